@@ -1,0 +1,1 @@
+"""A block-building robot, written down as a structural causal model."""

@@ -1,0 +1,151 @@
+"""What every physics engine must be able to do.
+
+A backend holds one scene. It knows bodies, parameters and states, and nothing about causes.
+``scm_world.testing.backend`` holds the conformance suite that each one passes.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, ClassVar, final
+
+from scm_world._types import Floats
+from scm_world.scene.controller import ControlMode
+from scm_world.scene.difference import Difference
+from scm_world.scene.scene import ParameterKey, Parameters, Scene
+from scm_world.scene.state import PhysicalState
+
+
+@final
+@dataclass(frozen=True)
+class Contact:
+    """One point where two bodies touch.
+
+    Attributes:
+        bodies: Names of the two bodies: blocks, ``"floor"``, ``"stage"`` or links of the robot
+            (the fingertip counts as link 3).
+        position: Of the point, shape (3,) [m].
+        normal: Unit vector from the first body to the second, shape (3,).
+        depth: How deep they intersect [m]; negative while they are apart.
+        force: Normal force [N].
+    """
+
+    bodies: tuple[str, str]
+    position: Floats
+    normal: Floats
+    depth: float
+    force: float
+
+
+@final
+@dataclass(frozen=True)
+class Capabilities:
+    """What an engine promises.
+
+    Attributes:
+        physics: Whether anything moves by itself.
+        batch: Whether many worlds can be stepped in one call.
+        snapshot: ``"exact"`` where the engine's own state is saved, ``"replay"`` where the
+            commands since the last canonical state are repeated. Both continue bit for bit.
+    """
+
+    physics: bool = True
+    batch: bool = False
+    snapshot: str = "exact"
+
+
+@final
+@dataclass(frozen=True)
+class EngineSnapshot:
+    """All that decides how an engine goes on: state, parameters, caches. It can be pickled.
+
+    Attributes:
+        engine: Name and version of the engine that took it.
+        payload: Owned by that engine.
+    """
+
+    engine: str
+    payload: Any
+
+
+class Backend(ABC):
+    """A physics engine with one scene in it.
+
+    Life: ``build`` once, then any of the others in any order. Every method may raise
+    ``EngineFailure``. Changes made between two calls of ``step`` take no time, and their result
+    depends on the last ``step`` and on the final parameters and state only, not on the path: a
+    change that is taken back leaves no trace, bit for bit.
+    """
+
+    name: ClassVar[str]
+    capabilities: ClassVar[Capabilities]
+
+    @property
+    @abstractmethod
+    def version(self) -> str:
+        """Version of the engine."""
+
+    @abstractmethod
+    def build(self, scene: Scene) -> None:
+        """Realise a scene from nothing. Equal scenes continue bit-identically, in any process."""
+
+    @abstractmethod
+    def apply(self, difference: Difference) -> None:
+        """Change structure, parameters and state without advancing time.
+
+        What is not mentioned stays as it is, bit for bit.
+        """
+
+    @abstractmethod
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Read parameters back from the engine itself, in the units of the scene."""
+
+    @abstractmethod
+    def inertia(self, body: str) -> Floats:
+        """Read the principal moments of inertia of a block or link, shape (3,) [kg m²]."""
+
+    @abstractmethod
+    def read(self, into: PhysicalState) -> None:
+        """Write the present state into an existing vector, without allocating."""
+
+    @abstractmethod
+    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+        """Hold a command for some physics steps.
+
+        Args:
+            mode: What the command means.
+            command: Shape (9,) [rad] or [N m].
+            substeps: How many steps of ``preset.timestep``.
+        """
+
+    @abstractmethod
+    def contacts(self) -> tuple[Contact, ...]:
+        """List the contact points of the last physics step."""
+
+    @abstractmethod
+    def snapshot(self) -> EngineSnapshot:
+        """Save everything. Restoring it continues bit for bit, in this process or another."""
+
+    @abstractmethod
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Go back to a snapshot.
+
+        Raises:
+            SnapshotMismatch: It was taken by another engine.
+        """
+
+    def close(self) -> None:
+        """Free what the engine holds. Closing twice is harmless."""
+
+    def state(self) -> PhysicalState:
+        """Read the present state into a new vector."""
+        state = PhysicalState(self.n_blocks)
+        self.read(state)
+        return state
+
+    @property
+    @abstractmethod
+    def n_blocks(self) -> int:
+        """How many movable blocks the scene has."""

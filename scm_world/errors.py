@@ -1,0 +1,366 @@
+"""What can go wrong, and what to do about it.
+
+Every error of the package carries its data as attributes and says what was given, what is
+allowed and what to do::
+
+    ScmWorldError
+    ├── ModelError               a causal model that cannot be built (all its problems at once)
+    ├── InterventionError        a do() that was refused; the world is as it was
+    │   ├── UnknownVariable      no such name; the nearest one is suggested
+    │   ├── NotIntervenable      the variable is measured, not set
+    │   ├── WrongType            not a number, or not of the declared dtype
+    │   ├── WrongShape
+    │   ├── NotFinite            NaN or infinity
+    │   ├── OutOfBounds          physically impossible
+    │   ├── OutOfSpace           possible, but outside the space that was asked for
+    │   ├── ConflictingTargets   two names of one quantity in the same do()
+    │   ├── Infeasible           two bodies in one place, or a body outside the arena
+    │   └── SeveralProblems      more than one of the above
+    ├── ActionError              an action the robot cannot take
+    ├── NotReset                 a world that was never reset
+    ├── UnknownOption            a task, backend, preset or mode that does not exist
+    ├── EngineError              the physics engine
+    │   ├── MissingEngine        it is not installed
+    │   ├── MixedInstallation    two versions of it in one folder
+    │   └── EngineFailure        it produced a state that is not finite
+    └── SnapshotMismatch         a snapshot of another scene
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Find the known name that looks most like ``name``.
+
+    Example:
+        >>> nearest("tool_blok.mass", ["tool_block.mass", "floor_friction"])
+        'tool_block.mass'
+    """
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return matches[0] if matches else None
+
+
+def _suggest(suggestion: str | None) -> str:
+    return f"; did you mean {suggestion!r}?" if suggestion else ""
+
+
+class ScmWorldError(Exception):
+    """Anything this package raises on purpose."""
+
+
+class ModelError(ScmWorldError, ValueError):
+    """A causal model that cannot be built.
+
+    Attributes:
+        problems: One sentence for each fault.
+    """
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        lines = "\n".join(f"  - {problem}" for problem in self.problems)
+        super().__init__(f"the model has {len(self.problems)} problem(s):\n{lines}")
+
+
+class InterventionError(ScmWorldError, ValueError):
+    """An intervention that was refused. Nothing has changed.
+
+    Attributes:
+        variable: The name of the variable.
+        value: What was asked for.
+    """
+
+    def __init__(self, message: str, *, variable: str, value: Any = None) -> None:
+        self.variable = variable
+        self.value = value
+        super().__init__(message)
+
+
+class UnknownVariable(InterventionError):
+    """No variable has this name.
+
+    Attributes:
+        suggestion: The nearest name there is, or None.
+    """
+
+    def __init__(self, name: str, known: Iterable[str]) -> None:
+        self.suggestion = nearest(name, known)
+        super().__init__(
+            f"no variable is named {name!r}{_suggest(self.suggestion)}", variable=name
+        )
+
+
+class NotIntervenable(InterventionError):
+    """The variable cannot be set.
+
+    Attributes:
+        causes: Variables that can be set instead.
+    """
+
+    def __init__(self, name: str, reason: str, causes: Iterable[str] = ()) -> None:
+        self.causes = tuple(causes)
+        instead = (
+            f"; intervene on a cause of it instead: {', '.join(self.causes)}"
+            if self.causes
+            else ""
+        )
+        super().__init__(f"{name!r} {reason}{instead}", variable=name)
+
+
+class WrongType(InterventionError):
+    """The value is not a number of the declared dtype."""
+
+    def __init__(self, name: str, value: Any, expected: str) -> None:
+        self.expected = expected
+        super().__init__(
+            f"do({name}): expected {expected}, got {value!r} of type {type(value).__name__}",
+            variable=name,
+            value=value,
+        )
+
+
+class WrongShape(InterventionError):
+    """The value has another shape than the variable.
+
+    Attributes:
+        expected: The shape of the variable.
+        actual: The shape of the value.
+    """
+
+    def __init__(
+        self, name: str, value: Any, expected: tuple[int, ...], actual: tuple[int, ...]
+    ) -> None:
+        self.expected = expected
+        self.actual = actual
+        super().__init__(
+            f"do({name}): expected shape {expected}, got {actual}", variable=name, value=value
+        )
+
+
+class NotFinite(InterventionError):
+    """The value has a NaN or an infinity."""
+
+    def __init__(self, name: str, value: Any) -> None:
+        super().__init__(
+            f"do({name}): every number must be finite, got {value!r}", variable=name, value=value
+        )
+
+
+class _Outside(InterventionError):
+    """A value outside what is allowed.
+
+    Attributes:
+        allowed: What is allowed, in words.
+        nearest: The nearest value that is allowed.
+    """
+
+    def __init__(self, name: str, value: Any, *, allowed: str, nearest: Any, unit: str) -> None:
+        self.allowed = allowed
+        self.nearest = nearest
+        unit = f" [{unit}]" if unit else ""
+        super().__init__(
+            f"do({name}): {value!r} is outside {allowed}{unit}; the nearest allowed value is "
+            f"{nearest!r}",
+            variable=name,
+            value=value,
+        )
+
+
+class OutOfBounds(_Outside):
+    """The value is physically impossible."""
+
+
+class OutOfSpace(_Outside):
+    """The value is possible, but not in the space that was asked for.
+
+    Attributes:
+        space: ``"A"``, ``"B"`` or ``"A|B"``.
+    """
+
+    def __init__(
+        self, name: str, value: Any, *, space: str, allowed: str, nearest: Any, unit: str
+    ) -> None:
+        self.space = space
+        super().__init__(
+            name, value, allowed=f"space {space} = {allowed}", nearest=nearest, unit=unit
+        )
+
+
+class ConflictingTargets(InterventionError):
+    """Two targets of one do() are coordinates of one and the same quantity.
+
+    Attributes:
+        names: The targets that exclude each other.
+    """
+
+    def __init__(self, names: Sequence[str], quantity: str) -> None:
+        self.names = tuple(names)
+        super().__init__(
+            f"{' and '.join(map(repr, self.names))} both set {quantity!r}; give one of them",
+            variable=self.names[0],
+        )
+
+
+class Infeasible(InterventionError):
+    """The intervention would put two bodies in one place, or one outside the arena.
+
+    Attributes:
+        problems: One sentence for each pair of bodies that would overlap.
+        nearest: The nearest value that is feasible, where one was found.
+    """
+
+    def __init__(
+        self, name: str, value: Any, problems: Sequence[str], nearest: Any = None
+    ) -> None:
+        self.problems = tuple(problems)
+        self.nearest = nearest
+        hint = f"; the nearest feasible value is {nearest!r}" if nearest is not None else ""
+        super().__init__(
+            f"do({name}): {value!r} is not feasible: {'; '.join(self.problems)}{hint}",
+            variable=name,
+            value=value,
+        )
+
+
+class SeveralProblems(InterventionError):
+    """More than one problem in one do().
+
+    Attributes:
+        problems: The errors, in the order of the request.
+    """
+
+    def __init__(self, problems: Sequence[InterventionError]) -> None:
+        self.problems = tuple(problems)
+        lines = "\n".join(f"  - {problem}" for problem in self.problems)
+        super().__init__(
+            f"{len(self.problems)} problems, nothing was changed:\n{lines}",
+            variable=self.problems[0].variable,
+        )
+
+
+def raise_all(problems: Sequence[InterventionError]) -> None:
+    """Raise the one problem, or all of them together; nothing if there is none."""
+    if len(problems) == 1:
+        raise problems[0]
+    if problems:
+        raise SeveralProblems(problems)
+
+
+class ActionError(ScmWorldError, ValueError):
+    """An action that the robot cannot take.
+
+    Attributes:
+        action: What was given.
+    """
+
+    def __init__(self, message: str, action: Any) -> None:
+        self.action = action
+        super().__init__(message)
+
+
+class NotReset(ScmWorldError, RuntimeError):
+    """The world was never reset, so there is nothing to step, ask or intervene on."""
+
+    def __init__(self) -> None:
+        super().__init__("the world has no episode yet; call reset() first")
+
+
+class UnknownOption(ScmWorldError, ValueError):
+    """A name that is none of the choices.
+
+    Attributes:
+        option: What is being chosen, for example ``"task"``.
+        value: What was given.
+        choices: What there is.
+    """
+
+    def __init__(self, option: str, value: Any, choices: Iterable[str]) -> None:
+        self.option = option
+        self.value = value
+        self.choices = tuple(choices)
+        hint = _suggest(nearest(str(value), self.choices))
+        super().__init__(
+            f"no {option} is named {value!r}{hint}; there are: {', '.join(self.choices)}"
+        )
+
+
+class EngineError(ScmWorldError, RuntimeError):
+    """The physics engine cannot do its work.
+
+    Attributes:
+        engine: The name of the backend.
+    """
+
+    def __init__(self, message: str, engine: str) -> None:
+        self.engine = engine
+        super().__init__(message)
+
+
+class MissingEngine(EngineError, ImportError):
+    """The engine is not installed.
+
+    Attributes:
+        install: The command that installs it.
+    """
+
+    def __init__(self, engine: str, install: str, reason: str = "") -> None:
+        self.install = install
+        because = f" ({reason})" if reason else ""
+        EngineError.__init__(
+            self, f"the {engine} engine is not installed{because}; try: {install}", engine
+        )
+
+
+class MixedInstallation(EngineError):
+    """Two versions of an engine lie in one folder.
+
+    Attributes:
+        versions: What was found, by distribution.
+        repair: The command that repairs it.
+    """
+
+    def __init__(self, engine: str, versions: dict[str, str], repair: str) -> None:
+        self.versions = dict(versions)
+        self.repair = repair
+        found = ", ".join(f"{name} {version}" for name, version in versions.items())
+        super().__init__(
+            f"the {engine} installation mixes versions ({found}); repair it with: {repair}", engine
+        )
+
+
+class EngineFailure(EngineError):
+    """The engine produced a state that is not finite."""
+
+
+class SnapshotMismatch(ScmWorldError, ValueError):
+    """A snapshot of another scene cannot be restored here."""
+
+
+__all__ = [
+    "ActionError",
+    "ConflictingTargets",
+    "EngineError",
+    "EngineFailure",
+    "Infeasible",
+    "InterventionError",
+    "MissingEngine",
+    "MixedInstallation",
+    "ModelError",
+    "NotFinite",
+    "NotIntervenable",
+    "NotReset",
+    "OutOfBounds",
+    "OutOfSpace",
+    "ScmWorldError",
+    "SeveralProblems",
+    "SnapshotMismatch",
+    "UnknownOption",
+    "UnknownVariable",
+    "WrongShape",
+    "WrongType",
+    "nearest",
+    "raise_all",
+]

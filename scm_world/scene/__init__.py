@@ -1,0 +1,38 @@
+"""An engine-free description of the world: what stands in it, where, and what it is made of."""
+
+from scm_world.scene.controller import TIMESTEP, ControllerSpec, ControlMode
+from scm_world.scene.difference import Difference, diff
+from scm_world.scene.presets import FAST, PRECISE, PRESETS, Preset, preset
+from scm_world.scene.scene import (
+    Goal,
+    ParameterKey,
+    Parameters,
+    Scene,
+    Structure,
+    default_parameters,
+    default_scene,
+    parameter_keys,
+)
+from scm_world.scene.state import PhysicalState
+
+__all__ = [
+    "FAST",
+    "PRECISE",
+    "PRESETS",
+    "TIMESTEP",
+    "ControlMode",
+    "ControllerSpec",
+    "Difference",
+    "Goal",
+    "ParameterKey",
+    "Parameters",
+    "PhysicalState",
+    "Preset",
+    "Scene",
+    "Structure",
+    "default_parameters",
+    "default_scene",
+    "diff",
+    "parameter_keys",
+    "preset",
+]

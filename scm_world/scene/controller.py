@@ -1,0 +1,67 @@
+"""The joint controller, specified once; every engine realises it and must match it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from scm_world._types import Floats
+
+TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, whatever the preset
+
+
+class ControlMode(StrEnum):
+    """What the nine numbers of a command mean."""
+
+    JOINT_POSITIONS = "joint_positions"
+    JOINT_TORQUES = "joint_torques"
+
+
+@dataclass(frozen=True)
+class ControllerSpec:
+    """A proportional-derivative law with a safety filter, evaluated at every physics step.
+
+    In ``joint_positions`` mode, with target q*, position q and velocity v of a joint::
+
+        tau = clip(clip(kp (q* - q) - kd v, ±limit) - safety v, ±limit)
+
+    In ``joint_torques`` mode the inner clip is applied to the commanded torque instead.
+
+    Attributes:
+        kp: Position gain of the three joints of a finger [N m/rad].
+        kd: Velocity gain [N m s/rad].
+        safety: Damping of the safety filter [N m s/rad].
+        limit: Largest torque [N m].
+
+    Source:
+        CausalWorld 1.2, ``envs/robot/trifinger.py`` (the law in force there).
+    """
+
+    kp: tuple[float, float, float] = (10.0, 10.0, 10.0)
+    kd: tuple[float, float, float] = (0.1, 0.3, 0.001)
+    safety: tuple[float, float, float] = (0.08, 0.08, 0.04)
+    limit: float = 0.36
+
+    def torques(
+        self, mode: ControlMode, command: Floats, positions: Floats, velocities: Floats
+    ) -> Floats:
+        """Evaluate the law.
+
+        Args:
+            mode: What ``command`` means.
+            command: Shape (9,) [rad] or [N m].
+            positions: Joint positions, shape (9,) [rad].
+            velocities: Joint velocities, shape (9,) [rad/s].
+
+        Returns:
+            Joint torques, shape (9,) [N m].
+        """
+        wanted = command
+        if mode is ControlMode.JOINT_POSITIONS:
+            gain, damping = np.tile(self.kp, 3), np.tile(self.kd, 3)
+            wanted = gain * (command - positions) - damping * velocities
+        inner = np.clip(wanted, -self.limit, self.limit)
+        safe: Floats = np.clip(inner - np.tile(self.safety, 3) * velocities, -self.limit, self.limit)
+        return safe

@@ -1,0 +1,116 @@
+"""The TriFinger robot: its published constants, and nothing an engine would call its own.
+
+Three fingers hang from a base above the table. Each is a chain of three hinges; the axes of the
+second and third are parallel. All numbers are those of the TriFinger-edu description as
+CausalWorld 1.2 ships it; the link inertias are the ones that are in force there after the first
+reset (computed by the engine from the collision hulls), which scale with the mass of the link.
+
+Frames: the world's z axis points up and the table top is at z = 0. The nominal robot height of
+0.34 m was measured from a plane 0.011 m below the table top.
+
+Source:
+    Ahmed et al., *CausalWorld*, ICLR 2021, release 1.2, ``trifinger_edu.urdf``;
+    Wüthrich et al., *TriFinger*, CoRL 2020.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+FINGERS = ("60", "120", "300")
+"""The fingers, in the order of every joint vector."""
+
+LINKS_PER_FINGER = 4
+"""Link 0 is the fixed finger base, 1 the upper, 2 the middle and 3 the lower link."""
+
+N_JOINTS = 9
+
+NOMINAL_HEIGHT = 0.34  # [m]
+TABLE_OFFSET = 0.011  # [m] how far the table top lies above the plane the height is measured from
+WORLD_YAW = -1.57079632679  # [rad] of the robot's base about z
+
+FINGER_YAW = (0.0, -2.09439510239, -4.18879020479)  # [rad] of each finger in the robot's frame
+FINGER_OFFSET = (
+    (-0.0455, 0.0, 0.0),
+    (0.02275, 0.0394041558722, 0.0),
+    (0.02275, -0.0394041558722, 0.0),
+)  # [m] of each finger base in the robot's frame
+
+JOINT_AXES = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 1.0, 0.0))
+JOINT_ORIGINS = ((0.0, 0.0, 0.0), (0.0, -0.014, 0.0), (0.0, -0.03745, -0.16))  # [m]
+TIP_ORIGIN = (0.0, -0.008, -0.16)  # [m] in the frame of the lower link
+
+LEG_LENGTH = 0.16  # [m] of the middle and of the lower link
+LATERAL_OFFSET = 0.05945  # [m] 0.014 + 0.03745 + 0.008
+
+ENGINE_LIMITS = (1.57079632679, 1.57079632679, 3.14159265359)  # [rad] ± of each joint of a finger
+JOINT_LOW = (-1.57, -1.2, -3.0) * 3  # [rad] what a command may ask for
+JOINT_HIGH = (1.0, 1.57, 3.0) * 3  # [rad]
+REST = (0.0, math.pi / 4, -math.pi / 4) * 3  # [rad]
+RAISED = (-1.56, -0.08, -2.7) * 3  # [rad]
+
+LINK_MASS = (1.0, 0.14854, 0.14854, 0.0307)  # [kg] links 0 to 3 of a finger
+TIP_MASS = 0.01  # [kg]
+TIP_INERTIA = (1.66666666667e-07,) * 3  # [kg m²]
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """How the mass of a link is spread.
+
+    Attributes:
+        center: Center of mass in the frame of the link, shape (3,) [m].
+        orientation: Of the principal axes in that frame, (x, y, z, w).
+        per_mass: Principal moments divided by the mass, shape (3,) [m²].
+    """
+
+    center: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+    per_mass: tuple[float, float, float]
+
+
+_TILT = 0.064287, 0.997931
+_NORM = math.hypot(*_TILT)
+_SIN, _COS = _TILT[0] / _NORM, _TILT[1] / _NORM
+
+INERTIAL = (
+    Inertial((-0.1, 0.0, 0.4), (0.0, 0.0, 0.0, 1.0), (6.67e-7, 6.67e-7, 6.67e-7)),
+    Inertial((-0.079, 0.0, 0.0), (0.0, 0.0, -_SIN, _COS), (6.349e-4, 3.867e-3, 4.069e-3)),
+    Inertial((0.0, -0.019, -0.079), (_SIN, 0.0, 0.0, _COS), (3.995e-3, 3.794e-3, 6.247e-4)),
+    Inertial((0.0, -0.009, -0.089), (0.0, 0.0, 0.0, 1.0), (3.057e-3, 3.089e-3, 1.609e-4)),
+)
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A collision shape: all points within ``radius`` of a segment in the frame of the link [m]."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+COLLISION = {
+    "upper": Capsule((-0.177, 0.0055, 0.0), (-0.0225, 0.0055, 0.0), 0.0225),
+    "middle": Capsule((0.0, -0.018, 0.0), (0.0, -0.018, -0.16), 0.0195),
+    "lower": Capsule((0.0, -0.008, -0.0), (0.0, -0.008, -0.14), 0.009),
+    "tip": Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 0.012), 0.0095),
+}
+"""One shape per link, fitted to the bounding boxes and radii of the published meshes."""
+
+LINK_COLORS = {"60": (0.6, 0.0, 0.0), "120": (0.0, 0.6, 0.0), "300": (0.0, 0.0, 0.6)}
+
+
+def link_name(finger: str, index: int) -> str:
+    """Give the published name of a link.
+
+    Example:
+        >>> link_name("60", 1)
+        'robot_finger_60_link_1'
+    """
+    return f"robot_finger_{finger}_link_{index}"
+
+
+LINK_NAMES = tuple(link_name(finger, i) for finger in FINGERS for i in range(LINKS_PER_FINGER))
+"""All links, finger by finger."""
