@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +14,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 """An array of 64-bit integers."""
 
-Value = NDArray[np.float64] | NDArray[np.int64]
-"""The value of one variable."""
+Value = NDArray[Any]
+"""The value of one variable: float64 for a real one, int64 for an integer or a category."""
 
 Values = Mapping[str, Value]
 """The values of several variables, by name."""

@@ -1,0 +1,34 @@
+"""Structural causal models over typed variables. Nothing here knows any physics."""
+
+from scm_world.graph.evaluate import Moment
+from scm_world.graph.files import (
+    from_dict,
+    from_json,
+    from_networkx,
+    to_dict,
+    to_dot,
+    to_json,
+    to_networkx,
+)
+from scm_world.graph.scm import SCM, flatten
+from scm_world.graph.structure import Edge, Structure
+from scm_world.graph.views import contemporaneous, d_separated, summary, two_slice
+
+__all__ = [
+    "SCM",
+    "Edge",
+    "Moment",
+    "Structure",
+    "contemporaneous",
+    "d_separated",
+    "flatten",
+    "from_dict",
+    "from_json",
+    "from_networkx",
+    "summary",
+    "to_dict",
+    "to_dot",
+    "to_json",
+    "to_networkx",
+    "two_slice",
+]

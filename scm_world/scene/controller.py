@@ -63,5 +63,6 @@ class ControllerSpec:
             gain, damping = np.tile(self.kp, 3), np.tile(self.kd, 3)
             wanted = gain * (command - positions) - damping * velocities
         inner = np.clip(wanted, -self.limit, self.limit)
-        safe: Floats = np.clip(inner - np.tile(self.safety, 3) * velocities, -self.limit, self.limit)
+        damped = inner - np.tile(self.safety, 3) * velocities
+        safe: Floats = np.clip(damped, -self.limit, self.limit)
         return safe

@@ -147,5 +147,6 @@ def default_scene(structure: Structure) -> Scene:
     state = PhysicalState(len(structure.blocks))
     state.joint_positions[:] = trifinger.REST
     state.positions[:, 2] = 0.0325
-    state.positions[:, 0] = 0.1 * (np.arange(len(structure.blocks)) - (len(structure.blocks) - 1) / 2)
+    places = np.arange(len(structure.blocks)) - (len(structure.blocks) - 1) / 2
+    state.positions[:, 0] = 0.1 * places
     return Scene(structure, default_parameters(structure), state)

@@ -1,0 +1,56 @@
+"""Typed variables, their spaces, their noise, and what can be done to them."""
+
+from scm_world.variables.interventions import SOFT, Draw, Hard, Intervention, Scale, Shift
+from scm_world.variables.kinds import (
+    Action,
+    AnyVariable,
+    Derived,
+    Exogenous,
+    Fixed,
+    Measured,
+    Parent,
+    Variable,
+    names,
+)
+from scm_world.variables.mechanisms import Function, Linear, Mechanism
+from scm_world.variables.noise import Noise
+from scm_world.variables.spaces import (
+    Affine,
+    Box,
+    Categories,
+    Distribution,
+    Either,
+    Integers,
+    Normal,
+    Space,
+)
+
+__all__ = [
+    "SOFT",
+    "Action",
+    "Affine",
+    "AnyVariable",
+    "Box",
+    "Categories",
+    "Derived",
+    "Distribution",
+    "Draw",
+    "Either",
+    "Exogenous",
+    "Fixed",
+    "Function",
+    "Hard",
+    "Integers",
+    "Intervention",
+    "Linear",
+    "Measured",
+    "Mechanism",
+    "Noise",
+    "Normal",
+    "Parent",
+    "Scale",
+    "Shift",
+    "Space",
+    "Variable",
+    "names",
+]

@@ -1,0 +1,85 @@
+"""Is there one MuJoCo, and is it recent enough?
+
+Beside a package that asks for ``mujoco``, pip may put ``mujoco`` 3.17 over ``mujoco-core`` 4.0.1
+into one folder, without a complaint from ``pip check``. The mixture fails on import, or worse,
+does not.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+
+from scm_world.errors import MissingEngine, MixedInstallation
+
+OLDEST = (3, 17)
+REQUIREMENT = "mujoco>=3.17,<5"
+REPAIR = (
+    "pip uninstall -y mujoco mujoco-core mujoco-studio && "
+    f"pip install --force-reinstall --no-deps '{REQUIREMENT}' mujoco-core mujoco-studio"
+)
+DISTRIBUTIONS = ("mujoco", "mujoco-core", "mujoco-studio")
+
+
+def check_installation() -> None:
+    """Look at the metadata and at the libraries, without importing MuJoCo.
+
+    Raises:
+        MissingEngine: It is not installed, or older than 3.17.
+        MixedInstallation: Versions differ within one folder.
+    """
+    spec = importlib.util.find_spec("mujoco")
+    folders = list(spec.submodule_search_locations or ()) if spec else []
+    libraries = [path.name for folder in folders for path in Path(folder).glob("libmujoco*")]
+    judge(_distributions(), libraries)
+
+
+def judge(distributions: Mapping[str, str], libraries: list[str]) -> None:
+    """Decide whether these parts make one MuJoCo.
+
+    Args:
+        distributions: Version of each installed distribution.
+        libraries: File names of the shared libraries in its folder.
+
+    Raises:
+        MissingEngine: There is nothing, or it is older than 3.17.
+        MixedInstallation: Versions differ.
+
+    Example:
+        >>> judge({"mujoco": "4.0.0", "mujoco-core": "4.0.0"}, ["libmujoco.so.4.0.0"])
+        >>> judge({"mujoco": "3.17.0", "mujoco-core": "4.0.1"}, ["libmujoco.so.3.17.0"])
+        Traceback (most recent call last):
+        scm_world.errors.MixedInstallation: the mujoco installation mixes versions ...
+    """
+    if not distributions or not libraries:
+        raise MissingEngine("mujoco", f"pip install '{REQUIREMENT}'")
+    found = {**distributions, **{name: _library_version(name) for name in libraries}}
+    versions = {_numbers(version) for version in found.values()}
+    if len(versions) > 1:
+        raise MixedInstallation("mujoco", found, REPAIR)
+    version = min(versions)
+    if version < OLDEST:
+        readable = ".".join(map(str, version))
+        raise MissingEngine("mujoco", f"pip install '{REQUIREMENT}'", f"{readable} is too old")
+
+
+def _distributions() -> dict[str, str]:
+    found = {}
+    for name in DISTRIBUTIONS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _library_version(name: str) -> str:
+    match = re.search(r"\d+\.\d+\.\d+", name)
+    return match.group() if match else "unknown"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])

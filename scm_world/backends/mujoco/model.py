@@ -1,0 +1,257 @@
+"""From a structure to a compiled model; parameters have their defaults in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+
+import mujoco
+
+from scm_world.backends.mujoco.settings import Settings, settings, write_options
+from scm_world.scene import trifinger
+from scm_world.scene.controller import ControllerSpec
+from scm_world.scene.scene import (
+    SPINNING_FRICTION,
+    WALL_HEIGHT,
+    WALL_RADIUS,
+    WALL_SEGMENTS,
+    WALL_THICKNESS,
+    Structure,
+)
+from scm_world.scene.trifinger import FINGERS, link_name
+
+BASE = "robot"
+FLOOR = "floor"
+STAGE = "stage"
+SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 3 and 3
+
+_BLOCK_HALF = 0.0325  # [m] any positive size and mass do: parameters follow
+_BLOCK_MASS = 0.02  # [kg]
+_ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
+
+
+@lru_cache(maxsize=32)
+def compiled(structure: Structure) -> mujoco.MjModel:
+    """Compile a structure once. Callers copy the model before they change it."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "scm_world"
+    spec.compiler.degree = False
+    write_options(spec, structure.preset)
+    _add_arena(spec)
+    _add_robot(spec, structure)
+    for name in structure.blocks:
+        _add_block(spec, name)
+    for first, second, sliding in contact_pairs(structure.blocks):
+        _add_pair(spec, first, second, settings(structure.preset), sliding=sliding)
+    return spec.compile()
+
+
+def shape_name(finger: str, shape: str) -> str:
+    """Name a collision shape of the robot."""
+    return f"{finger}/{shape}"
+
+
+def wall_name(segment: int) -> str:
+    """Name a segment of the ring."""
+    return f"{STAGE}/{segment}"
+
+
+def link_shapes(finger: str, index: int) -> tuple[str, ...]:
+    """List the shapes that belong to a link; the base has one that touches nothing."""
+    shapes = {0: ("base",), 1: ("upper",), 2: ("middle",), 3: ("lower", "tip")}[index]
+    return tuple(shape_name(finger, shape) for shape in shapes)
+
+
+def shape_owners(structure: Structure) -> dict[str, str]:
+    """Map every shape to the published name of its body."""
+    owners = {FLOOR: FLOOR}
+    owners |= {wall_name(i): STAGE for i in range(WALL_SEGMENTS)}
+    for finger in FINGERS:
+        for index in range(trifinger.LINKS_PER_FINGER):
+            owners |= {name: link_name(finger, index) for name in link_shapes(finger, index)}
+    return owners | {name: name for name in structure.blocks}
+
+
+def contact_pairs(blocks: tuple[str, ...]) -> Iterator[tuple[str, str, bool]]:
+    """List which shapes can touch, and whether they slide (True) or grip (False).
+
+    Yields:
+        Two shapes, and whether their friction is the soft one.
+    """
+    walls = [wall_name(i) for i in range(WALL_SEGMENTS)]
+    for i, block in enumerate(blocks):
+        yield FLOOR, block, True
+        yield from ((wall, block, True) for wall in walls)
+        yield from ((block, other, True) for other in blocks[i + 1 :])
+        for finger in FINGERS:
+            yield from ((shape_name(finger, shape), block, False) for shape in SHAPES)
+    for finger in FINGERS:
+        yield from ((FLOOR, shape_name(finger, shape), False) for shape in SHAPES[1:])
+        yield from (
+            (wall, shape_name(finger, shape), False) for wall in walls for shape in SHAPES[2:]
+        )
+    for i, finger in enumerate(FINGERS):
+        for other in FINGERS[i + 1 :]:
+            yield from (
+                (shape_name(finger, mine), shape_name(other, its), False)
+                for mine in SHAPES[1:]
+                for its in SHAPES[1:]
+            )
+
+
+def _add_pair(
+    spec: mujoco.MjSpec, first: str, second: str, chosen: Settings, *, sliding: bool
+) -> None:
+    spec.add_pair(
+        geomname1=first,
+        geomname2=second,
+        condim=4,
+        solref=chosen.contact,
+        solreffriction=chosen.sliding if sliding else (0.0, 0.0),
+        friction=(1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION),
+        margin=0.0,
+        gap=0.0,
+    )
+
+
+def _add_arena(spec: mujoco.MjSpec) -> None:
+    spec.worldbody.add_geom(
+        name=FLOOR,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(1.0, 1.0, 0.1),
+        contype=0,
+        conaffinity=0,
+    )
+    stage = spec.worldbody.add_body(name=STAGE)
+    outer = WALL_RADIUS + WALL_THICKNESS
+    half = (WALL_THICKNESS / 2, outer * math.tan(math.pi / WALL_SEGMENTS), WALL_HEIGHT / 2)
+    for i in range(WALL_SEGMENTS):
+        angle = 2 * math.pi * i / WALL_SEGMENTS
+        center = WALL_RADIUS + WALL_THICKNESS / 2
+        stage.add_geom(
+            name=wall_name(i),
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=(center * math.cos(angle), center * math.sin(angle), WALL_HEIGHT / 2),
+            quat=_yaw(angle),
+            size=half,
+            contype=0,
+            conaffinity=0,
+        )
+
+
+def _add_block(spec: mujoco.MjSpec, name: str) -> None:
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint()
+    body.mass = _BLOCK_MASS
+    body.inertia = (_BLOCK_MASS / 6 * (2 * _BLOCK_HALF) ** 2,) * 3
+    body.explicitinertial = True
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(_BLOCK_HALF,) * 3,
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def _add_robot(spec: mujoco.MjSpec, structure: Structure) -> None:
+    height = trifinger.NOMINAL_HEIGHT - trifinger.TABLE_OFFSET
+    base = spec.worldbody.add_body(
+        name=BASE, pos=(0.0, 0.0, height), quat=_yaw(trifinger.WORLD_YAW)
+    )
+    for finger, offset, yaw in zip(
+        FINGERS, trifinger.FINGER_OFFSET, trifinger.FINGER_YAW, strict=True
+    ):
+        _add_finger(spec, base, finger, offset, yaw, structure)
+    _add_controller(spec, structure.controller)
+
+
+def _add_finger(
+    spec: mujoco.MjSpec,
+    base: mujoco.MjsBody,
+    finger: str,
+    offset: tuple[float, float, float],
+    yaw: float,
+    structure: Structure,
+) -> None:
+    body = base.add_body(name=link_name(finger, 0), pos=offset, quat=_yaw(yaw))
+    _set_inertial(body, 0)
+    body.add_geom(
+        name=shape_name(finger, "base"),
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=(0.01, 0.0, 0.0),
+        contype=0,
+        conaffinity=0,
+    )
+    limit = structure.controller.limit
+    for index in (1, 2, 3):
+        body = body.add_body(name=link_name(finger, index), pos=trifinger.JOINT_ORIGINS[index - 1])
+        _set_inertial(body, index)
+        reach = trifinger.ENGINE_LIMITS[index - 1]
+        body.add_joint(
+            name=link_name(finger, index),
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=trifinger.JOINT_AXES[index - 1],
+            limited=True,
+            range=(-reach, reach),
+            solref_limit=settings(structure.preset).contact,
+            actfrclimited=True,
+            actfrcrange=(-limit, limit),
+        )
+        _add_capsule(body, finger, SHAPES[index - 1])
+    tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=trifinger.TIP_ORIGIN)
+    tip.mass, tip.inertia, tip.explicitinertial = trifinger.TIP_MASS, trifinger.TIP_INERTIA, True
+    _add_capsule(tip, finger, "tip")
+
+
+def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
+    inertial, mass = trifinger.INERTIAL[index], trifinger.LINK_MASS[index]
+    x, y, z, w = inertial.orientation
+    body.mass = mass
+    body.ipos = inertial.center
+    body.iquat = (w, x, y, z)
+    body.inertia = [mass * moment for moment in inertial.per_mass]
+    body.explicitinertial = True
+
+
+def _add_capsule(body: mujoco.MjsBody, finger: str, shape: str) -> None:
+    capsule = trifinger.COLLISION[shape]
+    body.add_geom(
+        name=shape_name(finger, shape),
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=(*capsule.start, *capsule.end),
+        size=(capsule.radius, 0.0, 0.0),
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def _add_controller(spec: mujoco.MjSpec, controller: ControllerSpec) -> None:
+    """Add nine servos whose force is clipped, then nine dampers; the joint clips the sum."""
+    joints = [link_name(finger, index) for finger in FINGERS for index in (1, 2, 3)]
+    for joint in joints:
+        spec.add_actuator(
+            name=f"{joint}/servo",
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=joint,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            forcelimited=True,
+            forcerange=(-controller.limit, controller.limit),
+        )
+    for joint, damping in zip(joints, controller.safety * len(FINGERS), strict=True):
+        spec.add_actuator(
+            name=f"{joint}/safety",
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=joint,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            gainprm=[0.0] * 10,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            biasprm=[0.0, 0.0, -damping] + [0.0] * 7,
+        )
+
+
+def _yaw(angle: float) -> tuple[float, float, float, float]:
+    """Give the MuJoCo quaternion (w, x, y, z) of a turn about z."""
+    return (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))

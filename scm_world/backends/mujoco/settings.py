@@ -1,0 +1,61 @@
+"""What a preset means to MuJoCo.
+
+Stock settings cannot lift a block with three fingers, let it creep on a slope and make a fast one
+hover. A softer friction reference for contacts without fingers, elliptic cones and a high
+``impratio`` mend all three. Fingers keep the hard reference: they have to grip.
+
+Source:
+    Measured; see the parity table in ``docs/design``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+
+from scm_world.scene.presets import Preset
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers of one preset.
+
+    Attributes:
+        integrator: An ``mjtIntegrator``.
+        contact: Time constant [s] and damping ratio of contacts.
+        sliding: The same for friction between blocks, floor and stage.
+        impratio: Stiffness of friction over stiffness of the normal.
+    """
+
+    integrator: mujoco.mjtIntegrator
+    contact: tuple[float, float]
+    sliding: tuple[float, float]
+    impratio: float = 100.0
+
+
+_SETTINGS = {
+    "fast": Settings(mujoco.mjtIntegrator.mjINT_IMPLICITFAST, (0.010, 1.0), (0.05, 1.0)),
+    "precise": Settings(mujoco.mjtIntegrator.mjINT_DISCRETE, (0.004, 1.0), (0.02, 1.0)),
+}
+
+
+def settings(preset: Preset) -> Settings:
+    """Look up what a preset means."""
+    return _SETTINGS[preset.name]
+
+
+def write_options(spec: mujoco.MjSpec, preset: Preset) -> None:
+    """Write everything that concerns the whole simulation."""
+    chosen = settings(preset)
+    option = spec.option
+    option.timestep = preset.timestep
+    option.integrator = chosen.integrator
+    option.impratio = chosen.impratio
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # MuJoCo 4.0.0 factors the sparse Hessian wrongly (#3767, mended in 4.0.1).
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    # A simulation that explodes must say so instead of starting again.
+    option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    option.enableflags = 0  # sleeping islands, in particular, cannot be restored exactly

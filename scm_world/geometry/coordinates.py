@@ -1,0 +1,44 @@
+"""Cartesian and cylindrical coordinates, on any leading axes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scm_world._types import ArrayLike, Floats
+
+
+def to_cylindrical(position: ArrayLike) -> Floats:
+    """Give radius, azimuth and height of points.
+
+    Args:
+        position: Shape (..., 3) [m].
+
+    Returns:
+        Radius [m], azimuth [rad] in (-pi, pi], zero on the axis, and height [m]; shape (..., 3).
+
+    Example:
+        >>> to_cylindrical([0.0, 2.0, 1.0])
+        array([2.        , 1.57079633, 1.        ])
+    """
+    x, y, z = np.moveaxis(np.asarray(position, dtype=np.float64), -1, 0)
+    radius = np.hypot(x, y)
+    azimuth = np.arctan2(y, x)
+    azimuth = np.where(azimuth == -np.pi, np.pi, np.where(radius == 0.0, 0.0, azimuth))
+    return np.stack((radius, azimuth, z), axis=-1)
+
+
+def from_cylindrical(cylindrical: ArrayLike) -> Floats:
+    """Give the cartesian coordinates of points.
+
+    Args:
+        cylindrical: Radius [m], azimuth [rad] and height [m], shape (..., 3).
+
+    Returns:
+        Shape (..., 3) [m].
+
+    Example:
+        >>> from_cylindrical([2.0, 0.0, 1.0])
+        array([2., 0., 1.])
+    """
+    radius, azimuth, z = np.moveaxis(np.asarray(cylindrical, dtype=np.float64), -1, 0)
+    return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=-1)

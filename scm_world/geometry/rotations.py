@@ -1,0 +1,245 @@
+"""Rotations as quaternions (x, y, z, w), in numpy on any leading axes and as scalar kernels.
+
+A quaternion need not have unit length: only its direction counts. The product is Hamilton's, so
+``quaternion_product(p, q)`` rotates by q first and by p afterwards, as matrices do.
+
+Source:
+    Shuster, "A survey of attitude representations", *J. Astronautical Sciences* 41, 1993.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from scm_world._types import ArrayLike, Floats
+
+UNIT = 8.0 * np.finfo(np.float64).eps
+"""How far a squared norm may be from one and still be left alone."""
+
+
+def _components(values: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
+    """Split quaternions; a last axis that is not four long is a ValueError."""
+    x, y, z, w = np.moveaxis(np.asarray(values, dtype=np.float64), -1, 0)
+    return x, y, z, w
+
+
+def _squared_norm(quaternion: Floats) -> Floats:
+    squared: Floats = np.sum(quaternion * quaternion, axis=-1, keepdims=True)
+    if np.any(squared == 0.0):
+        raise ValueError("a quaternion of length zero names no rotation")
+    return squared
+
+
+def canonical(quaternion: ArrayLike) -> Floats:
+    """Give the one unit quaternion with w >= 0 that names the same rotation.
+
+    Half turns have w = 0; of their two names the one is taken whose first component that is not
+    zero is positive. Applying the function twice changes no bit.
+
+    Args:
+        quaternion: Shape (..., 4).
+
+    Returns:
+        Shape (..., 4).
+
+    Raises:
+        ValueError: A quaternion is zero, or the last axis is not four long.
+
+    Example:
+        >>> canonical([0.0, 0.0, 0.0, -2.0])
+        array([0., 0., 0., 1.])
+    """
+    given = np.asarray(quaternion, dtype=np.float64)
+    x, y, z, w = _components(given)
+    lead = np.where(w != 0.0, w, np.where(x != 0.0, x, np.where(y != 0.0, y, z)))
+    squared = _squared_norm(given)
+    norm = np.where(np.abs(squared - 1.0) <= UNIT, 1.0, np.sqrt(squared))
+    unit: Floats = given / np.copysign(norm, lead[..., None]) + 0.0  # no negative zeros
+    return unit
+
+
+def quaternion_product(p: ArrayLike, q: ArrayLike) -> Floats:
+    """Compose two rotations: first q, then p.
+
+    Args:
+        p: Shape (..., 4).
+        q: Shape (..., 4), broadcast against ``p``.
+
+    Returns:
+        Hamilton's product, shape (..., 4), with whatever sign and length it has.
+
+    Example:
+        >>> quarter = from_rotation_vector([0.0, 0.0, np.pi / 2])
+        >>> quaternion_product(quarter, quarter).round(12)
+        array([0., 0., 1., 0.])
+    """
+    a, b, c, d = _components(p)
+    x, y, z, w = _components(q)
+    return np.stack(
+        (
+            d * x + a * w + b * z - c * y,
+            d * y + b * w + c * x - a * z,
+            d * z + c * w + a * y - b * x,
+            d * w - a * x - b * y - c * z,
+        ),
+        axis=-1,
+    )
+
+
+def quaternion_inverse(quaternion: ArrayLike) -> Floats:
+    """Give the quaternion whose product with this one is (0, 0, 0, 1).
+
+    Args:
+        quaternion: Shape (..., 4).
+
+    Returns:
+        Shape (..., 4).
+
+    Raises:
+        ValueError: A quaternion is zero, or the last axis is not four long.
+    """
+    given = np.asarray(quaternion, dtype=np.float64)
+    x, y, z, w = _components(given)
+    inverse: Floats = np.stack((-x, -y, -z, w), axis=-1) / _squared_norm(given)
+    return inverse
+
+
+def rotation_matrix(quaternion: ArrayLike) -> Floats:
+    """Give the matrix that turns coordinates of the body into those of the world.
+
+    Args:
+        quaternion: Shape (..., 4).
+
+    Returns:
+        Shape (..., 3, 3).
+
+    Raises:
+        ValueError: A quaternion is zero, or the last axis is not four long.
+
+    Example:
+        >>> rotation_matrix([0.0, 0.0, 1.0, 0.0]) @ [1.0, 0.0, 0.0]
+        array([-1.,  0.,  0.])
+    """
+    given = np.asarray(quaternion, dtype=np.float64)
+    x, y, z, w = _components(given)
+    scale = 2.0 / _squared_norm(given)[..., 0]
+    matrix = np.empty((*given.shape[:-1], 3, 3))
+    matrix[..., 0, 0] = 1.0 - scale * (y * y + z * z)
+    matrix[..., 0, 1] = scale * (x * y - z * w)
+    matrix[..., 0, 2] = scale * (x * z + y * w)
+    matrix[..., 1, 0] = scale * (x * y + z * w)
+    matrix[..., 1, 1] = 1.0 - scale * (x * x + z * z)
+    matrix[..., 1, 2] = scale * (y * z - x * w)
+    matrix[..., 2, 0] = scale * (x * z - y * w)
+    matrix[..., 2, 1] = scale * (y * z + x * w)
+    matrix[..., 2, 2] = 1.0 - scale * (x * x + y * y)
+    return matrix
+
+
+def from_rotation_vector(vector: ArrayLike) -> Floats:
+    """Give the quaternion of a rotation vector.
+
+    Args:
+        vector: Axis times angle, shape (..., 3) [rad]. The angle may be of any size.
+
+    Returns:
+        Unit quaternions with w >= 0, shape (..., 4).
+
+    Example:
+        >>> from_rotation_vector([0.0, 0.0, 0.0])
+        array([0., 0., 0., 1.])
+    """
+    given = np.asarray(vector, dtype=np.float64)
+    angle = np.sqrt(np.sum(given * given, axis=-1, keepdims=True))
+    imaginary = 0.5 * np.sinc(angle / (2.0 * np.pi)) * given
+    return canonical(np.concatenate((imaginary, np.cos(0.5 * angle)), axis=-1))
+
+
+def to_rotation_vector(quaternion: ArrayLike) -> Floats:
+    """Give the rotation vector of a quaternion.
+
+    Args:
+        quaternion: Shape (..., 4).
+
+    Returns:
+        Axis times angle, shape (..., 3) [rad], with an angle in [0, pi]. Accurate to rounding
+        near both ends.
+
+    Raises:
+        ValueError: A quaternion is zero, or the last axis is not four long.
+
+    Example:
+        >>> to_rotation_vector([0.0, 0.0, 1.0, 0.0])
+        array([0.        , 0.        , 3.14159265])
+    """
+    unit = canonical(quaternion)
+    imaginary, real = unit[..., :3], unit[..., 3:]
+    length = np.sqrt(np.sum(imaginary * imaginary, axis=-1, keepdims=True))
+    stretch = np.full_like(length, 2.0)  # the limit of angle / sin(angle / 2) at zero
+    np.divide(2.0 * np.arctan2(length, real), length, out=stretch, where=length > 0.0)
+    vector: Floats = stretch * imaginary
+    return vector
+
+
+def angle_between(p: ArrayLike, q: ArrayLike) -> Floats:
+    """Measure the angle of the rotation that leads from one orientation to the other.
+
+    Args:
+        p: Shape (..., 4), of any length and sign.
+        q: Shape (..., 4), broadcast against ``p``.
+
+    Returns:
+        Shape (...) [rad], in [0, pi].
+
+    Example:
+        >>> angle_between([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, -1.0]).item()
+        0.0
+    """
+    conjugate = np.asarray(p, dtype=np.float64) * (-1.0, -1.0, -1.0, 1.0)
+    turn = quaternion_product(conjugate, q)
+    sine = np.sqrt(np.sum(turn[..., :3] ** 2, axis=-1))
+    angle: Floats = 2.0 * np.arctan2(sine, np.abs(turn[..., 3]))
+    return angle
+
+
+@njit(cache=True)
+def angle_between_kernel(p: Floats, q: Floats) -> float:
+    """Measure the angle between two orientations, as ``angle_between`` does.
+
+    Args:
+        p: Quaternion, shape (4,).
+        q: Quaternion, shape (4,).
+
+    Returns:
+        The angle [rad], in [0, pi].
+    """
+    x = p[3] * q[0] - p[0] * q[3] - p[1] * q[2] + p[2] * q[1]
+    y = p[3] * q[1] - p[1] * q[3] - p[2] * q[0] + p[0] * q[2]
+    z = p[3] * q[2] - p[2] * q[3] - p[0] * q[1] + p[1] * q[0]
+    w = p[3] * q[3] + p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
+    return 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
+
+
+@njit(cache=True)
+def rotation_kernel(quaternion: Floats, matrix: Floats) -> None:
+    """Write the rotation matrix of a quaternion.
+
+    Args:
+        quaternion: Shape (4,). Zero counts as no rotation, so that no kernel makes a NaN.
+        matrix: Where to write, shape (3, 3).
+    """
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    squared = x * x + y * y + z * z + w * w
+    scale = 2.0 / squared if squared > 0.0 else 0.0
+    matrix[0, 0] = 1.0 - scale * (y * y + z * z)
+    matrix[0, 1] = scale * (x * y - z * w)
+    matrix[0, 2] = scale * (x * z + y * w)
+    matrix[1, 0] = scale * (x * y + z * w)
+    matrix[1, 1] = 1.0 - scale * (x * x + z * z)
+    matrix[1, 2] = scale * (y * z - x * w)
+    matrix[2, 0] = scale * (x * z - y * w)
+    matrix[2, 1] = scale * (y * z + x * w)
+    matrix[2, 2] = 1.0 - scale * (x * x + y * y)

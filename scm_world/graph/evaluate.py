@@ -1,0 +1,200 @@
+"""How the value of one variable is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Value, Values
+from scm_world.errors import ModelError
+from scm_world.variables import (
+    SOFT,
+    Derived,
+    Distribution,
+    Draw,
+    Exogenous,
+    Fixed,
+    Hard,
+    Intervention,
+    Measured,
+    Noise,
+    Shift,
+    Variable,
+)
+
+
+@final
+@dataclass(frozen=True)
+class Moment:
+    """Where in a noise stream a draw is taken.
+
+    Attributes:
+        noise: The seed's noise.
+        episode: The first episode.
+        step: The control step.
+        count: For how many episodes in a row; None for a single one without a batch axis.
+    """
+
+    noise: Noise
+    episode: int = 0
+    step: int = 0
+    count: int | None = None
+
+    def draw(
+        self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
+    ) -> Value:
+        """Draw a value of a variable, shape ``(count, *shape)`` or ``shape``."""
+        drawn = self.noise.draw(
+            source,
+            name,
+            shape,
+            values,
+            episode=self.episode,
+            step=self.step,
+            count=self.count or 1,
+        )
+        return drawn if self.count is not None else drawn[0]
+
+
+@final
+@dataclass(frozen=True)
+class Act:
+    """An intervention on a variable, possibly given in other coordinates of it."""
+
+    intervention: Intervention
+    requested: Variable
+
+
+def source_of(act: Act) -> Distribution:
+    """Give the distribution that a draw is taken from."""
+    draw = act.intervention
+    if not isinstance(draw, Draw):
+        raise TypeError(f"{draw!r} draws nothing")
+    if not isinstance(draw.source, str):
+        return draw.source
+    space = act.requested.space(draw.source)
+    if space is None:
+        raise ModelError([f"{act.requested.name!r} has no space {draw.source}"])
+    return space
+
+
+@final
+class Evaluator:
+    """The mechanisms of a model, with their functions looked up once.
+
+    Args:
+        declared: The variables, by name.
+    """
+
+    __slots__ = ("_declared", "_functions")
+
+    def __init__(self, declared: Mapping[str, Variable]) -> None:
+        self._declared = declared
+        self._functions: dict[str, Callable[..., Any]] = {}
+
+    def forced(self, name: str, act: Act, values: Values, moment: Moment | None) -> Value:
+        """Compute what a hard intervention or a draw puts in the place of a variable."""
+        requested = act.requested
+        if isinstance(act.intervention, Hard):
+            value = requested.array(act.intervention.value)
+        elif moment is None:
+            raise ModelError([f"{requested.name!r} is drawn: solve needs a moment to draw at"])
+        else:
+            value = moment.draw(source_of(act), requested.name, requested.shape, values)
+        if requested.name == name:
+            return value
+        return np.asarray(self._bound(requested, inverse=True)(value))
+
+    def evaluate(
+        self,
+        name: str,
+        act: Act | None,
+        values: Values,
+        previous: Values,
+        moment: Moment | None,
+    ) -> Value:
+        """Compute a variable from the values so far, under an intervention or none."""
+        if act is None:
+            return self._natural(self._declared[name], values, previous, moment)
+        if not isinstance(act.intervention, SOFT):
+            return self.forced(name, act, values, moment)
+        natural = self._natural(self._declared[name], values, previous, moment)
+        requested, by = act.requested, np.asarray(act.intervention.by)
+        there = natural
+        if requested.name != name:
+            there = np.asarray(self._bound(requested)(natural))
+        moved = there + by if isinstance(act.intervention, Shift) else there * by
+        if requested.dtype != "real":
+            moved = np.rint(moved).astype(np.int64)
+        if requested.name == name:
+            return moved
+        return np.asarray(self._bound(requested, inverse=True)(moved))
+
+    def _natural(
+        self, variable: Variable, values: Values, previous: Values, moment: Moment | None
+    ) -> Value:
+        match variable:
+            case Exogenous():
+                if variable.name in values:
+                    return values[variable.name]
+                if moment is None or variable.distribution is None:
+                    return variable.array(variable.default)
+                return moment.draw(variable.distribution, variable.name, variable.shape, values)
+            case Fixed():
+                return variable.array(variable.value)
+            case Derived():
+                return self._derive(variable, values, previous, moment)
+            case Measured() if variable.mechanism is not None:
+                arguments = self._arguments(variable, values, previous)
+                return np.asarray(self._bound(variable)(*arguments))
+            case _:
+                if variable.name not in values:
+                    raise ModelError(
+                        [f"{variable.name!r} is not computed by the model: give its value"]
+                    )
+                return values[variable.name]
+
+    def _derive(
+        self, variable: Derived, values: Values, previous: Values, moment: Moment | None
+    ) -> Value:
+        arguments = self._arguments(variable, values, previous)
+        if variable.noise is None:
+            return np.asarray(self._bound(variable)(*arguments))
+        noise: Value = np.zeros(variable.shape)
+        if moment is not None:
+            noise = moment.draw(variable.noise, variable.name, variable.shape, values)
+        return np.asarray(self._bound(variable)(*arguments, noise=noise))
+
+    def _arguments(self, variable: Variable, values: Values, previous: Values) -> list[Value]:
+        return [
+            values[parent.name] if parent.lag == 0 else self._lagged(parent.name, previous)
+            for parent in variable.all_parents
+        ]
+
+    def _lagged(self, name: str, previous: Values) -> Value:
+        if name in previous:
+            return previous[name]
+        variable = self._declared[name]
+        match variable:
+            case Derived():
+                first: Any = variable.start
+            case Fixed():
+                first = variable.value
+            case Exogenous():
+                first = variable.default
+            case _:
+                first = 0.0
+        return variable.array(
+            np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first
+        )
+
+    def _bound(self, variable: Variable, *, inverse: bool = False) -> Callable[..., Any]:
+        key = f"{variable.name}|inverse" if inverse else variable.name
+        found = self._functions.get(key)
+        if found is None:
+            mechanism = variable.inverse if inverse else variable.mechanism  # type: ignore[attr-defined]
+            found = self._functions[key] = mechanism.bind()
+        return found

@@ -1,0 +1,345 @@
+"""Structural causal models: build, check, mutilate, solve."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Value, Values
+from scm_world.errors import (
+    ConflictingTargets,
+    InterventionError,
+    ModelError,
+    NotIntervenable,
+    UnknownVariable,
+    raise_all,
+)
+from scm_world.graph.evaluate import Act, Evaluator, Moment, source_of
+from scm_world.graph.structure import Edge, Structure, checked
+from scm_world.variables import (
+    SOFT,
+    Derived,
+    Draw,
+    Exogenous,
+    Fixed,
+    Hard,
+    Intervention,
+    Noise,
+    Scale,
+    Shift,
+    Variable,
+)
+from scm_world.variables.checks import check_bounds, coerce
+
+
+def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
+    """Turn a nested request into dotted names.
+
+    Example:
+        >>> flatten({"tool_block": {"mass": 0.05}, "floor_friction": 0.4})
+        {'tool_block.mass': 0.05, 'floor_friction': 0.4}
+    """
+    flat: dict[str, Any] = {}
+    for name, value in request.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{name}.{key}": part for key, part in flatten(value).items()})
+        else:
+            flat[name] = value
+    return flat
+
+
+@final
+class SCM:
+    """A structural causal model over typed variables.
+
+    It is immutable: ``do`` returns another model. Edges of lag 0 act within an instant and form
+    a directed acyclic graph; edges of lag 1 reach from one control step into the next.
+
+    Args:
+        variables: The declarations.
+
+    Raises:
+        ModelError: With every problem: duplicate names, unknown parents, cycles.
+
+    Example:
+        >>> from scm_world.variables import Box, Linear
+        >>> model = SCM([
+        ...     Exogenous(name="mass", unit="kg", default=0.02, distribution=Box(0.015, 0.045)),
+        ...     Derived(name="weight", unit="N", parents=("mass",),
+        ...             mechanism=Linear(weights=(9.81,))),
+        ... ])
+        >>> round(float(model.do({"mass": 0.1}).solve()["weight"]), 3)
+        0.981
+        >>> model.sample(1000, seed=0)["weight"].shape
+        (1000,)
+    """
+
+    __slots__ = ("_acts", "_declared", "_evaluator", "_interventions", "_structure")
+
+    def __init__(self, variables: Iterable[Variable]) -> None:
+        self._declared = checked(variables)
+        self._structure: Structure | None = Structure(self._declared)
+        self._evaluator = Evaluator(self._declared)
+        self._interventions: dict[str, Intervention] = {}
+        self._acts: dict[str, Act] = {}
+
+    # --- looking ------------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._declared)
+
+    def __len__(self) -> int:
+        return len(self._declared)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._declared
+
+    def __getitem__(self, name: str) -> Variable:
+        """Give the variable as it is in this model: ``Fixed`` where ``do`` has set it.
+
+        Raises:
+            UnknownVariable: No variable has this name.
+        """
+        variable = self.declared(name)
+        act = self._acts.get(name)
+        if act is None or isinstance(act.intervention, SOFT):
+            return variable
+        common = variable.model_dump(
+            include=set(Variable.model_fields) - {"name", "bounds", "a", "b"}
+        )
+        spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
+        if isinstance(act.intervention, Hard):
+            value = np.ravel(self._evaluator.forced(name, act, {}, None)).tolist()
+            return Fixed(
+                name=name,
+                value=value if variable.shape else value[0],
+                intervenable=True,
+                **common,
+                **spaces,
+            )
+        default = tuple([0.0] * int(np.prod(variable.shape))) if variable.shape else 0.0
+        source = source_of(act)
+        return Exogenous(name=name, default=default, distribution=source, **common, **spaces)
+
+    def declared(self, name: str) -> Variable:
+        """Give the variable as it was declared, before any intervention.
+
+        Raises:
+            UnknownVariable: No variable has this name.
+        """
+        try:
+            return self._declared[name]
+        except KeyError:
+            raise UnknownVariable(name, self._declared) from None
+
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """All variables as declared."""
+        return tuple(self._declared.values())
+
+    @property
+    def interventions(self) -> Mapping[str, Intervention]:
+        """What ``do`` has set, by requested name."""
+        return dict(self._interventions)
+
+    @property
+    def structure(self) -> Structure:
+        """The edges of this model; those into a cut variable are gone."""
+        if self._structure is None:
+            self._structure = Structure({name: self[name] for name in self._declared})
+        return self._structure
+
+    @property
+    def edges(self) -> tuple[Edge, ...]:
+        """All edges."""
+        return self.structure.edges
+
+    def parents(self, name: str) -> tuple[str, ...]:
+        """Name the direct causes, of any lag."""
+        return self.structure.parents(self.declared(name).name)
+
+    def children(self, name: str) -> tuple[str, ...]:
+        """Name the direct effects, of any lag."""
+        return self.structure.children(self.declared(name).name)
+
+    def ancestors(self, name: str) -> frozenset[str]:
+        """Name the direct and indirect causes."""
+        return self.structure.ancestors(self.declared(name).name)
+
+    def descendants(self, name: str) -> frozenset[str]:
+        """Name the direct and indirect effects."""
+        return self.structure.descendants(self.declared(name).name)
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, SCM)
+            and self._declared == other._declared
+            and self._interventions == other._interventions
+        )
+
+    __hash__ = None  # type: ignore[assignment] # compared by content
+
+    def __repr__(self) -> str:
+        held = f", do({', '.join(self._interventions)})" if self._interventions else ""
+        return f"SCM({len(self)} variables{held})"
+
+    # --- intervening --------------------------------------------------------------------------
+
+    def target(self, name: str) -> str:
+        """Name the variable that an intervention acts on: for coordinates, the quantity itself."""
+        variable = self.declared(name)
+        if isinstance(variable, Derived) and variable.inverse is not None:
+            return variable.parents[0].name
+        return name
+
+    def do(self, request: Mapping[str, Any]) -> SCM:
+        """Intervene: return the mutilated model and leave this one as it is.
+
+        A later intervention on a variable takes the place of an earlier one, so that
+        ``model.do(a).do(b) == model.do({**a, **b})``.
+
+        Args:
+            request: Values or interventions by name, dotted or nested.
+
+        Raises:
+            InterventionError: With every problem of the request.
+        """
+        return self._do(request, any_variable=False)
+
+    def hold(self, request: Mapping[str, Any]) -> SCM:
+        """Like ``do``, but for readouts too.
+
+        No experiment can do this in the world; it isolates a direct effect in the model.
+        """
+        return self._do(request, any_variable=True)
+
+    def _do(self, request: Mapping[str, Any], *, any_variable: bool) -> SCM:
+        accepted: dict[str, Intervention] = {}
+        problems: list[InterventionError] = []
+        targets: dict[str, str] = {}
+        for name, value in flatten(request).items():
+            try:
+                accepted[name] = self._accept(name, value, any_variable=any_variable)
+                target = self.target(name)
+                if target in targets:
+                    raise ConflictingTargets((targets[target], name), target)
+                targets[target] = name
+            except InterventionError as problem:
+                problems.append(problem)
+        raise_all(problems)
+        return self.with_interventions(accepted)
+
+    def with_interventions(self, accepted: Mapping[str, Intervention]) -> SCM:
+        """Apply interventions that have been checked already."""
+        model = object.__new__(SCM)
+        model._declared = self._declared
+        model._evaluator = self._evaluator
+        model._interventions = {**self._interventions}
+        model._acts = {**self._acts}
+        for name, intervention in accepted.items():
+            target = self.target(name)
+            replaced = model._acts.get(target)
+            if replaced is not None:
+                model._interventions.pop(replaced.requested.name, None)
+            model._acts[target] = Act(intervention, self._declared[name])
+            model._interventions[name] = intervention
+        model._structure = None if accepted else self._structure
+        return model
+
+    def _accept(self, name: str, value: Any, *, any_variable: bool) -> Intervention:
+        variable = self.declared(name)
+        target = self.declared(self.target(name))
+        if not any_variable and not target.settable:
+            reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
+            raise NotIntervenable(name, reason, self._settable_causes(target.name))
+        if isinstance(value, Draw):
+            if isinstance(value.source, str) and variable.space(value.source) is None:
+                raise NotIntervenable(name, f"has no space {value.source}")
+            return value
+        if isinstance(value, Shift | Scale):
+            coerce(variable, value.by) if np.ndim(value.by) else coerce(
+                variable, np.full(variable.shape, value.by)
+            )
+            return value
+        number = coerce(variable, value.value if isinstance(value, Hard) else value)
+        if variable.bounds is not None and not variable.bounds.parents():
+            check_bounds(variable, number, {})
+        return Hard(number.tolist())
+
+    def _settable_causes(self, name: str) -> list[str]:
+        base = Structure(self._declared) if self._structure is None else self._structure
+        return sorted(
+            cause
+            for cause in base.ancestors(name)
+            if self._declared[cause].settable and self.target(cause) == cause
+        )
+
+    # --- solving ------------------------------------------------------------------------------
+
+    def solve(
+        self,
+        known: Values | None = None,
+        *,
+        previous: Values | None = None,
+        moment: Moment | None = None,
+        only: Iterable[str] | None = None,
+    ) -> dict[str, Value]:
+        """Compute every variable from the exogenous ones.
+
+        Values may carry leading batch axes, which broadcast.
+
+        Args:
+            known: Values of exogenous and measured variables and of actions.
+            previous: Values of one control step ago, for parents of lag 1. Where it is not
+                given, they are the declared ``start`` or default of the parent.
+            moment: Where to draw noise. Without it exogenous variables take their default and
+                noise terms are zero.
+            only: Compute these, in the order of the model, and take the rest from ``known``.
+
+        Returns:
+            All variables, shape ``(..., *shape)`` each.
+
+        Raises:
+            ModelError: A measured variable or an action has no value.
+        """
+        values: dict[str, Value] = dict(known or {})
+        evaluate = self._evaluator.evaluate
+        base = self._structure.order if self._structure is not None else self.structure.order
+        for name in base if only is None else only:
+            values[name] = evaluate(name, self._acts.get(name), values, previous or {}, moment)
+        return values
+
+    def sample(
+        self, n: int, *, seed: int, first: int = 0, steps: int | None = None
+    ) -> dict[str, Value]:
+        """Draw from the model.
+
+        Args:
+            n: How many episodes.
+            seed: Of the noise.
+            first: Number of the first episode: ``sample(1, first=i)`` is row i of a larger draw.
+            steps: For a model with lagged edges, how many control steps.
+
+        Returns:
+            Every variable, shape ``(n, *shape)``, or ``(n, steps, *shape)``.
+
+        Raises:
+            ModelError: The model has lagged edges and ``steps`` is not given.
+        """
+        noise = Noise(seed)
+        if steps is None:
+            if any(edge.lag for edge in self.edges):
+                raise ModelError(["the model has lagged edges: say how many steps to sample"])
+            solved = self.solve(moment=Moment(noise, first, 0, n))
+            return {name: self._spread(name, value, n) for name, value in solved.items()}
+        slices: list[dict[str, Value]] = []
+        for step in range(steps):
+            before = slices[-1] if slices else None
+            solved = self.solve(previous=before, moment=Moment(noise, first, step, n))
+            slices.append({name: self._spread(name, v, n) for name, v in solved.items()})
+        return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
+
+    def _spread(self, name: str, value: Value, n: int) -> Value:
+        return np.broadcast_to(value, (n, *self._declared[name].shape))

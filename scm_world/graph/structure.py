@@ -1,0 +1,186 @@
+"""The skeleton of a causal model: who points at whom, checked once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
+from typing import final
+
+from scm_world.errors import ModelError, nearest
+from scm_world.variables import Derived, Space, Variable
+
+
+@final
+@dataclass(frozen=True)
+class Edge:
+    """A causal arrow.
+
+    Attributes:
+        cause: Name of the parent.
+        effect: Name of the child.
+        lag: 0 or 1 control steps.
+        when: The condition under which it holds, or None.
+    """
+
+    cause: str
+    effect: str
+    lag: int = 0
+    when: str | None = None
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Cause, effect and lag: what discovery can find out."""
+        return (self.cause, self.effect, self.lag)
+
+
+@final
+class Structure:
+    """The edges among some variables, without what they mean.
+
+    Args:
+        variables: By name, in the order of declaration.
+
+    Raises:
+        ModelError: Contemporaneous edges form a cycle.
+    """
+
+    def __init__(self, variables: Mapping[str, Variable]) -> None:
+        self.edges = tuple(
+            Edge(parent.name, name, parent.lag, parent.when)
+            for name, variable in variables.items()
+            for parent in variable.all_parents
+        )
+        self._names = tuple(variables)
+        self.order = _topological(self._names, self.edges)
+
+    @cached_property
+    def _adjacency(self) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+        parents: dict[str, list[str]] = {name: [] for name in self._names}
+        children: dict[str, list[str]] = {name: [] for name in self._names}
+        for edge in self.edges:
+            if edge.cause not in parents[edge.effect]:
+                parents[edge.effect].append(edge.cause)
+                children[edge.cause].append(edge.effect)
+        return parents, children
+
+    def parents(self, name: str) -> tuple[str, ...]:
+        """Name the direct causes, of any lag."""
+        return tuple(self._adjacency[0][name])
+
+    def children(self, name: str) -> tuple[str, ...]:
+        """Name the direct effects, of any lag."""
+        return tuple(self._adjacency[1][name])
+
+    def ancestors(self, name: str) -> frozenset[str]:
+        """Name the direct and indirect causes; a variable that drives itself is one of them."""
+        return _reachable(name, self._adjacency[0])
+
+    def descendants(self, name: str) -> frozenset[str]:
+        """Name the direct and indirect effects."""
+        return _reachable(name, self._adjacency[1])
+
+    @cached_property
+    def instant_children(self) -> dict[str, tuple[str, ...]]:
+        """For each variable, the ones that follow it within the same instant."""
+        children: dict[str, list[str]] = {name: [] for name in self._names}
+        for edge in self.edges:
+            if edge.lag == 0 and edge.when != "set":
+                children[edge.cause].append(edge.effect)
+        return {name: tuple(found) for name, found in children.items()}
+
+    def instant_descendants(self, names: Iterable[str]) -> list[str]:
+        """List what follows some variables within the same instant, causes before effects."""
+        found: set[str] = set()
+        stack = list(names)
+        while stack:
+            for child in self.instant_children[stack.pop()]:
+                if child not in found:
+                    found.add(child)
+                    stack.append(child)
+        return [name for name in self.order if name in found] if found else []
+
+
+def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
+    found: set[str] = set()
+    stack = list(step[name])
+    while stack:
+        here = stack.pop()
+        if here not in found:
+            found.add(here)
+            stack.extend(step[here])
+    return frozenset(found)
+
+
+def _topological(names: Iterable[str], edges: Iterable[Edge]) -> tuple[str, ...]:
+    sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(names, ()))
+    for edge in edges:
+        if edge.lag == 0:
+            sorter.add(edge.effect, edge.cause)
+    try:
+        return tuple(sorter.static_order())
+    except CycleError as error:
+        cycle = " → ".join(reversed(error.args[1]))
+        raise ModelError([f"contemporaneous edges form a cycle: {cycle}"]) from None
+
+
+def _space_parents(variable: Variable) -> Iterable[tuple[str, str]]:
+    spaces: dict[str, Space | None] = {
+        "bounds": variable.bounds,
+        "space A": variable.a,
+        "space B": variable.b,
+    }
+    for label, space in spaces.items():
+        for parent in () if space is None else space.parents():
+            yield label, parent
+
+
+def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
+    seen: set[tuple[str, int]] = set()
+    for parent in variable.all_parents:
+        if parent.name not in known:
+            hint = nearest(parent.name, known)
+            suggestion = f"; did you mean {hint!r}?" if hint else ""
+            yield f"{variable.name!r} has the unknown parent {parent.name!r}{suggestion}"
+        if (parent.name, parent.lag) in seen:
+            yield f"{variable.name!r} names the parent {parent.name!r} twice with lag {parent.lag}"
+        seen.add((parent.name, parent.lag))
+    for label, name in _space_parents(variable):
+        if name not in known:
+            yield f"{label} of {variable.name!r} depends on the unknown variable {name!r}"
+    if isinstance(variable, Derived) and variable.inverse is not None:
+        target = known.get(variable.parents[0].name)
+        if isinstance(target, Derived) and target.inverse is not None:
+            yield f"{variable.name!r} are coordinates of coordinates {target.name!r}"
+        elif target is not None and target.shape != variable.shape and not target.settable:
+            yield f"{variable.name!r} are coordinates of {target.name!r}, which cannot be set"
+
+
+def checked(variables: Iterable[Variable]) -> dict[str, Variable]:
+    """Index variables by name, or raise one error that lists everything that is wrong.
+
+    Raises:
+        ModelError: Duplicate names, unknown parents, contemporaneous cycles.
+    """
+    by_name: dict[str, Variable] = {}
+    problems: list[str] = []
+    for variable in variables:
+        if variable.name in by_name:
+            problems.append(f"{variable.name!r} is declared twice")
+        by_name[variable.name] = variable
+    for variable in by_name.values():
+        problems.extend(_variable_problems(variable, by_name))
+    known_edges = [
+        Edge(parent.name, variable.name, parent.lag)
+        for variable in by_name.values()
+        for parent in variable.all_parents
+        if parent.name in by_name
+    ]
+    try:
+        _topological(by_name, known_edges)
+    except ModelError as error:
+        problems.extend(error.problems)
+    if problems:
+        raise ModelError(problems)
+    return by_name

@@ -1,0 +1,100 @@
+"""Whether a value may be given to a variable, and the error that says why not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from scm_world._types import Value, Values
+from scm_world.errors import (
+    NotFinite,
+    OutOfBounds,
+    OutOfSpace,
+    WrongShape,
+    WrongType,
+)
+from scm_world.variables.kinds import SpaceName, Variable
+
+
+def _expected(variable: Variable) -> str:
+    noun = {"real": "numbers", "integer": "whole numbers", "categorical": "whole numbers"}
+    where = f" of shape {variable.shape}" if variable.shape else ""
+    return f"{noun[variable.dtype]}{where}"
+
+
+def coerce(variable: Variable, value: Any) -> Value:
+    """Turn what a user gave into a value of the variable.
+
+    Returns:
+        An array of the declared shape; float64 for a real variable, int64 else.
+
+    Raises:
+        WrongType: It is not a number, or not a whole one where one is asked for.
+        WrongShape: It has another shape.
+        NotFinite: It has a NaN or an infinity.
+    """
+    try:
+        given = np.asarray(value)
+    except (ValueError, TypeError):  # a ragged list, or an object that refuses
+        raise WrongType(variable.name, value, _expected(variable)) from None
+    if given.dtype.kind not in "iuf":
+        raise WrongType(variable.name, value, _expected(variable))
+    if given.shape != variable.shape:
+        raise WrongShape(variable.name, value, variable.shape, given.shape)
+    if not np.isfinite(given).all():
+        raise NotFinite(variable.name, value)
+    if variable.dtype == "real":
+        return given.astype(np.float64)
+    if given.dtype.kind == "f" and (given != np.rint(given)).any():
+        raise WrongType(variable.name, value, _expected(variable))
+    return given.astype(np.int64)
+
+
+def _plain(value: Any) -> Any:
+    return np.asarray(value).tolist()
+
+
+def check_bounds(variable: Variable, value: Value, values: Values) -> None:
+    """Refuse what is physically impossible.
+
+    Raises:
+        OutOfBounds: With the nearest value that is possible.
+    """
+    bounds = variable.bounds
+    if bounds is not None and not bounds.contains(value, values):
+        raise OutOfBounds(
+            variable.name,
+            _plain(value),
+            allowed=bounds.describe(variable.shape, values),
+            nearest=_plain(bounds.nearest(value, values)),
+            unit=variable.unit,
+        )
+
+
+def check_space(variable: Variable, value: Value, space: SpaceName, values: Values) -> None:
+    """Refuse what lies outside the space that was asked for.
+
+    Raises:
+        OutOfSpace: With the nearest value of the space.
+    """
+    declared = variable.space(space)
+    if declared is None:
+        raise OutOfSpace(
+            variable.name,
+            _plain(value),
+            space=space,
+            allowed="∅ (none is declared)",
+            nearest=None,
+            unit=variable.unit,
+        )
+    if not variable.in_space(value, space, values):
+        raise OutOfSpace(
+            variable.name,
+            _plain(value),
+            space=space,
+            allowed=declared.describe(variable.shape, values)
+            + (" without A" if space == "B" and variable.a is not None else ""),
+            nearest=_plain(declared.nearest(value, values)),
+            unit=variable.unit,
+        )

@@ -1,0 +1,85 @@
+"""What one can do to a variable, as values.
+
+A plain number or array is the hard intervention: the variable is cut from its parents and held
+at this value. ``Shift`` and ``Scale`` keep the parents and change what they say; ``Draw`` cuts
+them and draws.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, final
+
+from pydantic import Field
+
+from scm_world.variables.kinds import SpaceName
+from scm_world.variables.spaces import Box, Categories, Either, Frozen, Integers, Normal
+
+Number = float | tuple[float, ...]
+
+
+def _number(value: Any) -> Any:
+    return tuple(value) if hasattr(value, "__len__") else value
+
+
+@final
+class Hard(Frozen):
+    """Set a variable to a value, whatever its parents say."""
+
+    kind: Literal["hard"] = "hard"
+    value: Number
+
+    def __init__(self, value: Any, **fields: Any) -> None:
+        super().__init__(value=_number(value), **fields)  # type: ignore[call-arg]
+
+
+@final
+class Shift(Frozen):
+    """Add to what a variable would have been. Its parents go on mattering.
+
+    Example:
+        >>> Shift(0.1)
+        Shift(kind='shift', by=0.1)
+    """
+
+    kind: Literal["shift"] = "shift"
+    by: Number
+
+    def __init__(self, by: Any, **fields: Any) -> None:
+        super().__init__(by=_number(by), **fields)  # type: ignore[call-arg]
+
+
+@final
+class Scale(Frozen):
+    """Multiply what a variable would have been. Its parents go on mattering."""
+
+    kind: Literal["scale"] = "scale"
+    by: Number
+
+    def __init__(self, by: Any, **fields: Any) -> None:
+        super().__init__(by=_number(by), **fields)  # type: ignore[call-arg]
+
+
+@final
+class Draw(Frozen):
+    """Draw a variable from its space ``"A"``, ``"B"`` or ``"A|B"``, or from a distribution.
+
+    Example:
+        >>> Draw("A").source
+        'A'
+    """
+
+    kind: Literal["draw"] = "draw"
+    source: (
+        SpaceName
+        | Annotated[Box | Integers | Categories | Either | Normal, Field(discriminator="kind")]
+    )
+
+    def __init__(self, source: Any, **fields: Any) -> None:
+        super().__init__(source=source, **fields)  # type: ignore[call-arg]
+
+
+Intervention = Annotated[Hard | Shift | Scale | Draw, Field(discriminator="kind")]
+"""Anything that ``do`` accepts, once a plain value has become ``Hard``."""
+
+SOFT = (Shift, Scale)
+"""The interventions that leave the parents in place."""

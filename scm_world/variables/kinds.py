@@ -1,0 +1,277 @@
+"""The kinds of variable. One declaration per variable; it reads like a row of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+
+from scm_world._types import Value, Values
+from scm_world.variables.mechanisms import Function, Linear, Mechanism
+from scm_world.variables.spaces import Distribution, Either, Frozen, Space
+
+Number = float | tuple[float, ...]
+Role = Literal["parameter", "state", "readout", "action"]
+SpaceName = Literal["A", "B", "A|B"]
+
+
+def _as_number(value: Any) -> Any:
+    if isinstance(value, np.ndarray | list):
+        flat = tuple(float(x) for x in np.ravel(value))
+        return flat if np.ndim(value) else flat[0]
+    return value
+
+
+def _as_mechanism(value: Any) -> Any:
+    return (
+        Function(value) if callable(value) and not isinstance(value, Function | Linear) else value
+    )
+
+
+AsNumber = Annotated[Number, BeforeValidator(_as_number)]
+AsMechanism = Annotated[Mechanism, BeforeValidator(_as_mechanism)]
+
+
+@final
+class Parent(Frozen):
+    """An edge into a variable.
+
+    Attributes:
+        name: The cause.
+        lag: 0 where the cause acts at once, 1 where it acts one control step later.
+        when: Under which condition the edge holds, None for always: ``"contact"`` while the
+            bodies are in one contact island, ``"set"`` at the start of an episode and at the
+            instant of an intervention.
+    """
+
+    name: str
+    lag: Literal[0, 1] = 0
+    when: Literal["contact", "set"] | None = None
+
+    def __init__(self, name: Any = None, lag: int = 0, when: str | None = None) -> None:
+        super().__init__(name=name, lag=lag, when=when)  # type: ignore[call-arg]
+
+
+def _as_parents(value: Any) -> Any:
+    if isinstance(value, str):
+        raise ValueError(f"parents must be a sequence of names, got the text {value!r}")
+    return tuple(Parent(p) if isinstance(p, str) else p for p in value)
+
+
+AsParents = Annotated[tuple[Parent, ...], BeforeValidator(_as_parents)]
+
+
+class Variable(Frozen):
+    """What all kinds have in common.
+
+    Attributes:
+        name: ``"<entity>.<quantity>"``.
+        unit: SI unit; ``"1"`` for a pure number.
+        shape: Of one value.
+        dtype: ``"real"``, ``"integer"`` or ``"categorical"``.
+        bounds: What is physically possible, or None for anything finite.
+        a: The training space, or None.
+        b: The held-out space, or None. A point that lies in both belongs to A.
+        doc: One sentence.
+    """
+
+    name: str = Field(min_length=1)
+    unit: str = "1"
+    shape: tuple[int, ...] = ()
+    dtype: Literal["real", "integer", "categorical"] = "real"
+    bounds: Space | None = None
+    a: Space | None = None
+    b: Space | None = None
+    doc: str = ""
+
+    @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        """The edges into this variable."""
+        return ()
+
+    @property
+    def role(self) -> Role:
+        """What an intervention on it means."""
+        return "parameter"
+
+    @property
+    def settable(self) -> bool:
+        """Whether ``do`` accepts it."""
+        return True
+
+    def array(self, value: Any) -> Value:
+        """Turn a number, or a flat tuple, into a value of the declared dtype and shape."""
+        kind = np.float64 if self.dtype == "real" else np.int64
+        return np.asarray(value, dtype=kind).reshape(self.shape)
+
+    def space(self, name: SpaceName) -> Space | None:
+        """Give one of the declared spaces, or their union; None where it is not declared."""
+        match name:
+            case "A":
+                return self.a
+            case "B":
+                return self.b
+            case _:
+                both = self.a is not None and self.b is not None and self.a != self.b
+                return Either(self.a, self.b) if both else (self.a or self.b)
+
+    def in_space(self, value: Value, name: SpaceName, values: Values) -> bool:
+        """Tell whether a value lies in a space, given the values of the other variables."""
+        space = self.space(name)
+        if space is None or not space.contains(value, values):
+            return False
+        return name != "B" or self.a is None or not self.a.contains(value, values)
+
+    @model_validator(mode="after")
+    def _categories_are_listed(self) -> Variable:
+        if self.dtype == "categorical" and self.bounds is None:
+            raise ValueError(f"{self.name}: a categorical variable needs bounds=Categories(…)")
+        return self
+
+
+@final
+class Exogenous(Variable):
+    """A root: its default, or a draw from its distribution.
+
+    Attributes:
+        default: The value without a draw.
+        distribution: Where ``sample`` draws from; None for the default.
+    """
+
+    kind: Literal["exogenous"] = "exogenous"
+    default: AsNumber = 0.0
+    distribution: Distribution | None = None
+
+    @model_validator(mode="after")
+    def _default_fits(self) -> Exogenous:
+        if np.ndim(self.default) == 0 and self.shape != ():
+            raise ValueError(f"{self.name}: the default has no components, the shape {self.shape}")
+        if np.size(self.default) != int(np.prod(self.shape)):
+            raise ValueError(f"{self.name}: the default does not have the shape {self.shape}")
+        return self
+
+
+@final
+class Derived(Variable):
+    """A Python function of its parents.
+
+    Attributes:
+        parents: Its causes, in the order in which the mechanism takes them.
+        mechanism: The function.
+        noise: Distribution of its own noise, or None. The mechanism takes it as ``noise=``.
+        start: The value that lagged children see before the first step.
+        inverse: For other coordinates of one quantity (cylindrical for Cartesian): the function
+            from a value of this variable to the one of its only parent. An intervention on this
+            variable is then one on the parent.
+    """
+
+    kind: Literal["derived"] = "derived"
+    parents: AsParents
+    mechanism: AsMechanism
+    noise: Distribution | None = None
+    start: AsNumber = 0.0
+    inverse: AsMechanism | None = None
+
+    @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        """The edges into this variable."""
+        return self.parents
+
+    @model_validator(mode="after")
+    def _fits(self) -> Derived:
+        if self.inverse is not None and len(self.parents) != 1:
+            raise ValueError(f"{self.name}: coordinates have exactly one parent")
+        weights = self.mechanism.weights if isinstance(self.mechanism, Linear) else self.parents
+        if len(weights) != len(self.parents):
+            raise ValueError(f"{self.name}: {len(weights)} weights for {len(self.parents)} parents")
+        return self
+
+
+@final
+class Measured(Variable):
+    """Something that physics decides, or a readout of it.
+
+    A state (``mechanism`` None, ``settable_state`` True) can be set at an instant; physics
+    carries it on. A readout cannot be set.
+
+    Attributes:
+        parents: Its causes.
+        mechanism: The function of the parents, for a readout that is computed; None where the
+            engine itself is the mechanism.
+        settable_state: Whether ``do`` may set it at an instant.
+        default: The value at the start of an episode, for a state without ``start``.
+        start: The value at the start as a function of the parents with ``when="set"``.
+        carry: How an intervention on a parent with ``when="set"`` moves a state at once:
+            a function of (the present value, those parents before, those parents after).
+    """
+
+    kind: Literal["measured"] = "measured"
+    parents: AsParents = ()
+    mechanism: AsMechanism | None = None
+    settable_state: bool = False
+    default: AsNumber | None = None
+    start: AsMechanism | None = None
+    carry: AsMechanism | None = None
+
+    @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        """The edges into this variable."""
+        return self.parents
+
+    @property
+    def role(self) -> Role:
+        """``"state"`` where it can be set, else ``"readout"``."""
+        return "state" if self.settable_state else "readout"
+
+    @property
+    def settable(self) -> bool:
+        """Whether ``do`` accepts it."""
+        return self.settable_state
+
+    def set_parents(self) -> tuple[str, ...]:
+        """Name the parents that act when the state is set."""
+        return tuple(p.name for p in self.parents if p.when == "set")
+
+
+@final
+class Action(Variable):
+    """What the policy decides at every control step."""
+
+    kind: Literal["action"] = "action"
+
+    @property
+    def role(self) -> Role:
+        """``"action"``."""
+        return "action"
+
+
+@final
+class Fixed(Variable):
+    """A constant: what ``do`` puts in the place of a variable, or a fact that cannot change.
+
+    Attributes:
+        value: The constant.
+        intervenable: Whether ``do`` may put another one there.
+    """
+
+    kind: Literal["fixed"] = "fixed"
+    value: AsNumber
+    intervenable: bool = False
+
+    @property
+    def settable(self) -> bool:
+        """Whether ``do`` accepts it."""
+        return self.intervenable
+
+
+AnyVariable = Annotated[
+    Exogenous | Derived | Measured | Action | Fixed, Field(discriminator="kind")
+]
+"""Any declaration, told apart by its ``kind``."""
+
+
+def names(parents: Sequence[Parent], *, lag: int | None = None) -> tuple[str, ...]:
+    """Name parents, of one lag or of all."""
+    return tuple(p.name for p in parents if lag is None or p.lag == lag)

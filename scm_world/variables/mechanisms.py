@@ -1,0 +1,145 @@
+"""Structural equations: how a variable follows from its parents.
+
+A mechanism is called with the values of the parents, in their order, and, where the variable has
+noise, with ``noise=``. Values carry leading batch axes; write ``size[..., 2] / 2``, not
+``size[2] / 2``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+
+from scm_world._types import Value
+from scm_world.errors import ModelError
+from scm_world.variables.spaces import Frozen
+
+Constant = float | tuple[float, ...]
+
+
+@final
+class Function(Frozen):
+    """A Python function of the parents.
+
+    Args:
+        function: The function itself, or ``"module:name"``. Only a function that can be found
+            under its name survives a JSON round trip; a lambda works until then.
+        constants: Passed to it by keyword.
+
+    From a file, a name is looked up in modules of this package only, unless the reader names
+    further ones (``SCM.from_json(text, trusted=("my_package",))``): reading never runs code that
+    the reader did not ask for.
+    """
+
+    kind: Literal["function"] = "function"
+    reference: str
+    constants: dict[str, Constant] = Field(default_factory=dict)
+    _function: Callable[..., Any] | None = PrivateAttr(default=None)
+
+    def __init__(self, function: Any = None, **fields: Any) -> None:
+        if callable(function):
+            fields["reference"] = f"{function.__module__}:{function.__qualname__}"
+        elif function is not None:
+            fields["reference"] = function
+        super().__init__(**fields)
+        if callable(function):
+            self._function = function
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_callable(cls, data: Any) -> Any:
+        return data if isinstance(data, dict) else {"reference": data}
+
+    @field_validator("reference")
+    @classmethod
+    def _is_trusted(cls, reference: str, info: ValidationInfo) -> str:
+        trusted = (info.context or {}).get("trusted")
+        if trusted is not None and not any(
+            reference.split(":")[0].split(".")[0] == package for package in trusted
+        ):
+            raise ValueError(
+                f"{reference!r} lies outside the trusted packages {trusted}; "
+                "pass trusted=(…) to read it"
+            )
+        return reference
+
+    def is_portable(self) -> bool:
+        """Tell whether the function can be found again under its name."""
+        try:
+            return self._look_up() is self.resolve()
+        except (ModelError, AttributeError, ImportError):
+            return False
+
+    def _look_up(self) -> Callable[..., Any]:
+        module, _, name = self.reference.partition(":")
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+        if not callable(found):
+            raise ModelError([f"{self.reference!r} is not a function"])
+        return found  # type: ignore[no-any-return]
+
+    def resolve(self) -> Callable[..., Any]:
+        """Give the function, importing its module if need be."""
+        if self._function is None:
+            self._function = self._look_up()
+        return self._function
+
+    def bind(self) -> Callable[..., Any]:
+        """Give a callable with the constants filled in."""
+        function = self.resolve()
+        if not self.constants:
+            return function
+        constants = {key: np.asarray(value, float) for key, value in self.constants.items()}
+
+        def bound(*parents: Value, **noise: Value) -> Any:
+            return function(*parents, **constants, **noise)
+
+        return bound
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Function)
+            and (self.reference, self.constants) == (other.reference, other.constants)
+            and ("<" not in self.reference or self._function is other._function)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.reference, tuple(sorted(self.constants))))
+
+
+@final
+class Linear(Frozen):
+    """A weighted sum of the parents, plus an intercept, plus the noise.
+
+    Attributes:
+        weights: One for each parent.
+        intercept: Summand.
+    """
+
+    kind: Literal["linear"] = "linear"
+    weights: tuple[float, ...]
+    intercept: float = 0.0
+
+    def bind(self) -> Callable[..., Any]:
+        """Give the function of the parents."""
+        weights, intercept = self.weights, self.intercept
+
+        def linear(*parents: Value, noise: Value | float = 0.0) -> Any:
+            total = noise + intercept
+            for weight, parent in zip(weights, parents, strict=True):
+                total = total + weight * parent
+            return total
+
+        return linear
+
+    def is_portable(self) -> bool:
+        """Tell that numbers can always be written down."""
+        return True
+
+
+Mechanism = Annotated[Function | Linear, Field(discriminator="kind")]

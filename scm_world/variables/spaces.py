@@ -1,0 +1,323 @@
+"""Sets of values: hard bounds, the training space A and the held-out space B.
+
+The bounds of a space may depend on the present values of other variables (the height of a block
+that lies on the floor is half its size). They are evaluated when asked, never stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from scm_world._types import Floats, Value, Values
+
+TOLERANCE = 1e-9
+"""How far outside a closed interval a number still counts as inside, so that a value computed
+from a parent, or read from a file, is not refused for its last digit."""
+
+
+class Frozen(BaseModel):
+    """A declaration: immutable, strict about its fields, and the same after a JSON round trip."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+
+@final
+class Affine(Frozen):
+    """A bound that follows another variable: ``offset + scale * parent[index]``.
+
+    Attributes:
+        parent: Name of the variable.
+        index: Which component of it, or None for a scalar.
+        scale: Factor.
+        offset: Summand.
+    """
+
+    parent: str
+    index: int | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def evaluate(self, values: Values) -> Floats:
+        """Compute the bound from the values of the variables."""
+        parent = np.asarray(values[self.parent], dtype=np.float64)
+        component = parent if self.index is None else parent[..., self.index]
+        return np.asarray(self.offset + self.scale * component)
+
+
+Bound = float | Affine
+Bounds = Bound | tuple[Bound, ...]
+
+
+def _parents(*bounds: Bounds) -> Iterator[str]:
+    for bound in bounds:
+        for part in bound if isinstance(bound, tuple) else (bound,):
+            if isinstance(part, Affine):
+                yield part.parent
+
+
+def _evaluate(bound: Bounds, shape: tuple[int, ...], values: Values) -> Floats:
+    if not isinstance(bound, tuple):
+        number = bound.evaluate(values) if isinstance(bound, Affine) else np.float64(bound)
+        return np.broadcast_to(
+            np.asarray(number)[(..., *(None,) * len(shape))], (*np.shape(number), *shape)
+        )
+    parts = [p.evaluate(values) if isinstance(p, Affine) else np.float64(p) for p in bound]
+    stacked: Floats = np.stack(np.broadcast_arrays(*parts), axis=-1)
+    return stacked.reshape(*stacked.shape[:-1], *shape)
+
+
+class _Space(Frozen):
+    def parents(self) -> frozenset[str]:
+        """Name the variables that the bounds depend on."""
+        return frozenset()
+
+
+@final
+class Box(_Space):
+    """All points between two corners, both included.
+
+    Attributes:
+        low: One number for all components, or one for each, or a function of a parent.
+        high: Likewise.
+
+    Example:
+        >>> Box(0.015, 0.045).contains(np.array(0.02))
+        True
+        >>> floor_level = Box((0.0, Affine(parent="size", scale=0.5)), (0.1, 0.3))
+        >>> floor_level.bounds((2,), {"size": np.array(0.06)})[0]
+        array([0.  , 0.03])
+    """
+
+    kind: Literal["box"] = "box"
+    low: Bounds
+    high: Bounds
+
+    def __init__(self, low: Any, high: Any, **fields: Any) -> None:
+        super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
+
+    def parents(self) -> frozenset[str]:
+        """Name the variables that the bounds depend on."""
+        return frozenset(_parents(self.low, self.high))
+
+    def bounds(self, shape: tuple[int, ...], values: Values) -> tuple[Floats, Floats]:
+        """Evaluate both corners, each of shape ``(..., *shape)``."""
+        return _evaluate(self.low, shape, values), _evaluate(self.high, shape, values)
+
+    def contains(self, value: Value, values: Values | None = None) -> bool:
+        """Tell whether a value lies inside, borders included."""
+        low, high = self.bounds(np.shape(value), values or {})
+        return bool(np.all(value >= low - TOLERANCE) and np.all(value <= high + TOLERANCE))
+
+    def nearest(self, value: Value, values: Values | None = None) -> Value:
+        """Find the point of the box that is nearest to a value."""
+        low, high = self.bounds(np.shape(value), values or {})
+        clipped: Floats = np.clip(value, low, high)
+        return clipped
+
+    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+        """Multiply the edge lengths that are not zero."""
+        low, high = self.bounds(shape, values)
+        edges = np.ravel(high - low)
+        return float(np.prod(edges[edges > 0]))
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes."""
+        return int(np.prod(shape))
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn uniform numbers, shape ``(..., n)``, into uniform points, ``(..., *shape)``."""
+        low, high = self.bounds(shape, values)
+        unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
+        return low + (high - low) * unit
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the box down."""
+        low, high = self.bounds(shape, values)
+        return f"[{np.array2string(low, precision=6)}, {np.array2string(high, precision=6)}]"
+
+
+@final
+class Integers(_Space):
+    """All whole numbers between two ends, both included.
+
+    Example:
+        >>> Integers(1, 4).contains(np.array(4)), Integers(1, 4).contains(np.array(5))
+        (True, False)
+    """
+
+    kind: Literal["integers"] = "integers"
+    low: int
+    high: int
+
+    def __init__(self, low: int, high: int, **fields: Any) -> None:
+        super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
+
+    def contains(self, value: Value, values: Values | None = None) -> bool:
+        """Tell whether a value lies between the ends."""
+        return bool(np.all(value >= self.low) and np.all(value <= self.high))
+
+    def nearest(self, value: Value, values: Values | None = None) -> Value:
+        """Find the nearest whole number between the ends."""
+        whole: Value = np.clip(np.rint(value), self.low, self.high).astype(np.int64)
+        return whole
+
+    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+        """Count the values."""
+        return float(self.high - self.low + 1) ** int(np.prod(shape))
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes."""
+        return int(np.prod(shape))
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn uniform numbers into equally likely whole numbers."""
+        unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
+        whole: Value = (self.low + np.floor(unit * (self.high - self.low + 1))).astype(np.int64)
+        return whole
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the range down."""
+        return f"{{{self.low}, …, {self.high}}}"
+
+
+@final
+class Categories(_Space):
+    """A few whole numbers, without an order.
+
+    Example:
+        >>> Categories((1, 20)).contains(np.array(20))
+        True
+    """
+
+    kind: Literal["categories"] = "categories"
+    members: tuple[int, ...] = Field(min_length=1)
+
+    def __init__(self, members: Any, **fields: Any) -> None:
+        super().__init__(members=tuple(members), **fields)  # type: ignore[call-arg]
+
+    def contains(self, value: Value, values: Values | None = None) -> bool:
+        """Tell whether every component is a member."""
+        return bool(np.all(np.isin(value, self.members)))
+
+    def nearest(self, value: Value, values: Values | None = None) -> Value:
+        """Keep members; replace others by the first member: there is no order."""
+        kept: Value = np.where(np.isin(value, self.members), value, self.members[0])
+        return kept.astype(np.int64)
+
+    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+        """Count the values."""
+        return float(len(self.members)) ** int(np.prod(shape))
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes."""
+        return int(np.prod(shape))
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn uniform numbers into equally likely members."""
+        unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
+        index = np.floor(unit * len(self.members)).astype(np.int64)
+        return np.asarray(self.members, dtype=np.int64)[index]
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the members down."""
+        return "{" + ", ".join(map(str, self.members)) + "}"
+
+
+@final
+class Either(_Space):
+    """The union of two spaces: not their hull. A draw is uniform over both.
+
+    Example:
+        >>> gap = Either(Box(0.0, 1.0), Box(2.0, 3.0))
+        >>> gap.contains(np.array(1.5)), gap.nearest(np.array(1.7))
+        (False, array(2.))
+    """
+
+    kind: Literal["either"] = "either"
+    first: Box | Integers | Categories
+    second: Box | Integers | Categories
+
+    def __init__(self, first: Any, second: Any, **fields: Any) -> None:
+        super().__init__(first=first, second=second, **fields)  # type: ignore[call-arg]
+
+    def parents(self) -> frozenset[str]:
+        """Name the variables that the bounds depend on."""
+        return self.first.parents() | self.second.parents()
+
+    def contains(self, value: Value, values: Values | None = None) -> bool:
+        """Tell whether one of the two contains the value."""
+        return self.first.contains(value, values) or self.second.contains(value, values)
+
+    def nearest(self, value: Value, values: Values | None = None) -> Value:
+        """Find the nearest point of either."""
+        candidates = [self.first.nearest(value, values), self.second.nearest(value, values)]
+        return min(candidates, key=lambda point: float(np.sum((point - value) ** 2)))
+
+    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+        """Add the volumes of both."""
+        return self.first.volume(shape, values) + self.second.volume(shape, values)
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes: one decides which of the two."""
+        return 1 + max(self.first.n_uniforms(shape), self.second.n_uniforms(shape))
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Choose one of the two in proportion to its volume, then a point of it."""
+        share = self.first.volume(shape, values) / self.volume(shape, values)
+        draws = [
+            space.transform(uniforms[..., 1 : 1 + space.n_uniforms(shape)], shape, values)
+            for space in (self.first, self.second)
+        ]
+        which = uniforms[..., 0] < share
+        chosen: Value = np.where(which[(..., *(None,) * len(shape))], *draws)
+        return chosen
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write both down."""
+        return f"{self.first.describe(shape, values)} ∪ {self.second.describe(shape, values)}"
+
+
+@final
+class Normal(_Space):
+    """The normal distribution, component by component.
+
+    Attributes:
+        mean: Mean.
+        std: Standard deviation.
+
+    Source:
+        Box and Muller, *A note on the generation of random normal deviates*, 1958.
+    """
+
+    kind: Literal["normal"] = "normal"
+    mean: float = 0.0
+    std: float = Field(default=1.0, ge=0.0)
+
+    def __init__(self, mean: float = 0.0, std: float = 1.0, **fields: Any) -> None:
+        super().__init__(mean=mean, std=std, **fields)  # type: ignore[call-arg]
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes: two for each component."""
+        return 2 * int(np.prod(shape))
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn pairs of uniform numbers into normal ones."""
+        half = uniforms.shape[-1] // 2
+        radius = np.sqrt(-2.0 * np.log1p(-uniforms[..., :half]))
+        standard = radius * np.cos(2.0 * np.pi * uniforms[..., half:])
+        return self.mean + self.std * standard.reshape(*uniforms.shape[:-1], *shape)
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the distribution down."""
+        return f"N({self.mean:g}, {self.std:g}²)"
+
+
+Space = Annotated[Box | Integers | Categories | Either, Field(discriminator="kind")]
+"""A set that can tell whether a value is in it, and from which one can draw."""
+
+Distribution = Annotated[Box | Integers | Categories | Either | Normal, Field(discriminator="kind")]
+"""Anything one can draw from; a space stands for the uniform distribution over it."""
