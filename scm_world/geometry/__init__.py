@@ -1,0 +1,47 @@
+"""Rotations, coordinates, and how boxes and capsules lie in one another: numbers only."""
+
+from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
+from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_fraction, overlap_volume
+from scm_world.geometry.penetration import (
+    box_box,
+    box_capsule,
+    box_floor,
+    box_wall,
+    capsule_capsule,
+    capsule_floor,
+    capsule_wall,
+)
+from scm_world.geometry.rotations import (
+    angle_between,
+    canonical,
+    from_rotation_vector,
+    quaternion_inverse,
+    quaternion_product,
+    rotation_matrix,
+    to_rotation_vector,
+)
+from scm_world.geometry.sweep import Found, sweep
+
+__all__ = [
+    "Found",
+    "aabb_overlap_fraction",
+    "angle_between",
+    "box_box",
+    "box_capsule",
+    "box_floor",
+    "box_wall",
+    "canonical",
+    "capsule_capsule",
+    "capsule_floor",
+    "capsule_wall",
+    "from_cylindrical",
+    "from_rotation_vector",
+    "overlap_fraction",
+    "overlap_volume",
+    "quaternion_inverse",
+    "quaternion_product",
+    "rotation_matrix",
+    "sweep",
+    "to_cylindrical",
+    "to_rotation_vector",
+]

@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats
+from scm_world.geometry.arrays import compact, rows
 from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
 
 WORKSPACE = (5, 48, 3)
@@ -55,7 +56,11 @@ def _clip(polygon: Floats, count: int, axis: int, sign: float, bound: float, out
             out[kept, axis] = sign * bound
             kept += 1
         if depth >= 0.0:
-            out[kept, 0], out[kept, 1], out[kept, 2] = polygon[now, 0], polygon[now, 1], polygon[now, 2]
+            out[kept, 0], out[kept, 1], out[kept, 2] = (
+                polygon[now, 0],
+                polygon[now, 1],
+                polygon[now, 2],
+            )
             kept += 1
         before = now
         depth_before = depth
@@ -124,10 +129,10 @@ def _face(size_a: Floats, axis: int, sign: float, size_b: Floats, work: Floats) 
         work[0, 1, k] = center + along - across
         work[0, 2, k] = center + along + across
         work[0, 3, k] = center - along + across
-    count = _clip(work[0], 4, 1, 1.0, 0.5 * size_b[1], work[1])
-    count = _clip(work[1], count, 1, -1.0, 0.5 * size_b[1], work[0])
-    count = _clip(work[0], count, 2, 1.0, 0.5 * size_b[2], work[1])
-    count = _clip(work[1], count, 2, -1.0, 0.5 * size_b[2], work[0])
+    count = 4
+    for k in range(1, 3):
+        count = _clip(work[0], count, k, 1.0, 0.5 * size_b[k], work[1])
+        count = _clip(work[1], count, k, -1.0, 0.5 * size_b[k], work[0])
     half = 0.5 * size_b[0]
     count = _clip(work[0], count, 0, -1.0, half, work[1])
     inside = _integral(work[1], count, half)
@@ -175,7 +180,7 @@ def overlap_kernel(
             volume += _face(size_a, axis, 1.0, size_b, work)
             volume += _face(size_a, axis, -1.0, size_b, work)
     most = min(size_a[0] * size_a[1] * size_a[2], size_b[0] * size_b[1] * size_b[2])
-    return min(max(volume, 0.0), most)
+    return float(min(max(volume, 0.0), most))
 
 
 @njit(cache=True)
@@ -220,16 +225,6 @@ def overlap_fraction_kernel(
     return filled / wanted if wanted > 0.0 else 1.0
 
 
-def _array(values: ArrayLike) -> Floats:
-    """Give a writable C array: kernels are compiled for nothing else."""
-    return np.array(values, dtype=np.float64, order="C")
-
-
-def _rows(values: ArrayLike, width: int) -> Floats:
-    """Give a C array of rows, also where there are none."""
-    return _array(values).reshape(-1, width)
-
-
 def overlap_volume(
     size_a: ArrayLike,
     position_a: ArrayLike,
@@ -263,12 +258,12 @@ def overlap_volume(
     """
     return float(
         overlap_kernel(
-            _array(size_a),
-            _array(position_a),
-            _array(orientation_a),
-            _array(size_b),
-            _array(position_b),
-            _array(orientation_b),
+            compact(size_a),
+            compact(position_a),
+            compact(orientation_a),
+            compact(size_b),
+            compact(position_b),
+            compact(orientation_b),
             np.empty(WORKSPACE),
         )
     )
@@ -309,15 +304,15 @@ def overlap_fraction(
     Source:
         Ahmed et al., *CausalWorld*, ICLR 2021, "fractional success".
     """
-    blocks = (_rows(sizes, 3), _rows(positions, 3), _rows(orientations, 4))
-    goals = (_rows(goal_sizes, 3), _rows(goal_positions, 3), _rows(goal_orientations, 4))
+    blocks = (rows(sizes, 3), rows(positions, 3), rows(orientations, 4))
+    goals = (rows(goal_sizes, 3), rows(goal_positions, 3), rows(goal_orientations, 4))
     return float(overlap_fraction_kernel(*blocks, *goals))
 
 
 def _corners(sizes: ArrayLike, positions: ArrayLike, orientations: ArrayLike) -> Floats:
     """Give the lower and the upper corner of the axis-aligned hulls, shape (2, n, 3) [m]."""
-    half, center = 0.5 * _rows(sizes, 3), _rows(positions, 3)
-    spread = np.einsum("nij,nj->ni", np.abs(rotation_matrix(_rows(orientations, 4))), half)
+    half, center = 0.5 * rows(sizes, 3), rows(positions, 3)
+    spread = np.einsum("nij,nj->ni", np.abs(rotation_matrix(rows(orientations, 4))), half)
     return np.stack((center - spread, center + spread))
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats
+from scm_world.geometry.arrays import compact
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.geometry.segments import into_frame, segment_box_distance, segment_segment_distance
 
@@ -40,7 +41,7 @@ def _faces_depth(half_a: Floats, half_b: Floats, cosines: Floats, offset: Floats
             reach_a += abs(cosines[i, j]) * half_b[j]
             reach_b += abs(cosines[j, i]) * half_a[j]
             along_b += cosines[j, i] * offset[j]
-        depth = min(depth, min(reach_a - abs(offset[i]), reach_b - abs(along_b)))
+        depth = min(depth, reach_a - abs(offset[i]), reach_b - abs(along_b))
     return depth
 
 
@@ -146,13 +147,13 @@ def box_floor_kernel(half: Floats, center: Floats, rotation: Floats) -> float:
     depth = -center[2]
     for k in range(3):
         depth += abs(rotation[2, k]) * half[k]
-    return depth
+    return float(depth)
 
 
 @njit(cache=True)
 def capsule_floor_kernel(start: Floats, end: Floats, radius: float) -> float:
     """Measure how deep the lowest point of a capsule lies below z = 0 [m]."""
-    return radius - min(start[2], end[2])
+    return float(radius - min(start[2], end[2]))
 
 
 @njit(cache=True)
@@ -205,7 +206,7 @@ def _into_wall(start: Floats, end: Floats, along: float, inner: float, height: f
     beyond = math.hypot(x, y) - inner
     below = height - start[2] - along * (end[2] - start[2])
     if beyond > 0.0 and below > 0.0:
-        return min(beyond, below)
+        return float(min(beyond, below))
     return -math.hypot(min(beyond, 0.0), min(below, 0.0))
 
 
@@ -217,7 +218,7 @@ def capsule_wall_kernel(
     outermost = max(math.hypot(start[0], start[1]), math.hypot(end[0], end[1])) + radius
     lowest = min(start[2], end[2]) - radius
     if outermost <= inner or lowest >= height:
-        return min(outermost - inner, height - lowest)
+        return float(min(outermost - inner, height - lowest))
     best, deepest = 0.0, -math.inf
     for sample in range(SAMPLES + 1):
         depth = _into_wall(start, end, sample / SAMPLES, inner, height)
@@ -232,13 +233,8 @@ def capsule_wall_kernel(
             high = right
         else:
             low = left
-        deepest = max(deepest, max(depth_left, depth_right))
+        deepest = max(deepest, depth_left, depth_right)
     return radius + deepest
-
-
-def _array(values: ArrayLike) -> Floats:
-    """Give a writable C array: kernels are compiled for nothing else."""
-    return np.array(values, dtype=np.float64, order="C")
 
 
 def _box(
@@ -246,8 +242,8 @@ def _box(
 ) -> tuple[Floats, Floats, Floats]:
     """Give half edges, center and rotation of a box."""
     rotation = np.empty((3, 3))
-    rotation_kernel(_array(orientation), rotation)
-    return 0.5 * _array(size), _array(position), rotation
+    rotation_kernel(compact(orientation), rotation)
+    return 0.5 * compact(size), compact(position), rotation
 
 
 def box_box(
@@ -304,7 +300,7 @@ def box_capsule(
         spheres around both bodies meet, else minus a lower bound of the distance.
     """
     box = _box(size, position, orientation)
-    return float(box_capsule_kernel(*box, _array(start), _array(end), float(radius)))
+    return float(box_capsule_kernel(*box, compact(start), compact(end), float(radius)))
 
 
 def capsule_capsule(
@@ -328,8 +324,8 @@ def capsule_capsule(
     Returns:
         The depth [m]: the sum of the radii less the distance of the segments, always exact.
     """
-    first = _array(start_a), _array(end_a), float(radius_a)
-    return float(capsule_capsule_kernel(*first, _array(start_b), _array(end_b), float(radius_b)))
+    first = compact(start_a), compact(end_a), float(radius_a)
+    return float(capsule_capsule_kernel(*first, compact(start_b), compact(end_b), float(radius_b)))
 
 
 def box_floor(size: ArrayLike, position: ArrayLike, orientation: ArrayLike) -> float:
@@ -339,7 +335,7 @@ def box_floor(size: ArrayLike, position: ArrayLike, orientation: ArrayLike) -> f
 
 def capsule_floor(start: ArrayLike, end: ArrayLike, radius: float) -> float:
     """Measure how deep the lowest point of a capsule lies below z = 0 [m]."""
-    return float(capsule_floor_kernel(_array(start), _array(end), float(radius)))
+    return float(capsule_floor_kernel(compact(start), compact(end), float(radius)))
 
 
 def box_wall(
@@ -379,5 +375,7 @@ def capsule_wall(
         wholly within the radius or above the height, minus a lower bound of the distance.
     """
     return float(
-        capsule_wall_kernel(_array(start), _array(end), float(radius), float(inner), float(height))
+        capsule_wall_kernel(
+            compact(start), compact(end), float(radius), float(inner), float(height)
+        )
     )

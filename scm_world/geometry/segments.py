@@ -65,7 +65,9 @@ def point_segment_distance(point: Floats, start: Floats, end: Floats) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def segment_segment_distance(start_a: Floats, end_a: Floats, start_b: Floats, end_b: Floats) -> float:
+def segment_segment_distance(
+    start_a: Floats, end_a: Floats, start_b: Floats, end_b: Floats
+) -> float:
     """Measure the distance of two segments, which may be parallel or points.
 
     The nearest points are ends of a segment, or both are inside; all five cases are measured.
@@ -77,14 +79,10 @@ def segment_segment_distance(start_a: Floats, end_a: Floats, start_b: Floats, en
         end_b: Shape (3,) [m].
     """
     nearest = min(
-        min(
-            point_segment_distance(start_a, start_b, end_b),
-            point_segment_distance(end_a, start_b, end_b),
-        ),
-        min(
-            point_segment_distance(start_b, start_a, end_a),
-            point_segment_distance(end_b, start_a, end_a),
-        ),
+        point_segment_distance(start_a, start_b, end_b),
+        point_segment_distance(end_a, start_b, end_b),
+        point_segment_distance(start_b, start_a, end_a),
+        point_segment_distance(end_b, start_a, end_a),
     )
     aa, ab, bb, ao, bo = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
@@ -140,9 +138,8 @@ def _nearest_to_box(start: Point, end: Point, half: Floats) -> float:
 @njit(cache=True)
 def _inward(point: Point, half: Floats) -> float:
     """Measure how deep a point lies in a box; negative outside [m]."""
-    return min(
-        half[0] - abs(point[0]), min(half[1] - abs(point[1]), half[2] - abs(point[2]))
-    )
+    x, y, z = point
+    return float(min(half[0] - abs(x), half[1] - abs(y), half[2] - abs(z)))
 
 
 @njit(cache=True, error_model="numpy")

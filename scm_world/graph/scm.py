@@ -76,11 +76,12 @@ class SCM:
         (1000,)
     """
 
-    __slots__ = ("_acts", "_declared", "_evaluator", "_interventions", "_structure")
+    __slots__ = ("_acts", "_declared", "_evaluator", "_interventions", "_order", "_structure")
 
     def __init__(self, variables: Iterable[Variable]) -> None:
         self._declared = checked(variables)
         self._structure: Structure | None = Structure(self._declared)
+        self._order: tuple[str, ...] | None = self._structure.order
         self._evaluator = Evaluator(self._declared)
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, Act] = {}
@@ -221,7 +222,7 @@ class SCM:
         targets: dict[str, str] = {}
         for name, value in flatten(request).items():
             try:
-                accepted[name] = self._accept(name, value, any_variable=any_variable)
+                accepted[name] = self.accept(name, value, any_variable=any_variable)
                 target = self.target(name)
                 if target in targets:
                     raise ConflictingTargets((targets[target], name), target)
@@ -246,9 +247,18 @@ class SCM:
             model._acts[target] = Act(intervention, self._declared[name])
             model._interventions[name] = intervention
         model._structure = None if accepted else self._structure
+        # Cutting edges keeps every causal order valid; only a draw from a space whose bounds
+        # follow other variables adds edges.
+        draws = (a for a in model._acts.values() if isinstance(a.intervention, Draw))
+        model._order = None if any(source_of(act).parents() for act in draws) else self._order
         return model
 
-    def _accept(self, name: str, value: Any, *, any_variable: bool) -> Intervention:
+    def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
+        """Check one intervention: name, type, shape, finite, fixed bounds.
+
+        Raises:
+            InterventionError: What is wrong with it.
+        """
         variable = self.declared(name)
         target = self.declared(self.target(name))
         if not any_variable and not target.settable:
@@ -269,12 +279,19 @@ class SCM:
         return Hard(number.tolist())
 
     def _settable_causes(self, name: str) -> list[str]:
-        base = Structure(self._declared) if self._structure is None else self._structure
-        return sorted(
-            cause
-            for cause in base.ancestors(name)
-            if self._declared[cause].settable and self.target(cause) == cause
-        )
+        """Name the nearest causes that can be set, past others that cannot."""
+        found: dict[str, None] = {}
+        stack, seen = [name], {name}
+        while stack:
+            for parent in self._declared[stack.pop(0)].all_parents:
+                if parent.name in seen:
+                    continue
+                seen.add(parent.name)
+                if self._declared[parent.name].settable:
+                    found[parent.name] = None
+                else:
+                    stack.append(parent.name)
+        return list(found)
 
     # --- solving ------------------------------------------------------------------------------
 
@@ -306,8 +323,9 @@ class SCM:
         """
         values: dict[str, Value] = dict(known or {})
         evaluate = self._evaluator.evaluate
-        base = self._structure.order if self._structure is not None else self.structure.order
-        for name in base if only is None else only:
+        if self._order is None:
+            self._order = self.structure.order
+        for name in self._order if only is None else only:
             values[name] = evaluate(name, self._acts.get(name), values, previous or {}, moment)
         return values
 

@@ -145,9 +145,9 @@ makes it upright and mirrored: ``picture[::-1]``.
 
 OVERVIEW = Camera(
     name="overview",
-    eye=(0.33, -0.72, 0.62),
-    target=(0.0, 0.0, 0.11),
-    field_of_view=42.0,
+    eye=(0.3, -0.68, 0.72),
+    target=(0.0, 0.0, 0.1),
+    field_of_view=39.0,
     width=640,
     height=480,
     near=0.01,

@@ -7,8 +7,8 @@ from typing import final
 
 import numpy as np
 
-from scm_world.scene.scene import Parameters, Scene, Structure
-from scm_world.scene.state import PhysicalState
+from scm_world.scene.scene import Parameters, Scene, Structure, default_scene
+from scm_world.scene.state import ROBOT_SIZE, PhysicalState
 
 
 @final
@@ -52,5 +52,30 @@ def diff(now: Scene, then: Scene) -> Difference:
         for key, value in then.parameters.items()
         if value is not now.parameters[key] and not np.array_equal(value, now.parameters[key])
     }
-    same = np.array_equal(now.state.settable(), then.state.settable())
+    same = now.state.coincides(then.state)
     return Difference(None, changed, None if same else then.state)
+
+
+def complete(now: Scene, structure: Structure, difference: Difference) -> Difference:
+    """Fill in what a change of structure leaves unsaid.
+
+    Bodies that stay keep their parameters and their state, new ones get the defaults.
+
+    Args:
+        now: The scene before.
+        structure: The structure after.
+        difference: A change to that structure, with only some parameters, or without a state.
+
+    Returns:
+        The same change with all parameters and a state.
+    """
+    default = default_scene(structure)
+    stays = {key: value for key, value in now.parameters.items() if key in default.parameters}
+    state = difference.state
+    if state is None:
+        state = default.state
+        state.vector[:ROBOT_SIZE] = now.state.vector[:ROBOT_SIZE]
+        for index, name in enumerate(structure.blocks):
+            if name in now.structure.blocks:
+                state.blocks[index] = now.state.blocks[now.structure.blocks.index(name)]
+    return Difference(structure, {**default.parameters, **stays, **difference.parameters}, state)

@@ -84,9 +84,14 @@ class PhysicalState:
         """Shape (n, 3) [rad/s], in the world frame."""
         return self.blocks[:, 10:13]
 
+    def coincides(self, other: PhysicalState) -> bool:
+        """Tell whether all numbers but the torques are the same."""
+        mine, others = self.vector, other.vector
+        return bool((mine[:18] == others[:18]).all() and (mine[27:] == others[27:]).all())
+
     def settable(self) -> Floats:
         """Copy all numbers but the torques, shape (18 + 13 n,)."""
-        return np.delete(self.vector, np.s_[18:27])
+        return np.concatenate([self.vector[:18], self.vector[27:]])
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, PhysicalState):

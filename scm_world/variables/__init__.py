@@ -22,6 +22,7 @@ from scm_world.variables.spaces import (
     Either,
     Integers,
     Normal,
+    Rotations,
     Space,
 )
 
@@ -48,6 +49,7 @@ __all__ = [
     "Noise",
     "Normal",
     "Parent",
+    "Rotations",
     "Scale",
     "Shift",
     "Space",

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, final
 from pydantic import Field
 
 from scm_world.variables.kinds import SpaceName
-from scm_world.variables.spaces import Box, Categories, Either, Frozen, Integers, Normal
+from scm_world.variables.spaces import Distribution, Frozen
 
 Number = float | tuple[float, ...]
 
@@ -69,10 +69,7 @@ class Draw(Frozen):
     """
 
     kind: Literal["draw"] = "draw"
-    source: (
-        SpaceName
-        | Annotated[Box | Integers | Categories | Either | Normal, Field(discriminator="kind")]
-    )
+    source: SpaceName | Distribution
 
     def __init__(self, source: Any, **fields: Any) -> None:
         super().__init__(source=source, **fields)  # type: ignore[call-arg]

@@ -144,6 +144,12 @@ class Exogenous(Variable):
     default: AsNumber = 0.0
     distribution: Distribution | None = None
 
+    @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        """The variables that the bounds of its distribution follow; mostly there are none."""
+        followed = () if self.distribution is None else sorted(self.distribution.parents())
+        return tuple(Parent(name) for name in followed)
+
     @model_validator(mode="after")
     def _default_fits(self) -> Exogenous:
         if np.ndim(self.default) == 0 and self.shape != ():

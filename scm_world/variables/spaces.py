@@ -282,6 +282,55 @@ class Either(_Space):
 
 
 @final
+class Rotations(_Space):
+    """All unit quaternions (x, y, z, w); q and -q are one rotation, written with w >= 0.
+
+    Example:
+        >>> Rotations().nearest(np.array([0.0, 0.0, 0.0, -2.0]))
+        array([0., 0., 0., 1.])
+    """
+
+    kind: Literal["rotations"] = "rotations"
+
+    def contains(self, value: Value, values: Values | None = None) -> bool:
+        """Tell whether the norm is 1, to six digits."""
+        return bool(np.all(np.abs(np.linalg.norm(value, axis=-1) - 1.0) < 1e-6))
+
+    def nearest(self, value: Value, values: Values | None = None) -> Value:
+        """Scale to norm 1 and choose the sign; zero becomes the identity."""
+        norm = np.linalg.norm(value, axis=-1, keepdims=True)
+        whole = np.where(norm < 1e-12, (0.0, 0.0, 0.0, 1.0), value)
+        length = np.where(norm < 1e-12, 1.0, norm)
+        exact = np.where(np.abs(length - 1.0) < 1e-15, 1.0, length)
+        unit: Value = whole / exact * np.where(whole[..., 3:] < 0, -1.0, 1.0)
+        return unit + 0.0
+
+    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+        """Give the volume of the group, π²: half of the unit sphere in four dimensions."""
+        return float(np.pi**2)
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes."""
+        return 3
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn three uniform numbers into a uniformly distributed rotation.
+
+        Source:
+            Shoemake, *Uniform random rotations*, Graphics Gems III, 1992.
+        """
+        u, v, w = (uniforms[..., i] for i in range(3))
+        a, b = np.sqrt(1.0 - u), np.sqrt(u)
+        angle, turn = 2.0 * np.pi * v, 2.0 * np.pi * w
+        parts = (a * np.sin(angle), a * np.cos(angle), b * np.sin(turn), b * np.cos(turn))
+        return self.nearest(np.stack(parts, axis=-1))
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the set down."""
+        return "the unit quaternions"
+
+
+@final
 class Normal(_Space):
     """The normal distribution, component by component.
 
@@ -316,8 +365,10 @@ class Normal(_Space):
         return f"N({self.mean:g}, {self.std:g}²)"
 
 
-Space = Annotated[Box | Integers | Categories | Either, Field(discriminator="kind")]
+Space = Annotated[Box | Integers | Categories | Either | Rotations, Field(discriminator="kind")]
 """A set that can tell whether a value is in it, and from which one can draw."""
 
-Distribution = Annotated[Box | Integers | Categories | Either | Normal, Field(discriminator="kind")]
+Distribution = Annotated[
+    Box | Integers | Categories | Either | Rotations | Normal, Field(discriminator="kind")
+]
 """Anything one can draw from; a space stands for the uniform distribution over it."""

@@ -68,16 +68,21 @@ def _shapes(shape: Capsule | None) -> str:
     """Describe a collision shape and its picture. The finger base has a picture only."""
     if shape is None:
         return '<visual><geometry><box size="0.02 0.02 0.02"/></geometry></visual>'
-    along = tuple(end - start for start, end in zip(shape.start, shape.end, strict=True))
+    x, y, z = (end - start for start, end in zip(shape.start, shape.end, strict=True))
     middle = tuple((start + end) / 2 for start, end in zip(shape.start, shape.end, strict=True))
-    tilt = (0.0, math.atan2(math.hypot(along[0], along[1]), abs(along[2])), 0.0)
-    capsule = f'<capsule radius="{shape.radius!r}" length="{math.hypot(*along)!r}"/>'
+    tilt = (0.0, math.atan2(math.hypot(x, y), abs(z)), math.atan2(y, x))  # from the z axis
+    capsule = f'<capsule radius="{shape.radius!r}" length="{math.hypot(x, y, z)!r}"/>'
     body = f"{_origin(middle, tilt)}<geometry>{capsule}</geometry>"
     return f"<visual>{body}</visual><collision>{body}</collision>"
 
 
 def _joint(
-    parent: str, child: str, origin: tuple[float, ...], *, yaw: float = 0.0, hinge: int | None = None
+    parent: str,
+    child: str,
+    origin: tuple[float, ...],
+    *,
+    yaw: float = 0.0,
+    hinge: int | None = None,
 ) -> str:
     kind, axis = "fixed", ""
     if hinge is not None:

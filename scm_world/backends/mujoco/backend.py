@@ -23,14 +23,14 @@ from scm_world.backends.mujoco.state import (
     settle,
     write_state,
 )
-from scm_world.errors import EngineFailure, SnapshotMismatch
+from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
 from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference
+from scm_world.scene.difference import Difference, complete
 from scm_world.scene.scene import ParameterKey, Parameters, Scene, Structure
 from scm_world.scene.state import PhysicalState
 from scm_world.scene.trifinger import FINGERS, N_JOINTS
 
-# Everything that decides how MuJoCo goes on, warm start included.
+# Everything that decides how MuJoCo goes on.
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -66,6 +66,9 @@ class MujocoBackend(Backend):
     capabilities: ClassVar[Capabilities] = Capabilities()
 
     _structure: Structure | None = None
+    _instant: Instant | None
+    _written: Floats | None
+    _touches: Touches | None
 
     @property
     def version(self) -> str:
@@ -90,9 +93,13 @@ class MujocoBackend(Backend):
         self._place(scene.state.vector)
 
     def apply(self, difference: Difference) -> None:
-        """Change structure, parameters and state without advancing time."""
+        """Change structure, parameters and state without advancing time.
+
+        Raises:
+            UnknownOption: There is no such parameter. Nothing has changed.
+        """
         if difference.structure is not None:
-            self._restructure(difference.structure)
+            difference = self._restructure(difference.structure, difference)
         if difference.parameters:
             self._edit(difference.parameters)
         if difference.state is not None:
@@ -100,7 +107,13 @@ class MujocoBackend(Backend):
             self._place(difference.state.vector)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the arrays of the model."""
+        """Read parameters back from the arrays of the model.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+        """
+        keys = tuple(keys)
+        self._check(keys)
         return {key: self._slots[key].read() for key in keys}
 
     def inertia(self, body: str) -> Floats:
@@ -192,7 +205,6 @@ class MujocoBackend(Backend):
         )
         self._size = mujoco.mj_stateSize(model, _STATE)
         self._positions, self._velocities = data.qpos, data.qvel
-        self._warm_start = data.qacc_warmstart
         self._torques = data.qfrc_actuator[:N_JOINTS]
         self._command = data.ctrl[:N_JOINTS]
         self._switch(ControlMode.JOINT_POSITIONS)
@@ -212,6 +224,7 @@ class MujocoBackend(Backend):
 
     def _edit(self, parameters: Parameters) -> None:
         """Write parameters, then whatever follows from them; those in force cost nothing."""
+        self._check(parameters)
         kept, places = self._kept, self._slots
         constant = coupled = False
         for key, value in parameters.items():
@@ -237,12 +250,10 @@ class MujocoBackend(Backend):
             vector,
             self._positions,
             self._velocities,
-            self._warm_start,
             self._source,
             last.vector,
             last.positions,
             last.velocities,
-            last.warm_start,
         )
         self._written = vector.copy()
 
@@ -256,20 +267,25 @@ class MujocoBackend(Backend):
             vector,
             self._positions.copy(),
             self._velocities.copy(),
-            self._warm_start.copy(),
         )
         self._source = np.arange(self._n_blocks)
 
-    def _restructure(self, structure: Structure) -> None:
-        """Let bodies come and go; the others keep what the last physics step left."""
+    def _restructure(self, structure: Structure, difference: Difference) -> Difference:
+        """Let bodies come and go, and complete the difference with what stays as it is."""
         self._remember()
+        now = Scene(self._present, self._kept, self.state())
         torques, record = self._torques.copy(), self._last_touches()
         if structure != self._structure:
             self._load(structure)
         self._torques[:] = torques
         self._touches = record
-        last = self._instant or nothing()
-        self._source = last.source(structure.blocks)
+        self._source = (self._instant or nothing()).source(structure.blocks)
+        return complete(now, structure, difference)
+
+    def _check(self, keys: Iterable[ParameterKey]) -> None:
+        for key in keys:
+            if key not in self._slots:
+                raise UnknownOption("parameter", ".".join(key), map(".".join, self._slots))
 
     def _last_touches(self) -> Touches:
         if self._touches is None:

@@ -54,9 +54,10 @@ def judge(distributions: Mapping[str, str], libraries: list[str]) -> None:
         Traceback (most recent call last):
         scm_world.errors.MixedInstallation: the mujoco installation mixes versions ...
     """
-    if not distributions or not libraries:
+    if not distributions:
         raise MissingEngine("mujoco", f"pip install '{REQUIREMENT}'")
-    found = {**distributions, **{name: _library_version(name) for name in libraries}}
+    numbered = {name: re.search(r"\d+\.\d+\.\d+", name) for name in libraries}
+    found = {**distributions, **{name: match[0] for name, match in numbered.items() if match}}
     versions = {_numbers(version) for version in found.values()}
     if len(versions) > 1:
         raise MixedInstallation("mujoco", found, REPAIR)
@@ -74,11 +75,6 @@ def _distributions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
-
-
-def _library_version(name: str) -> str:
-    match = re.search(r"\d+\.\d+\.\d+", name)
-    return match.group() if match else "unknown"
 
 
 def _numbers(version: str) -> tuple[int, ...]:

@@ -21,7 +21,6 @@ from scm_world.scene.scene import (
 )
 from scm_world.scene.trifinger import FINGERS, link_name
 
-BASE = "robot"
 FLOOR = "floor"
 STAGE = "stage"
 SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 3 and 3
@@ -50,6 +49,11 @@ def compiled(structure: Structure) -> mujoco.MjModel:
 def shape_name(finger: str, shape: str) -> str:
     """Name a collision shape of the robot."""
     return f"{finger}/{shape}"
+
+
+def base_name(finger: str) -> str:
+    """Name the frame from which a finger hangs."""
+    return f"{finger}/base"
 
 
 def wall_name(segment: int) -> str:
@@ -89,7 +93,9 @@ def contact_pairs(blocks: tuple[str, ...]) -> Iterator[tuple[str, str, bool]]:
     for finger in FINGERS:
         yield from ((FLOOR, shape_name(finger, shape), False) for shape in SHAPES[1:])
         yield from (
-            (wall, shape_name(finger, shape), False) for wall in walls for shape in SHAPES[2:]
+            # Nothing but a tip reaches the ring: the knee stays within 0.232 m of the center.
+            (wall, shape_name(finger, "tip"), False)
+            for wall in walls
         )
     for i, finger in enumerate(FINGERS):
         for other in FINGERS[i + 1 :]:
@@ -156,34 +162,33 @@ def _add_block(spec: mujoco.MjSpec, name: str) -> None:
 
 
 def _add_robot(spec: mujoco.MjSpec, structure: Structure) -> None:
+    """Hang each finger from the world.
+
+    MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
+    and the links that cannot move outside of them, no mass changes the roundings elsewhere.
+    """
     height = trifinger.NOMINAL_HEIGHT - trifinger.TABLE_OFFSET
-    base = spec.worldbody.add_body(
-        name=BASE, pos=(0.0, 0.0, height), quat=_yaw(trifinger.WORLD_YAW)
-    )
-    for finger, offset, yaw in zip(
+    for finger, (x, y, z), yaw in zip(
         FINGERS, trifinger.FINGER_OFFSET, trifinger.FINGER_YAW, strict=True
     ):
-        _add_finger(spec, base, finger, offset, yaw, structure)
+        cos, sin = math.cos(trifinger.WORLD_YAW), math.sin(trifinger.WORLD_YAW)
+        position = (cos * x - sin * y, sin * x + cos * y, z + height)
+        orientation = _yaw(trifinger.WORLD_YAW + yaw)
+        fixed = spec.worldbody.add_body(name=link_name(finger, 0), pos=position, quat=orientation)
+        _set_inertial(fixed, 0)
+        fixed.add_geom(
+            name=shape_name(finger, "base"),
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(0.01, 0.0, 0.0),
+            contype=0,
+            conaffinity=0,
+        )
+        root = spec.worldbody.add_body(name=base_name(finger), pos=position, quat=orientation)
+        _add_finger(root, finger, structure)
     _add_controller(spec, structure.controller)
 
 
-def _add_finger(
-    spec: mujoco.MjSpec,
-    base: mujoco.MjsBody,
-    finger: str,
-    offset: tuple[float, float, float],
-    yaw: float,
-    structure: Structure,
-) -> None:
-    body = base.add_body(name=link_name(finger, 0), pos=offset, quat=_yaw(yaw))
-    _set_inertial(body, 0)
-    body.add_geom(
-        name=shape_name(finger, "base"),
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        size=(0.01, 0.0, 0.0),
-        contype=0,
-        conaffinity=0,
-    )
+def _add_finger(body: mujoco.MjsBody, finger: str, structure: Structure) -> None:
     limit = structure.controller.limit
     for index in (1, 2, 3):
         body = body.add_body(name=link_name(finger, index), pos=trifinger.JOINT_ORIGINS[index - 1])

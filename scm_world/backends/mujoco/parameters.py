@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.model import (
-    BASE,
     FLOOR,
     STAGE,
+    base_name,
     link_shapes,
     shape_owners,
     wall_name,
@@ -51,7 +51,7 @@ class Slot(ABC):
 
 @final
 @dataclass(frozen=True)
-class Gravity(Slot):
+class _Gravity(Slot):
     """Acceleration, shape (3,) [m/s²]."""
 
     vector: Floats
@@ -65,22 +65,24 @@ class Gravity(Slot):
 
 @final
 @dataclass(frozen=True)
-class Height(Slot):
+class _Height(Slot):
     """Of the robot's base over the plane it is measured from [m]."""
 
-    position: Floats
+    positions: Floats
+    bodies: tuple[int, ...]
     constant = True
 
     def write(self, value: Floats) -> None:
-        self.position[2] = value - trifinger.TABLE_OFFSET
+        for body in self.bodies:
+            self.positions[body, 2] = value - trifinger.TABLE_OFFSET
 
     def read(self) -> Floats:
-        return np.array(self.position[2] + trifinger.TABLE_OFFSET)
+        return np.array(self.positions[self.bodies[0], 2] + trifinger.TABLE_OFFSET)
 
 
 @final
 @dataclass(frozen=True)
-class Friction(Slot):
+class _Friction(Slot):
     """Factor of one body. Contact pairs get products; the factors rest in the shapes."""
 
     friction: Floats
@@ -97,7 +99,7 @@ class Friction(Slot):
 
 @final
 @dataclass(frozen=True)
-class Color(Slot):
+class _Color(Slot):
     """Red, green, blue, shape (3,); MuJoCo keeps 32 bits of each."""
 
     colors: NDArray[np.float32]
@@ -113,7 +115,7 @@ class Color(Slot):
 
 @final
 @dataclass(frozen=True)
-class LinkMass(Slot):
+class _LinkMass(Slot):
     """Mass of a link [kg]; its moments of inertia scale with it."""
 
     masses: Floats
@@ -132,7 +134,7 @@ class LinkMass(Slot):
 
 @final
 @dataclass(frozen=True)
-class BlockMass(Slot):
+class _BlockMass(Slot):
     """Mass of a block [kg]."""
 
     masses: Floats
@@ -151,7 +153,7 @@ class BlockMass(Slot):
 
 @final
 @dataclass(frozen=True)
-class BlockSize(Slot):
+class _BlockSize(Slot):
     """Full edge lengths of a block, shape (3,) [m]."""
 
     masses: Floats
@@ -189,9 +191,12 @@ def couple(
 
 def slots(model: mujoco.MjModel, structure: Structure) -> dict[ParameterKey, Slot]:
     """Find the place of every parameter of this structure in this model."""
+    hanging = [name(finger) for finger in trifinger.FINGERS for name in (base_name, _fixed_link)]
     found: dict[ParameterKey, Slot] = {
-        ("world", "gravity"): Gravity(model.opt.gravity),
-        ("robot", "height"): Height(model.body_pos[model.body(BASE).id]),
+        ("world", "gravity"): _Gravity(model.opt.gravity),
+        ("robot", "height"): _Height(
+            model.body_pos, tuple(int(model.body(name).id) for name in hanging)
+        ),
     }
     owners = shape_owners(structure)
     links = [name for name, owner in owners.items() if owner in trifinger.LINK_NAMES]
@@ -201,20 +206,20 @@ def slots(model: mujoco.MjModel, structure: Structure) -> dict[ParameterKey, Slo
     for finger in trifinger.FINGERS:
         for index, inertial in enumerate(trifinger.INERTIAL):
             link = trifinger.link_name(finger, index)
-            found[link, "mass"] = LinkMass(
+            found[link, "mass"] = _LinkMass(
                 model.body_mass,
                 model.body_inertia,
                 model.body(link).id,
                 np.array(inertial.per_mass),
             )
-            found[link, "color"] = Color(
+            found[link, "color"] = _Color(
                 model.geom_rgba, _ids(model, list(link_shapes(finger, index)))
             )
     for block in structure.blocks:
         body, shape = model.body(block).id, model.geom(block).id
         box = (model.body_mass, model.body_inertia[body], model.geom_size[shape], body)
-        found[block, "mass"] = BlockMass(*box)
-        found[block, "size"] = BlockSize(*box)
+        found[block, "mass"] = _BlockMass(*box)
+        found[block, "size"] = _BlockSize(*box)
         _add_surface(found, model, block, [block])
     return found
 
@@ -228,9 +233,13 @@ def _add_surface(
     color: bool = True,
 ) -> None:
     ids = _ids(model, shapes)
-    found[name, "friction"] = Friction(model.geom_friction, ids)
+    found[name, "friction"] = _Friction(model.geom_friction, ids)
     if color:
-        found[name, "color"] = Color(model.geom_rgba, ids)
+        found[name, "color"] = _Color(model.geom_rgba, ids)
+
+
+def _fixed_link(finger: str) -> str:
+    return trifinger.link_name(finger, 0)
 
 
 def _ids(model: mujoco.MjModel, shapes: list[str]) -> tuple[int, ...]:

@@ -30,14 +30,12 @@ class Instant:
         vector: The state in the units of the scene, shape (27 + 13 n,).
         positions: MuJoCo's own, shape (9 + 7 n,).
         velocities: MuJoCo's own, shape (9 + 6 n,).
-        warm_start: Accelerations with which its solver begins, shape (9 + 6 n,).
     """
 
     blocks: tuple[str, ...]
     vector: Floats
     positions: Floats
     velocities: Floats
-    warm_start: Floats
 
     def source(self, blocks: tuple[str, ...]) -> Integers:
         """Find blocks in the instant; -1 where one is new. Shape (n,)."""
@@ -47,9 +45,7 @@ class Instant:
 
 def nothing() -> Instant:
     """Describe a world in which no physics step was made."""
-    return Instant(
-        (), np.zeros(ROBOT_SIZE), np.zeros(N_JOINTS), np.zeros(N_JOINTS), np.zeros(N_JOINTS)
-    )
+    return Instant((), np.zeros(ROBOT_SIZE), np.zeros(N_JOINTS), np.zeros(N_JOINTS))
 
 
 @numba.njit("void(f8[::1], i8, f8[::1], b1)", cache=True, error_model="numpy")
@@ -108,19 +104,17 @@ def settle(written: Floats, into: Floats) -> None:
 
 
 @numba.njit(
-    "void(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1])",
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], f8[::1], f8[::1])",
     cache=True,
 )
 def write_state(
     vector: Floats,
     positions: Floats,
     velocities: Floats,
-    warm_start: Floats,
     source: Integers,
     last: Floats,
     last_positions: Floats,
     last_velocities: Floats,
-    last_warm_start: Floats,
 ) -> None:
     """Convert the vector of a ``PhysicalState`` into MuJoCo's coordinates.
 
@@ -128,18 +122,15 @@ def write_state(
         vector: What to write; orientations of either sign.
         positions: Written, shape (9 + 7 n,).
         velocities: Written, shape (9 + 6 n,).
-        warm_start: Written, shape (9 + 6 n,).
         source: Index of each block in the last instant, or -1, shape (n,).
         last: State of the last instant.
         last_positions: MuJoCo's own of that instant.
         last_velocities: MuJoCo's own of that instant.
-        last_warm_start: MuJoCo's own of that instant.
     """
     spin = np.empty(3)
     for i in range(9):
         positions[i] = vector[i]
         velocities[i] = vector[9 + i]
-        warm_start[i] = last_warm_start[i]
     for block in range(source.shape[0]):
         q, v, s = 9 + 7 * block, 9 + 6 * block, ROBOT_SIZE + BLOCK_SIZE * block
         known = source[block] >= 0
@@ -164,8 +155,6 @@ def write_state(
         for axis in range(3):
             same = not (turned or spun)
             velocities[v + 3 + axis] = last_velocities[lv + 3 + axis] if same else spin[axis]
-        for axis in range(6):
-            warm_start[v + axis] = last_warm_start[lv + axis] if known else 0.0
 
 
 @numba.njit("b1(f8[::1], f8[::1])", cache=True)

@@ -1,0 +1,292 @@
+"""Bullet as a backend: two physics clients, of which one always holds the last step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import ClassVar, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
+from scm_world.backends.bullet import dynamics, touch, values
+from scm_world.backends.bullet.client import Client
+from scm_world.backends.bullet.engine import load, version
+from scm_world.backends.bullet.history import History, Record, SavedState, relive
+from scm_world.backends.bullet.values import Instant, Values
+from scm_world.errors import EngineFailure, SnapshotMismatch
+from scm_world.scene.controller import ControlMode
+from scm_world.scene.difference import Difference, complete
+from scm_world.scene.scene import ParameterKey, Parameters, Scene
+from scm_world.scene.state import PhysicalState
+
+LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper than a replay
+
+
+@final
+class BulletBackend(Backend):
+    """Bullet, through pybullet.
+
+    The engine cannot set a state exactly, because contact caches survive. So a state is set by
+    bringing about a *canonical* world, which is a function of parameters and state alone. It is
+    made in a second physics client while the first keeps the world of the last step: going back
+    to that world is then exact and costs nothing, and a change that fails cannot harm it.
+
+    A snapshot is the last canonical state and the commands since. Within the process that took
+    it, the engine's own saved state stands in for a long replay.
+
+    Raises:
+        MissingEngine: pybullet is not installed.
+    """
+
+    name: ClassVar[str] = "bullet"
+    capabilities: ClassVar[Capabilities] = Capabilities(snapshot="replay")
+
+    def __init__(self) -> None:
+        self._engine = load()
+        self._version = version()
+        self._base: Client | None = None  # holds the world of the last step, once it is needed
+        self._lost = False  # whether the base must live through its past before it is used
+        self._spare: Client | None = None  # holds the canonical world, if there is one
+        self._history: History | None = None
+        self._before: Values = {}  # parameters of the last step
+        self._present: Instant | None = None  # what was made of the last step since
+        self._light = True  # whether the base itself holds the present, and not the spare
+        self._torques = [0.0] * 9
+        self._resting: list[float] | None = None  # state of the base, once it was asked for
+        self._saved: SavedState | None = None  # of the base
+
+    @property
+    def version(self) -> str:
+        """Version of pybullet."""
+        return self._version
+
+    @property
+    def n_blocks(self) -> int:
+        """How many movable blocks the scene has."""
+        return len((self._present or self._lived().origin).structure.blocks)
+
+    # --- clients -------------------------------------------------------------------------------
+
+    def _lived(self) -> History:
+        if self._history is None:
+            raise EngineFailure("there is no scene yet; call build() first", self.name)
+        return self._history
+
+    def _last(self) -> Client:
+        """Give the client that holds the world of the last step."""
+        history = self._lived()
+        if self._base is None:
+            self._base, self._lost = self._opened(), True
+        if self._lost:
+            relive(self._base, history.past(self._torques))
+            self._lost = False
+        return self._base
+
+    def _other(self) -> Client:
+        """Give the client that does not hold the last step."""
+        if self._spare is None:
+            self._spare = self._opened()
+        return self._spare
+
+    def _opened(self) -> Client:
+        client = Client(self._engine)
+        client.furnish()
+        return client
+
+    def _now(self) -> Client:
+        """Give the client that holds the present."""
+        return self._last() if self._light else self._other()
+
+    # --- the interface -------------------------------------------------------------------------
+
+    def build(self, scene: Scene) -> None:
+        """Realise a scene from nothing; with the bodies that are there already, where possible."""
+        parameters = values.complete(scene.structure, scene.parameters)
+        origin = Instant(scene.structure, parameters, values.state(scene.structure, scene.state))
+        with self._all_or_nothing():
+            self._other().canonicalize(origin)
+        self._present, self._light, self._torques = origin, False, [0.0] * 9
+        self._commit()
+
+    def apply(self, difference: Difference) -> None:
+        """Change structure, parameters and state without advancing time.
+
+        Raises:
+            UnknownOption: The scene has no such parameter.
+            EngineFailure: A value is not finite, or the engine refused. The world is as it was.
+        """
+        present = self._described()
+        wish = self._wish(present, difference)
+        light = values.light(self._described_base(), wish)
+        with self._all_or_nothing():
+            if light:
+                changed = difference.parameters if self._light else wish.parameters
+                self._last().edit({key: wish.parameters[key] for key in changed})
+            elif not self._light and values.light(present, wish):
+                self._other().edit({key: wish.parameters[key] for key in difference.parameters})
+            else:
+                self._other().canonicalize(wish)
+        self._present, self._light = wish, light
+
+    def _described_base(self) -> Instant:
+        """Describe the world of the last step."""
+        structure = self._lived().origin.structure
+        if self._resting is None:
+            self._resting = self._last().read(self._torques)
+        return Instant(structure, self._before, self._resting)
+
+    def _described(self) -> Instant:
+        """Describe the present."""
+        return self._present or self._described_base()
+
+    def _wish(self, present: Instant, difference: Difference) -> Instant:
+        """Say which world the difference makes of the present."""
+        structure, parameters, state = present.structure, present.parameters, present.state
+        if difference.structure is not None:
+            now = Scene(structure, values.arrays(parameters), values.physical(structure, state))
+            structure = difference.structure
+            difference = complete(now, structure, difference)
+            parameters = values.complete(structure, difference.parameters)
+        elif difference.parameters:
+            parameters = {**parameters, **values.some(parameters, difference.parameters)}
+        if difference.state is not None:
+            state = values.state(structure, difference.state)
+        return Instant(structure, parameters, state)
+
+    @contextmanager
+    def _all_or_nothing(self) -> Iterator[None]:
+        """Bring the present back, should the engine fail half way."""
+        try:
+            yield
+        except Exception as error:
+            if self._spare is not None:
+                self._spare.close()
+                self._spare = None
+            if self._history is not None:
+                self._return()
+            raise EngineFailure(f"Bullet refused the change: {error}", self.name) from error
+
+    def _return(self) -> None:
+        """Bring the clients back to the present."""
+        present = self._described()
+        if self._light:
+            self._last().edit(present.parameters)
+        else:
+            self._other().canonicalize(present)
+
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Read parameters back from the engine itself.
+
+        Raises:
+            UnknownOption: The scene has no such parameter.
+        """
+        client = self._now()
+        return {
+            key: dynamics.read(self._engine, client.handle, client.bodies, key)
+            for key in values.known(self._described().parameters, keys)
+        }
+
+    def inertia(self, body: str) -> Floats:
+        """Read the principal moments of inertia of a block or link, shape (3,) [kg m²].
+
+        The fingertip is a link of its own in this engine, and no part of link 3.
+        """
+        values.known(self._described().parameters, [(body, "mass")])
+        client = self._now()
+        place = client.bodies.place(body)
+        return np.array(self._engine.getDynamicsInfo(*place, physicsClientId=client.handle)[2])
+
+    def read(self, into: PhysicalState) -> None:
+        """Write the present state into an existing vector."""
+        numbers = self._now().read(self._torques)
+        if not math.isfinite(sum(numbers)):
+            raise EngineFailure("Bullet produced a state that is not finite", self.name)
+        into.vector[:] = numbers
+
+    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+        """Hold a command for some physics steps."""
+        numbers = np.asarray(command, dtype=np.float64).tolist()
+        if len(numbers) != len(self._torques):
+            raise ValueError(f"a command has {len(self._torques)} numbers, got {len(numbers)}")
+        if substeps < 1:
+            return
+        self._commit()
+        client, history = self._last(), self._lived()
+        try:
+            torques = client.advance(mode, numbers, substeps)
+        except Exception as error:
+            self._lost = True
+            raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
+        history.step(mode, numbers, substeps)
+        self._torques, self._resting, self._saved = torques, None, None
+
+    def _commit(self) -> None:
+        """Make the present the world that everything after it starts from."""
+        if self._present is None:
+            return
+        if self._light:
+            self._lived().edit(self._pending(self._present.parameters))
+        else:
+            self._history = History(self._present)
+            self._base, self._spare, self._lost = self._spare, self._base, False
+            self._resting = self._saved = None
+        self._before = self._present.parameters
+        self._present, self._light = None, True
+
+    def _pending(self, parameters: Values) -> Values:
+        """List the parameters that differ from those of the last step."""
+        return {key: value for key, value in parameters.items() if value != self._before[key]}
+
+    def contacts(self) -> tuple[Contact, ...]:
+        """List the contact points of the last physics step."""
+        client = self._last()
+        return touch.contacts(self._engine, client.handle, client.bodies)
+
+    def snapshot(self) -> EngineSnapshot:
+        """Save everything."""
+        history, resting = self._lived(), self._described_base().state
+        if history.substeps >= LONG and self._saved is None and not self._lost:
+            self._saved = SavedState(self._last())
+        past = history.past(self._torques)
+        record = Record(past, self._present, self._light, resting, self._saved)
+        return EngineSnapshot(f"{self.name} {self._version}", record)
+
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Go back to a snapshot.
+
+        Raises:
+            SnapshotMismatch: It was taken by another engine, or another version of it.
+        """
+        mine, record = f"{self.name} {self._version}", snapshot.payload
+        if snapshot.engine != mine or not isinstance(record, Record):
+            raise SnapshotMismatch(f"this is a snapshot of {snapshot.engine!r}, not of {mine!r}")
+        self._history, self._before = History.of(record.past), record.past.parameters()
+        self._present, self._light = record.present, record.light
+        self._torques, self._resting = record.past.torques, record.resting
+        self._lost, self._saved = True, None
+        try:
+            self._recall(record.saved)
+            self._return()
+        except Exception as error:
+            raise EngineFailure(f"Bullet could not go there: {error}", self.name) from error
+
+    def _recall(self, saved: SavedState | None) -> None:
+        """Spare the base a replay, if one of the clients still has the saved state."""
+        if saved is None or not saved.usable():
+            return
+        if saved.client is self._spare:
+            self._base, self._spare = self._spare, self._base
+        if saved.client is self._base:
+            saved.client.load(saved.number)
+            saved.client.edit(self._before)
+            self._lost, self._saved = False, saved
+
+    def close(self) -> None:
+        """Disconnect both clients. Closing twice is harmless."""
+        for client in (self._base, self._spare):
+            if client is not None:
+                client.close()
+        self._base = self._spare = self._history = self._present = self._saved = None

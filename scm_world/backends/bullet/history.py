@@ -1,0 +1,143 @@
+"""What a world has been through since its last canonical state; enough to live it again."""
+
+from __future__ import annotations
+
+import weakref
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, final
+
+from scm_world.backends.bullet.client import Client
+from scm_world.backends.bullet.values import Instant, Values
+from scm_world.scene.controller import ControlMode
+
+Step = tuple[ControlMode, Sequence[float], int]
+
+MODES = tuple(ControlMode)
+ROW = 11  # numbers for each step: mode, substeps, command
+
+
+@final
+class SavedState:
+    """A claim on a state that a client keeps; the client forgets it when the claim is dropped."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.generation = client.generation
+        self.number = client.save()
+        weakref.finalize(self, client.forget, self.number).atexit = False
+
+    def usable(self) -> bool:
+        """Tell whether the client still stands where the state is exact."""
+        return self.client.handle is not None and self.client.generation == self.generation
+
+
+@final
+@dataclass(frozen=True)
+class Past:
+    """The first part of a history: how the world of the last step came about.
+
+    Attributes:
+        origin: Where it began.
+        rows: The steps, ``ROW`` numbers each; it may go on after ``length``.
+        length: How many numbers belong to this past.
+        edits: Changes of parameters: the length of ``rows`` at that moment, and the new values.
+        torques: Of the last physics step [N m].
+    """
+
+    origin: Instant
+    rows: array[float]
+    length: int
+    edits: tuple[tuple[int, Values], ...]
+    torques: list[float]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "rows": self.rows[: self.length]}
+
+    def events(self) -> Iterator[Values | Step]:
+        """List what happened, in order."""
+        edits = list(reversed(self.edits))
+        for start in range(0, self.length, ROW):
+            while edits and edits[-1][0] == start:
+                yield edits.pop()[1]
+            mode, substeps, *command = self.rows[start : start + ROW]
+            yield MODES[int(mode)], command, int(substeps)
+
+    def parameters(self) -> Values:
+        """Give all parameters as they are in the end."""
+        values = dict(self.origin.parameters)
+        for _, edit in self.edits:
+            values.update(edit)
+        return values
+
+
+@final
+@dataclass(frozen=True)
+class Record:
+    """What a snapshot of Bullet holds. It can be pickled; the saved state then stays behind.
+
+    Attributes:
+        past: How the world of the last step came about.
+        present: The world now, if anything was changed since.
+        light: Whether the present differs from the last step in nothing but light parameters.
+        resting: The state after the last step.
+        saved: The engine's own state after the last step, if one was kept.
+    """
+
+    past: Past
+    present: Instant | None
+    light: bool
+    resting: list[float]
+    saved: SavedState | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "saved": None}
+
+
+@final
+@dataclass
+class History:
+    """A growing past. What is taken from it shares its numbers, so that taking it costs little.
+
+    Attributes:
+        origin: The last canonical state.
+        rows: See ``Past``.
+        edits: See ``Past``.
+        substeps: How many physics steps a replay takes.
+    """
+
+    origin: Instant
+    rows: array[float] = field(default_factory=lambda: array("d"))
+    edits: list[tuple[int, Values]] = field(default_factory=list)
+    substeps: int = 0
+
+    @classmethod
+    def of(cls, past: Past) -> History:
+        """Go on from a past without touching the history it was taken from."""
+        rows = past.rows[: past.length]
+        return cls(past.origin, rows, list(past.edits), int(sum(rows[1::ROW])))
+
+    def edit(self, values: Values) -> None:
+        """Write down a change of parameters."""
+        if values:
+            self.edits.append((len(self.rows), values))
+
+    def step(self, mode: ControlMode, command: Sequence[float], substeps: int) -> None:
+        """Write down a command."""
+        self.rows.extend((MODES.index(mode), substeps, *command))
+        self.substeps += substeps
+
+    def past(self, torques: list[float]) -> Past:
+        """Take what was so far."""
+        return Past(self.origin, self.rows, len(self.rows), tuple(self.edits), torques)
+
+
+def relive(client: Client, past: Past) -> None:
+    """Go through a past from its canonical state to its end."""
+    client.canonicalize(past.origin)
+    for event in past.events():
+        if isinstance(event, dict):
+            client.edit(event)
+        else:
+            client.advance(*event)

@@ -1,0 +1,180 @@
+"""What an entity is: declarations, and what they mean physically."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Values
+from scm_world.scene import Goal, ParameterKey
+from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
+from scm_world.variables import Function, Measured, Parent, Space, Variable
+
+Numbers = float | tuple[float, ...]
+
+
+@final
+@dataclass(frozen=True)
+class State:
+    """A quantity that physics moves.
+
+    Attributes:
+        name: ``"<entity>.<quantity>"``.
+        unit: SI unit.
+        shape: Of one value.
+        bounds: What is possible.
+        default: At the start of an episode.
+        doc: One sentence.
+        always: Causes that act at every control step; all other physical quantities of the
+            world act while there is contact.
+        on_set: Parameters and states of the same entity that move it when they are set.
+        start: Its value at the start, a function of ``on_set``.
+        carry: Its value after one of ``on_set`` was set.
+        settable: False for what the engine reports only.
+        a: Space A.
+        b: Space B.
+    """
+
+    name: str
+    unit: str
+    shape: tuple[int, ...]
+    bounds: Space
+    default: Numbers
+    doc: str
+    always: tuple[str, ...]
+    on_set: tuple[str, ...] = ()
+    start: Function | None = None
+    carry: Function | None = None
+    settable: bool = True
+    a: Space | None = None
+    b: Space | None = None
+
+    def declare(self, inputs: Iterable[str]) -> Measured:
+        """Write the declaration, given all quantities of the world that physics knows."""
+        always = tuple(Parent(name, 1) for name in self.always)
+        contact = tuple(Parent(name, 1, "contact") for name in inputs if name not in self.always)
+        on_set = tuple(Parent(name, 0, "set") for name in self.on_set)
+        return Measured(
+            name=self.name,
+            unit=self.unit,
+            shape=self.shape,
+            bounds=self.bounds,
+            a=self.a,
+            b=self.b,
+            default=self.default,
+            doc=self.doc,
+            parents=always + contact + on_set,
+            start=self.start,
+            carry=self.carry,
+            settable_state=self.settable,
+        )
+
+
+class Entity(ABC):  # every hook has a sensible empty default
+    """Something in the world: it declares its variables and says what they mean physically.
+
+    Attributes:
+        name: Prefix of its variables.
+    """
+
+    name: str
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare everything but the states."""
+        return ()
+
+    def states(self) -> Iterable[State]:
+        """Declare what physics moves."""
+        return ()
+
+    def inputs(self) -> Iterable[str]:
+        """Name the variables of this entity that physics depends on."""
+        return ()
+
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        return {}
+
+    def slices(self, block: int) -> Mapping[str, slice]:
+        """Say where its states stand in the vector of ``PhysicalState``.
+
+        Args:
+            block: Index of this entity among the movable blocks.
+        """
+        return {}
+
+    @property
+    def is_block(self) -> bool:
+        """Whether it is a movable block."""
+        return False
+
+    def goal(self, values: Values) -> Goal | None:
+        """Describe the goal that this entity is, if it is one."""
+        return None
+
+
+def block_slice(block: int, start: int, stop: int) -> slice:
+    """Give the place of some numbers of a block in the state vector."""
+    offset = ROBOT_SIZE + BLOCK_SIZE * block
+    return slice(offset + start, offset + stop)
+
+
+@final
+@dataclass(frozen=True)
+class Composition:
+    """All entities of a world together: where the causal and the physical column meet.
+
+    Attributes:
+        entities: In the order of the observation.
+        shared: Variables that belong to no single entity.
+    """
+
+    entities: tuple[Entity, ...]
+    shared: tuple[Variable, ...] = ()
+    blocks: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        names = tuple(entity.name for entity in self.entities if entity.is_block)
+        object.__setattr__(self, "blocks", names)
+
+    def variables(self) -> tuple[Variable, ...]:
+        """Declare every variable, with the states coupled to all physical quantities."""
+        inputs = tuple(name for entity in self.entities for name in entity.inputs())
+        declared: list[Variable] = list(self.shared)
+        for entity in self.entities:
+            declared.extend(entity.variables())
+            declared.extend(state.declare(inputs) for state in entity.states())
+        return tuple(declared)
+
+    def parameters(self) -> dict[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        return {k: v for entity in self.entities for k, v in entity.parameters().items()}
+
+    def slices(self) -> dict[str, slice]:
+        """Say where each state stands in the state vector."""
+        found: dict[str, slice] = {}
+        for entity in self.entities:
+            block = self.blocks.index(entity.name) if entity.is_block else -1
+            found.update(entity.slices(block))
+        return found
+
+    def goals(self, values: Values) -> tuple[Goal, ...]:
+        """Describe all goals."""
+        goals = (entity.goal(values) for entity in self.entities)
+        return tuple(goal for goal in goals if goal is not None)
+
+
+def lowest_point(size: np.ndarray, orientation: np.ndarray) -> float:  # type: ignore[type-arg]
+    """Compute how far a box reaches below its center [m].
+
+    Args:
+        size: Edge lengths, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w).
+    """
+    x, y, z, w = orientation
+    row = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+    return 0.5 * float(abs(row[0]) * size[0] + abs(row[1]) * size[1] + abs(row[2]) * size[2])

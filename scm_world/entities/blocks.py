@@ -1,0 +1,253 @@
+"""Blocks that can be moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.entities.base import Entity, State, block_slice, lowest_point
+from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
+from scm_world.geometry.rotations import from_rotation_vector, to_rotation_vector
+from scm_world.scene import ParameterKey
+from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Parent, Variable
+from scm_world.variables import catalogue as numbers
+
+CUBOID = 1  # the published type id
+
+
+def standing(size: Floats, orientation: Floats, *, place: Floats) -> Floats:
+    """Stand a block on the floor.
+
+    Args:
+        size: Edge lengths, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w).
+        place: x and y of the center, and the height of the lowest point, shape (3,) [m].
+
+    Returns:
+        The center, shape (3,) [m].
+    """
+    return np.array([place[0], place[1], place[2] + lowest_point(size, orientation)])
+
+
+def keep_lowest_point(
+    position: Floats, size: Floats, orientation: Floats, new_size: Floats, new_orientation: Floats
+) -> Floats:
+    """Raise or lower the center so that the lowest point stays where it was.
+
+    A block that grows does not sink into the floor, and one that shrinks does not hang above it.
+    """
+    lift = lowest_point(new_size, new_orientation) - lowest_point(size, orientation)
+    return np.array([position[0], position[1], position[2] + lift])
+
+
+def coordinates(
+    entity: str, *, a: Box | None, b: Box | None, orientation: bool = True
+) -> Iterable[Variable]:
+    """Declare the other coordinates of a pose: cylindrical position and rotation vector."""
+    yield Derived(
+        name=f"{entity}.cylindrical_position",
+        unit="m, rad, m",
+        shape=(3,),
+        a=a,
+        b=b,
+        parents=(f"{entity}.cartesian_position",),
+        mechanism=to_cylindrical,
+        inverse=from_cylindrical,
+        doc="Position as radius, angle and height; setting it sets the Cartesian position.",
+    )
+    if orientation:
+        yield Derived(
+            name=f"{entity}.euler_orientation",
+            unit="rad",
+            shape=(3,),
+            a=numbers.YAW,
+            b=numbers.YAW,
+            parents=(f"{entity}.orientation",),
+            mechanism=to_rotation_vector,
+            inverse=from_rotation_vector,
+            doc="Orientation as a rotation vector; setting it sets the quaternion.",
+        )
+
+
+@final
+class ToolBlock(Entity):
+    """A cuboid that the robot may move.
+
+    Args:
+        name: Prefix of its variables.
+        size_from: Variable that its size copies, or None for a size of its own.
+        mass: Default [kg].
+        place: x, y of the center at the start and height of its lowest point [m].
+        a: Space A of the cylindrical position.
+        b: Space B of it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        size_from: str | None,
+        mass: float,
+        place: tuple[float, float, float],
+        a: Box,
+        b: Box,
+    ) -> None:
+        self.name = name
+        self._size_from = size_from
+        self._mass = mass
+        self._place = place
+        self._a, self._b = a, b
+
+    @property
+    def is_block(self) -> bool:
+        """A block it is."""
+        return True
+
+    def _v(self, quantity: str) -> str:
+        return f"{self.name}.{quantity}"
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare type, size, mass, friction, color and the other coordinates of the pose."""
+        yield Fixed(
+            name=self._v("type"),
+            dtype="categorical",
+            bounds=numbers.TYPE_BOUNDS,
+            value=CUBOID,
+            doc="Published id of the kind of object.",
+        )
+        yield block_size(self._v("size"), self._size_from)
+        yield Exogenous(
+            name=self._v("mass"),
+            unit="kg",
+            bounds=numbers.BLOCK_MASS_BOUNDS,
+            a=numbers.MASS_A,
+            b=numbers.MASS_B,
+            default=self._mass,
+            doc="Mass; the inertia of a solid box follows from it.",
+        )
+        yield Exogenous(
+            name=self._v("friction"),
+            bounds=numbers.FRICTION_BOUNDS,
+            default=numbers.BLOCK_FRICTION,
+            doc="Friction of its surface; a contact has the product of two frictions.",
+        )
+        yield color(self._v("color"), numbers.BLOCK_COLOR)
+        yield from coordinates(self.name, a=self._a, b=self._b)
+
+    def states(self) -> Iterable[State]:
+        """Declare pose and velocities."""
+        position, orientation = self._v("cartesian_position"), self._v("orientation")
+        linear, angular = self._v("linear_velocity"), self._v("angular_velocity")
+        yield State(
+            position,
+            "m",
+            (3,),
+            numbers.POSITION_BOUNDS,
+            (0.0, 0.0, 0.0),
+            "Position of the center.",
+            always=(position, linear, "gravity"),
+            on_set=(self._v("size"), orientation),
+            start=Function(standing, constants={"place": self._place}),
+            carry=Function(keep_lowest_point),
+        )
+        yield State(
+            orientation,
+            "1",
+            (4,),
+            numbers.QUATERNION_BOUNDS,
+            numbers.IDENTITY,
+            "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
+            always=(orientation, angular),
+        )
+        yield State(
+            linear,
+            "m/s",
+            (3,),
+            numbers.LINEAR_VELOCITY_BOUNDS,
+            (0.0, 0.0, 0.0),
+            "Velocity of the center.",
+            always=(linear, "gravity"),
+        )
+        yield State(
+            angular,
+            "rad/s",
+            (3,),
+            numbers.ANGULAR_VELOCITY_BOUNDS,
+            (0.0, 0.0, 0.0),
+            "Angular velocity in the world frame.",
+            always=(angular,),
+        )
+
+    def inputs(self) -> Iterable[str]:
+        """Pose, velocities, mass, size and friction matter to physics; the color does not."""
+        yield from (state.name for state in self.states())
+        yield from (self._v("mass"), self._v("size"), self._v("friction"))
+
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        return {
+            self._v(quantity): (self.name, quantity)
+            for quantity in ("mass", "size", "friction", "color")
+        }
+
+    def slices(self, block: int) -> Mapping[str, slice]:
+        """Say where its states stand in the state vector."""
+        return {
+            self._v("cartesian_position"): block_slice(block, 0, 3),
+            self._v("orientation"): block_slice(block, 3, 7),
+            self._v("linear_velocity"): block_slice(block, 7, 10),
+            self._v("angular_velocity"): block_slice(block, 10, 13),
+        }
+
+
+def same(parent: Floats) -> Floats:
+    """Copy the value of the parent."""
+    return parent
+
+
+def block_size(name: str, size_from: str | None) -> Variable:
+    """Declare the size of a block: a root, or the copy of a shared cause."""
+    if size_from is None:
+        return Exogenous(
+            name=name,
+            unit="m",
+            shape=(3,),
+            bounds=numbers.SIZE_BOUNDS,
+            a=numbers.SIZE_A,
+            b=numbers.SIZE_B,
+            default=numbers.BLOCK_SIZE,
+            doc="Full edge lengths.",
+        )
+    return Derived(
+        name=name,
+        unit="m",
+        shape=(3,),
+        bounds=numbers.SIZE_BOUNDS,
+        a=numbers.SIZE_A,
+        b=numbers.SIZE_B,
+        parents=(Parent(size_from),),
+        mechanism=same,
+        doc="Full edge lengths.",
+    )
+
+
+def color(
+    name: str,
+    default: tuple[float, float, float],
+    *,
+    a: Box = numbers.BRIGHT,
+    b: Box = numbers.DARK,
+) -> Exogenous:
+    """Declare a color."""
+    return Exogenous(
+        name=name,
+        shape=(3,),
+        bounds=numbers.COLOR_BOUNDS,
+        a=a,
+        b=b,
+        default=default,
+        doc="Red, green and blue; nothing physical depends on it.",
+    )

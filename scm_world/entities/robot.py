@@ -1,0 +1,147 @@
+"""The robot, as variables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import final
+
+from scm_world._types import Floats
+from scm_world.entities.base import Entity, State
+from scm_world.entities.blocks import color
+from scm_world.scene import ParameterKey, trifinger
+from scm_world.scene.kinematics import forward
+from scm_world.variables import Action, Box, Exogenous, Measured, Variable
+from scm_world.variables import catalogue as numbers
+
+END_EFFECTORS = Box((-0.5, -0.5, 0.0) * 3, (0.5, 0.5, 0.5) * 3)  # [m] what an action may ask for
+
+ACTIONS = {
+    "joint_positions": ("rad", Box(trifinger.JOINT_LOW, trifinger.JOINT_HIGH)),
+    "joint_torques": ("N m", Box(-0.36, 0.36)),
+    "end_effector_positions": ("m", END_EFFECTORS),
+}
+"""Unit and range of each way to command the robot."""
+
+
+def tips(joint_positions: Floats, robot_height: Floats) -> Floats:
+    """Compute the three fingertips from the joints, shape (9,) [m]."""
+    return forward(joint_positions, float(robot_height))
+
+
+@final
+class Robot(Entity):
+    """Three fingers with three joints each.
+
+    Args:
+        action_mode: One of ``ACTIONS``.
+        start: Joint positions at the start, shape (9,) [rad].
+    """
+
+    name = "robot"
+
+    def __init__(self, action_mode: str, start: tuple[float, ...] = trifinger.REST) -> None:
+        self.action_mode = action_mode
+        self._start = start
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare the action, the height, the links and the fingertips."""
+        unit, bounds = ACTIONS[self.action_mode]
+        yield Action(
+            name="action",
+            unit=unit,
+            shape=(9,),
+            bounds=bounds,
+            doc=f"What the policy commands: {self.action_mode}.",
+        )
+        yield Exogenous(
+            name="robot_height",
+            unit="m",
+            bounds=numbers.ROBOT_HEIGHT_BOUNDS,
+            default=trifinger.NOMINAL_HEIGHT,
+            doc="Height of the robot's base above a plane 0.011 m below the table top.",
+        )
+        for finger in trifinger.FINGERS:
+            yield from self._links(finger)
+        yield Measured(
+            name="end_effector_positions",
+            unit="m",
+            shape=(9,),
+            bounds=Box(-1.0, 1.0),
+            parents=("joint_positions", "robot_height"),
+            mechanism=tips,
+            doc="The three fingertips.",
+        )
+
+    def _links(self, finger: str) -> Iterable[Variable]:
+        for index, mass in enumerate(trifinger.LINK_MASS):
+            link = trifinger.link_name(finger, index)
+            still = " It is fixed to the base, so nothing depends on it." if index == 0 else ""
+            yield Exogenous(
+                name=f"{link}.mass",
+                unit="kg",
+                bounds=numbers.LINK_MASS_BOUNDS,
+                a=numbers.MASS_A,
+                b=numbers.MASS_B,
+                default=mass,
+                doc=f"Mass of the link; its inertia scales with it.{still}",
+            )
+            tint = trifinger.LINK_COLORS[finger]
+            yield color(f"{link}.color", tint, a=numbers.DARK, b=numbers.BRIGHT)
+
+    def states(self) -> Iterable[State]:
+        """Declare joint positions, velocities and the torques the engine reports."""
+        moving = tuple(name for name in self.inputs() if name != "robot_height")
+        always = (*moving, "gravity")
+        yield State(
+            "joint_positions",
+            "rad",
+            (9,),
+            numbers.JOINT_BOUNDS,
+            self._start,
+            "Angles of the joints, finger by finger.",
+            always=always,
+            a=numbers.JOINTS_A,
+            b=numbers.JOINTS_B,
+        )
+        yield State(
+            "joint_velocities",
+            "rad/s",
+            (9,),
+            numbers.JOINT_VELOCITY_BOUNDS,
+            (0.0,) * 9,
+            "Angular velocities of the joints.",
+            always=always,
+        )
+        yield State(
+            "joint_torques",
+            "N m",
+            (9,),
+            Box(-0.36, 0.36),
+            (0.0,) * 9,
+            "Torques of the last physics step.",
+            always=always,
+            settable=False,
+        )
+
+    def inputs(self) -> Iterable[str]:
+        """Everything but colors, the fixed finger bases and what is only read out."""
+        yield from ("joint_positions", "joint_velocities", "action", "robot_height")
+        for finger in trifinger.FINGERS:
+            yield from (f"{trifinger.link_name(finger, index)}.mass" for index in (1, 2, 3))
+
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        links = {
+            f"{link}.{quantity}": (link, quantity)
+            for link in trifinger.LINK_NAMES
+            for quantity in ("mass", "color")
+        }
+        return {"robot_height": ("robot", "height"), **links}
+
+    def slices(self, block: int) -> Mapping[str, slice]:
+        """Say where its states stand in the state vector."""
+        return {
+            "joint_positions": slice(0, 9),
+            "joint_velocities": slice(9, 18),
+            "joint_torques": slice(18, 27),
+        }

@@ -1,0 +1,110 @@
+"""The stage: gravity, floor, ring wall, and the clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.entities.base import Entity
+from scm_world.entities.blocks import color
+from scm_world.scene import ParameterKey
+from scm_world.variables import Box, Exogenous, Function, Measured, Parent, Variable
+from scm_world.variables import catalogue as numbers
+
+CONTROL_INDEX = "control_index"
+
+
+@final
+class Stage(Entity):
+    """What the robot and the blocks stand in."""
+
+    name = "stage"
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare gravity, frictions and colors."""
+        yield Exogenous(
+            name="gravity",
+            unit="m/s^2",
+            shape=(3,),
+            bounds=numbers.GRAVITY_BOUNDS,
+            a=numbers.GRAVITY_A,
+            b=numbers.GRAVITY_B,
+            default=numbers.GRAVITY,
+            doc="Acceleration of free fall; it pulls the fingers too.",
+        )
+        for surface, what in (("floor", "the table"), ("stage", "the ring wall")):
+            yield Exogenous(
+                name=f"{surface}_friction",
+                bounds=numbers.FRICTION_BOUNDS,
+                a=numbers.FRICTION_A,
+                b=numbers.FRICTION_B,
+                default=numbers.SURFACE_FRICTION,
+                doc=f"Friction of {what}; a contact has the product of two frictions.",
+            )
+        yield color("floor_color", numbers.FLOOR_COLOR)
+        yield color("stage_color", numbers.STAGE_COLOR, a=numbers.DARK, b=numbers.BRIGHT)
+
+    def inputs(self) -> Iterable[str]:
+        """Gravity and the two frictions."""
+        return ("gravity", "floor_friction", "stage_friction")
+
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        return {
+            "gravity": ("world", "gravity"),
+            "floor_friction": ("floor", "friction"),
+            "stage_friction": ("stage", "friction"),
+            "floor_color": ("floor", "color"),
+            "stage_color": ("stage", "color"),
+        }
+
+
+def remaining(control_index: Value, *, steps: Floats, seconds_per_step: Floats) -> Floats:
+    """Compute the time left [s], never below zero."""
+    left: Floats = np.maximum(steps - control_index, 0.0) * seconds_per_step
+    return left
+
+
+@final
+class Clock(Entity):
+    """How many control steps of the episode are over.
+
+    Args:
+        steps: Length of an episode in control steps.
+        seconds_per_step: Control period [s].
+    """
+
+    name = "clock"
+
+    def __init__(self, steps: int, seconds_per_step: float) -> None:
+        self._steps = steps
+        self._seconds_per_step = seconds_per_step
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare the counter and the time that is left."""
+        yield Measured(
+            name=CONTROL_INDEX,
+            dtype="integer",
+            bounds=numbers.CONTROL_INDEX_BOUNDS,
+            parents=(Parent(CONTROL_INDEX, 1),),
+            settable_state=True,
+            default=0,
+            doc="Control steps since the start of the episode.",
+        )
+        yield Measured(
+            name="time_left_for_task",
+            unit="s",
+            bounds=Box(0.0, self._steps * self._seconds_per_step),
+            parents=(CONTROL_INDEX,),
+            mechanism=Function(
+                remaining,
+                constants={
+                    "steps": float(self._steps),
+                    "seconds_per_step": self._seconds_per_step,
+                },
+            ),
+            doc="Time until the episode is cut off.",
+        )

@@ -1,0 +1,209 @@
+"""Which of many boxes and capsules intersect, in one compiled pass.
+
+Bodies are numbered: first the boxes, then the bodies made of capsules, then the floor (the plane
+z = 0) and the wall (see ``penetration``). Several capsules may belong to one body; the deepest
+counts. Every box is compared with everything; what a capsule is compared with besides the boxes
+is up to its flags.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from scm_world._types import Floats, Integers
+from scm_world.geometry.penetration import (
+    box_box_kernel,
+    box_capsule_kernel,
+    box_floor_kernel,
+    box_wall_kernel,
+    capsule_capsule_kernel,
+    capsule_floor_kernel,
+    capsule_wall_kernel,
+)
+from scm_world.geometry.rotations import rotation_kernel
+
+OTHERS, FLOOR, WALL = 1, 2, 4
+"""Flags: compare a capsule with those of other groups that have this flag; the floor; the wall."""
+
+
+class Found(NamedTuple):
+    """Pairs of bodies that intersect.
+
+    Attributes:
+        pairs: Numbers of the bodies, the lower one first, in ascending order, shape (n, 2).
+        depths: Shape (n,) [m].
+    """
+
+    pairs: Integers
+    depths: Floats
+
+
+@njit(cache=True)
+def _deepen(table: Floats, first: int, second: int, depth: float) -> None:
+    """Note a depth for two bodies, unless a greater one is known."""
+    low, high = min(first, second), max(first, second)
+    table[low, high] = max(table[low, high], depth)
+
+
+@njit(cache=True)
+def _place_capsules(
+    capsules: Floats, members: Integers, origins: Floats, orientations: Floats, ends: Floats
+) -> None:
+    """Write both ends of every capsule in the world, shape (m, 2, 3) [m]."""
+    rotation = np.empty((3, 3))
+    for c in range(len(capsules)):
+        frame = members[c, 0]
+        rotation_kernel(orientations[frame], rotation)
+        for end in range(2):
+            for k in range(3):
+                ends[c, end, k] = origins[frame, k]
+                for axis in range(3):
+                    ends[c, end, k] += rotation[k, axis] * capsules[c, 3 * end + axis]
+
+
+@njit(cache=True)
+def _sweep_boxes(
+    halves: Floats, centers: Floats, rotations: Floats, inner: float, height: float, table: Floats
+) -> None:
+    """Compare the boxes with one another, the floor and the wall.
+
+    The wall has no upper end for a box whose center is beyond it: that one has left the arena.
+    """
+    floor = len(table) - 2
+    for i in range(len(halves)):
+        half, center, rotation = halves[i], centers[i], rotations[i]
+        for j in range(i):
+            depth = box_box_kernel(half, center, rotation, halves[j], centers[j], rotations[j])
+            _deepen(table, i, j, depth)
+        _deepen(table, i, floor, box_floor_kernel(half, center, rotation))
+        top = math.inf if math.hypot(center[0], center[1]) > inner else height
+        _deepen(table, i, floor + 1, box_wall_kernel(half, center, rotation, inner, top))
+
+
+@njit(cache=True)
+def _sweep_capsules(
+    capsules: Floats,
+    members: Integers,
+    ends: Floats,
+    first_body: int,
+    inner: float,
+    height: float,
+    table: Floats,
+) -> None:
+    """Compare the capsules with one another, the floor and the wall, as far as flags say."""
+    floor = len(table) - 2
+    for c in range(len(capsules)):
+        body, group, flags = first_body + members[c, 1], members[c, 2], members[c, 3]
+        start, end, radius = ends[c, 0], ends[c, 1], capsules[c, 6]
+        if flags & FLOOR:
+            _deepen(table, body, floor, capsule_floor_kernel(start, end, radius))
+        if flags & WALL:
+            depth = capsule_wall_kernel(start, end, radius, inner, height)
+            _deepen(table, body, floor + 1, depth)
+        for d in range(c):
+            if flags & members[d, 3] & OTHERS and members[d, 2] != group:
+                depth = capsule_capsule_kernel(
+                    start, end, radius, ends[d, 0], ends[d, 1], capsules[d, 6]
+                )
+                _deepen(table, body, first_body + members[d, 1], depth)
+
+
+@njit(cache=True)
+def _select(table: Floats, tolerance: float) -> tuple[Integers, Floats]:
+    """List the pairs whose depth exceeds the tolerance."""
+    n = len(table)
+    count = 0
+    for i in range(n):
+        for j in range(i + 1, n):
+            count += table[i, j] > tolerance
+    pairs, depths = np.empty((count, 2), dtype=np.int64), np.empty(count)
+    count = 0
+    for i in range(n):
+        for j in range(i + 1, n):
+            if table[i, j] > tolerance:
+                pairs[count, 0], pairs[count, 1], depths[count] = i, j, table[i, j]
+                count += 1
+    return pairs, depths
+
+
+@njit(cache=True)
+def sweep_kernel(
+    sizes: Floats,
+    positions: Floats,
+    orientations: Floats,
+    capsules: Floats,
+    members: Integers,
+    frame_origins: Floats,
+    frame_orientations: Floats,
+    wall: tuple[float, float],
+    tolerance: float,
+) -> tuple[Integers, Floats]:
+    """Find all intersections; see ``sweep``, which names the result."""
+    n_boxes, n_bodies = len(sizes), 0
+    for c in range(len(members)):
+        n_bodies = max(n_bodies, members[c, 1] + 1)
+    table = np.full((n_boxes + n_bodies + 2, n_boxes + n_bodies + 2), -np.inf)
+    halves, rotations = 0.5 * sizes, np.empty((n_boxes, 3, 3))
+    for i in range(n_boxes):
+        rotation_kernel(orientations[i], rotations[i])
+    ends = np.empty((len(capsules), 2, 3))
+    _place_capsules(capsules, members, frame_origins, frame_orientations, ends)
+    _sweep_boxes(halves, positions, rotations, wall[0], wall[1], table)
+    _sweep_capsules(capsules, members, ends, n_boxes, wall[0], wall[1], table)
+    for i in range(n_boxes):
+        for c in range(len(capsules)):
+            depth = box_capsule_kernel(
+                halves[i], positions[i], rotations[i], ends[c, 0], ends[c, 1], capsules[c, 6]
+            )
+            _deepen(table, i, n_boxes + members[c, 1], depth)
+    return _select(table, tolerance)
+
+
+def sweep(
+    sizes: Floats,
+    positions: Floats,
+    orientations: Floats,
+    capsules: Floats,
+    members: Integers,
+    frame_origins: Floats,
+    frame_orientations: Floats,
+    *,
+    wall: tuple[float, float],
+    tolerance: float,
+) -> Found:
+    """Find all bodies that intersect.
+
+    The arrays must be writable and contiguous: the kernel is compiled for nothing else.
+
+    Args:
+        sizes: Full edge lengths of the boxes, shape (n, 3) [m].
+        positions: Their centers, shape (n, 3) [m].
+        orientations: Their quaternions (x, y, z, w), shape (n, 4).
+        capsules: Start, end and radius in a frame, shape (m, 7) [m].
+        members: For each capsule the number of its frame, of its body (from zero), of its group,
+            and its flags, shape (m, 4).
+        frame_origins: Shape (k, 3) [m].
+        frame_orientations: Quaternions (x, y, z, w), shape (k, 4).
+        wall: Inner radius and height [m].
+        tolerance: Only deeper intersections are found [m].
+
+    Returns:
+        The pairs and their depths.
+    """
+    return Found(
+        *sweep_kernel(
+            sizes,
+            positions,
+            orientations,
+            capsules,
+            members,
+            frame_origins,
+            frame_orientations,
+            wall,
+            tolerance,
+        )
+    )

@@ -1,0 +1,83 @@
+"""The ranges, bounds and defaults of the benchmark, as numbers only.
+
+Source:
+    Ahmed et al., *CausalWorld: A Robotic Manipulation Benchmark for Causal Structure and
+    Transfer Learning*, ICLR 2021, and release 1.2 of its code for names and values.
+"""
+
+from __future__ import annotations
+
+import math
+
+from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations
+
+# --- what is physically possible -----------------------------------------------------------------
+COLOR_BOUNDS = Box(0.0, 1.0)
+FRICTION_BOUNDS = Box(0.0, 2.0)
+BLOCK_MASS_BOUNDS = Box(0.001, 2.0)  # [kg]
+LINK_MASS_BOUNDS = Box(0.005, 5.0)  # [kg]
+SIZE_BOUNDS = Box(0.02, 0.2)  # [m]
+GRAVITY_BOUNDS = Box(-30.0, 30.0)  # [m/s²]
+ROBOT_HEIGHT_BOUNDS = Box(0.2, 0.6)  # [m]
+POSITION_BOUNDS = Box((-0.24, -0.24, 0.0), (0.24, 0.24, 0.5))  # [m]
+POLAR_BOUNDS = Box((0.0, -math.pi), (0.24, math.pi))  # [m, rad]
+QUATERNION_BOUNDS = Rotations()
+LINEAR_VELOCITY_BOUNDS = Box(-10.0, 10.0)  # [m/s]
+ANGULAR_VELOCITY_BOUNDS = Box(-100.0, 100.0)  # [rad/s]
+JOINT_BOUNDS = Box(
+    (-1.57079632679, -1.57079632679, -3.14159265359) * 3,
+    (1.57079632679, 1.57079632679, 3.14159265359) * 3,
+)  # [rad]
+JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
+CONTROL_INDEX_BOUNDS = Integers(0, 10**9)
+TYPE_BOUNDS = Categories((1, 2, 10, 20, 21, 23))
+
+# --- training space A and held-out space B ---------------------------------------------------------
+JOINTS_A = Box((-1.57, -1.2, -3.0) * 3, (-0.69, 0.0, 0.0) * 3)
+JOINTS_B = Box((-0.69, 0.0, 0.0) * 3, (1.0, 1.57, 3.0) * 3)
+SIZE_A = Box(0.055, 0.075)
+SIZE_B = Box(0.075, 0.095)
+MASS_A = Box(0.015, 0.045)
+MASS_B = Box(0.045, 0.100)
+FRICTION_A = Box(0.3, 0.6)
+FRICTION_B = Box(0.6, 0.8)
+DARK = Box(0.0, 0.5)
+BRIGHT = Box(0.5, 1.0)
+YAW = Box((0.0, 0.0, -math.pi), (0.0, 0.0, math.pi))  # a rotation about z, as a rotation vector
+GRAVITY_A = Box((0.0, 0.0, -10.0), (0.0, 0.0, -7.0))  # the paper; its code has no space
+GRAVITY_B = Box((0.0, 0.0, -7.0), (0.0, 0.0, -4.0))
+
+RADIUS_A = (0.0, 0.11)  # [m]
+RADIUS_B = (0.11, 0.15)  # [m]
+HEIGHT_A = 0.15  # [m] highest center of an object
+HEIGHT_B = 0.3  # [m]
+
+POLAR_A = Box((RADIUS_A[0], -math.pi), (RADIUS_A[1], math.pi))
+POLAR_B = Box((RADIUS_B[0], -math.pi), (RADIUS_B[1], math.pi))
+
+
+def half_height(size: str) -> Affine:
+    """Give the height of the center of an object that stands on the floor.
+
+    Args:
+        size: Name of the variable that holds its edge lengths.
+    """
+    return Affine(parent=size, index=2, scale=0.5)
+
+
+def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
+    """Give the space of cylindrical positions between two radii and two heights [m, rad, m]."""
+    return Box((radii[0], -math.pi, low), (radii[1], math.pi, high))
+
+
+# --- defaults ---------------------------------------------------------------------------------------
+GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]
+SURFACE_FRICTION = 0.5
+BLOCK_FRICTION = 1.0
+BLOCK_MASS = 0.02  # [kg]
+BLOCK_SIZE = (0.065, 0.065, 0.065)  # [m]
+FLOOR_COLOR = (0.31, 0.27, 0.25)
+STAGE_COLOR = (0.95, 0.95, 0.95)
+BLOCK_COLOR = (1.0, 0.0, 0.0)
+GOAL_COLOR = (0.0, 1.0, 0.0)
+IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)

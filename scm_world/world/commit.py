@@ -1,0 +1,218 @@
+"""The second half of a do(): is it feasible, and make it so, wholly or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.entities import CONTROL_INDEX
+from scm_world.errors import EngineFailure, Infeasible, InterventionError
+from scm_world.graph import flatten
+from scm_world.scene import Difference, PhysicalState
+from scm_world.scene.feasibility import overlaps
+from scm_world.variables import Hard
+from scm_world.variables.checks import coerce
+from scm_world.world.audit import Applied, Audit
+from scm_world.world.proposal import Instant, Proposal, propose
+
+if TYPE_CHECKING:
+    from scm_world.world.world import World
+
+TOLERANCE = 1e-3  # [m] how deep two bodies may lie in one another after an intervention
+READ_BACK = 1e-6  # how far an engine may report a number from what it was given
+_MOVES = ("size", "height")
+"""Parameters that change where the surfaces of bodies are."""
+
+
+def difference(world: World, proposal: Proposal) -> Difference:
+    """Give what the engine has to change, from its present state."""
+    now, state = world.current()
+    changed = {
+        key: np.asarray(proposal.static[name])
+        for name, key in world.parameter_keys.items()
+        if proposal.static[name] is not now[name]
+        and not np.array_equal(proposal.static[name], now[name])
+    }
+    same = state.coincides(proposal.state)
+    return Difference(None, changed, None if same else proposal.state)
+
+
+def _moves_surfaces(change: Difference) -> bool:
+    return change.state is not None or any(what in _MOVES for _, what in change.parameters)
+
+
+def _new_overlaps(world: World, proposal: Proposal) -> list[str]:
+    if not _moves_surfaces(difference(world, proposal)):
+        return []
+    found = overlaps(world.describe(proposal.static, proposal.state), tolerance=TOLERANCE)
+    if not found:
+        return []
+    now, state = world.current()
+    present = overlaps(world.describe(now, state), tolerance=0.0)
+    depth = {overlap.bodies: overlap.depth for overlap in present}
+    return [str(o) for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
+
+
+def refuse_overlaps(
+    world: World,
+    proposal: Proposal,
+    request: Mapping[str, Any],
+    nearest: Callable[[], dict[str, Any] | None],
+) -> None:
+    """Refuse an intervention that puts two bodies in one place.
+
+    Bodies that intersect already (a block that is being squeezed) may go on doing so.
+
+    Raises:
+        Infeasible: With the bodies, the depths, and the nearest value that is feasible.
+    """
+    problems = _new_overlaps(world, proposal)
+    if problems:
+        flat = flatten(request)
+        name = next(iter(flat))
+        found = nearest()
+        raise Infeasible(name, flat[name], problems, None if found is None else found[name])
+
+
+def nearest_feasible(
+    world: World, instant: Instant, request: Mapping[str, Any], *, halvings: int = 20
+) -> dict[str, Any] | None:
+    """Search the straight line from the present values to the wanted ones for the last feasible.
+
+    Returns:
+        A value for each target, or None where a target is no plain number or nothing is feasible.
+    """
+    here: dict[str, Value] = {}
+    there: dict[str, Value] = {}
+    for name, value in flatten(request).items():
+        variable = world.model.declared(name)
+        plain = value.value if isinstance(value, Hard) else value
+        try:
+            there[name] = coerce(variable, plain)
+        except InterventionError:
+            return None
+        here[name] = world[name]
+
+    def between(part: float) -> dict[str, Any]:
+        return {name: (here[name] + part * (there[name] - here[name])).tolist() for name in here}
+
+    low, high = 0.0, 1.0
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        try:
+            blocked = _new_overlaps(world, propose(world, instant, between(middle), None))
+        except InterventionError:
+            blocked = ["outside the bounds on the way"]
+        low, high = (low, middle) if blocked else (middle, high)
+    return between(low)
+
+
+def commit(
+    world: World, instant: Instant, proposal: Proposal, request: Mapping[str, Any]
+) -> tuple[Audit, Instant]:
+    """Apply a proposal, read it back, and report; or put everything back and raise.
+
+    Raises:
+        EngineFailure: The engine does not report what it was given. The world is as before.
+    """
+    change = difference(world, proposal)
+    before = dict(world.current()[0])
+    moved_before = {}
+    if change.state is not None:
+        moved_before = {name: np.array(before[name]) for name in world.slices}
+    inertia = _inertia(world, change)
+    if change:
+        world.backend.apply(change)
+        wrong = _not_taken(world, change, proposal)
+        if wrong:
+            world.backend.apply(_back(world, change, before))
+            raise EngineFailure(
+                f"the engine did not take over {', '.join(wrong)}", world.backend.name
+            )
+    world.adopt(proposal.model, proposal.static, proposal.index)
+    audit = _report(world, proposal, request, before, moved_before, inertia, change)
+    kept = Instant(
+        instant.model,
+        instant.static,
+        instant.state,
+        instant.index,
+        proposal.requests,
+        instant.at_start,
+    )
+    return audit, kept
+
+
+def _back(world: World, change: Difference, before: Mapping[str, Value]) -> Difference:
+    keys = {key: name for name, key in world.parameter_keys.items()}
+    old = {key: before[keys[key]] for key in change.parameters}
+    return Difference(None, old, None if change.state is None else world.current()[1].copy())
+
+
+def _not_taken(world: World, change: Difference, proposal: Proposal) -> list[str]:
+    reported = world.backend.parameters(change.parameters)
+    wrong = [
+        ".".join(key)
+        for key, value in change.parameters.items()
+        if not _close(value, reported[key])
+    ]
+    if change.state is not None:
+        got = PhysicalState(change.state.n_blocks)
+        world.backend.read(got)
+        if not _close(change.state.settable(), got.settable()):
+            wrong.append("the state")
+    return wrong
+
+
+def _close(given: Floats, reported: Floats) -> bool:
+    return bool(np.all(np.abs(given - reported) <= READ_BACK * np.maximum(1.0, np.abs(given))))
+
+
+def _inertia(world: World, change: Difference) -> dict[str, Value]:
+    bodies = {body for body, what in change.parameters if what in ("mass", "size")}
+    return {f"{body}.inertia": world.backend.inertia(body) for body in sorted(bodies)}
+
+
+def _report(
+    world: World,
+    proposal: Proposal,
+    request: Mapping[str, Any],
+    before: Mapping[str, Value],
+    moved_before: Mapping[str, Value],
+    inertia: Mapping[str, Value],
+    change: Difference,
+) -> Audit:
+    flat = flatten(request)
+    now, state = world.current()
+    targets = {world.model.target(name) for name in proposal.asked}
+    reported = world.backend.parameters(
+        [world.parameter_keys[t] for t in targets if t in world.parameter_keys]
+    )
+    entries = {}
+    for name in proposal.asked:
+        target = world.model.target(name)
+        applied = np.array(now[target])
+        key, where = world.parameter_keys.get(target), world.slices.get(target)
+        back = reported[key] if key is not None else None
+        if where is not None:
+            back = state.vector[where].copy()
+        if target == CONTROL_INDEX:
+            back = np.asarray(world.index)
+        entries[name] = Applied(name, flat[name], applied, back)
+    followed = {
+        name: (before[name], proposal.static[name])
+        for name in proposal.static
+        if name not in targets
+        and proposal.static[name] is not before[name]
+        and not np.array_equal(before[name], proposal.static[name])
+    }
+    for name, old in moved_before.items():
+        if name not in targets and not np.array_equal(old, now[name]):
+            followed[name] = (old, np.array(now[name]))
+    engine = {
+        body: (old, world.backend.inertia(body.removesuffix(".inertia")))
+        for body, old in inertia.items()
+    }
+    return Audit(entries, followed, engine)

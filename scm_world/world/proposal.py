@@ -1,0 +1,238 @@
+"""The first half of a do(): what would the world be, and may it be so? Nothing changes here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from scm_world._types import Value, Values
+from scm_world.entities import CONTROL_INDEX
+from scm_world.errors import ConflictingTargets, InterventionError, raise_all
+from scm_world.graph import SCM, Moment, flatten
+from scm_world.scene import PhysicalState
+from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Shift
+from scm_world.variables.checks import check_bounds, check_space, coerce
+from scm_world.variables.kinds import SpaceName
+
+if TYPE_CHECKING:
+    from scm_world.world.world import World
+
+Requests = dict[str, tuple[str, Intervention]]
+"""By target: the name that was asked for (the target, or coordinates of it) and the act."""
+
+
+@final
+@dataclass(frozen=True)
+class Instant:
+    """The world as physics left it, before anyone intervened at this instant.
+
+    Interventions at one instant are one intervention: they are always computed from here, so
+    that taking one back leaves no trace, and the order does not matter.
+
+    Attributes:
+        model: With the interventions of earlier instants.
+        static: Values of everything that physics does not move.
+        state: Where everything is.
+        index: The control step.
+        requests: What has been asked for at this instant so far.
+        at_start: Whether an episode is just beginning.
+    """
+
+    model: SCM
+    static: Mapping[str, Value]
+    state: PhysicalState
+    index: int
+    requests: Requests = field(default_factory=dict)
+    at_start: bool = False
+
+
+@final
+@dataclass(frozen=True)
+class Proposal:
+    """What the world would be after the intervention."""
+
+    model: SCM
+    static: dict[str, Value]
+    state: PhysicalState
+    index: int
+    requests: Requests
+    asked: tuple[str, ...]
+
+
+def accept(model: SCM, request: Mapping[str, Any]) -> tuple[Requests, list[InterventionError]]:
+    """Check names, types and shapes; keep what is right and list what is wrong."""
+    accepted: Requests = {}
+    problems: list[InterventionError] = []
+    for name, value in flatten(request).items():
+        try:
+            act = model.accept(name, value)
+            target = model.target(name)
+            if target in accepted:
+                raise ConflictingTargets((accepted[target][0], name), target)
+            accepted[target] = (name, act)
+        except InterventionError as problem:
+            problems.append(problem)
+    return accepted, problems
+
+
+def propose(
+    world: World, instant: Instant, request: Mapping[str, Any], space: SpaceName | None
+) -> Proposal:
+    """Work out an intervention without touching the world.
+
+    Raises:
+        InterventionError: With every problem of the request.
+    """
+    accepted, problems = accept(world.model, request)
+    requests: Requests = {**instant.requests, **accepted}
+    draft = _Draft(world, instant, requests)
+    draft.solve_parameters()
+    problems += draft.set_states()
+    problems += draft.check(accepted, space)
+    raise_all(problems)
+    asked = tuple(name for name, _ in accepted.values())
+    frozen = {
+        target: (name, draft.frozen(target, name, act)) for target, (name, act) in requests.items()
+    }
+    return Proposal(draft.model, draft.static, draft.state, draft.index, frozen, asked)
+
+
+@final
+class _Draft:
+    """A world on paper."""
+
+    def __init__(self, world: World, instant: Instant, requests: Requests) -> None:
+        self._world, self._instant, self._requests = world, instant, requests
+        self.static: dict[str, Value] = dict(instant.static)
+        self.model = instant.model
+        self.state = instant.state
+        self.index = instant.index
+        self._moment = Moment(world.noise, world.episode, instant.index)
+
+    def _is_state(self, target: str) -> bool:
+        return self._world.model.declared(target).role == "state"
+
+    def solve_parameters(self) -> None:
+        """Mutilate the model and recompute the descendants of the targets."""
+        acts = {t: na for t, na in self._requests.items() if not self._is_state(t)}
+        if not acts:
+            return
+        self.model = self._instant.model.with_interventions(dict(acts.values()))
+        targets = [target for target in acts if target in self.static]
+        follow = self._world.static_descendants(targets)
+        known = {name: v for name, v in self.static.items() if name not in targets}
+        order = [n for n in self._world.static_names if n in follow or n in targets]
+        solved = self.model.solve(known, moment=self._moment, only=order)
+        self.static = {name: solved[name] for name in self.static}
+        draws = {
+            name: Hard(self._coordinates(target, name).tolist())
+            for target, (name, act) in acts.items()
+            if isinstance(act, Draw) and target in self.static
+        }
+        if draws:
+            self.model = self.model.with_interventions(draws)
+
+    def _coordinates(self, target: str, name: str) -> Value:
+        """Give the value of a target in the coordinates that were asked for."""
+        value = self._value(target)
+        if name == target:
+            return np.asarray(value)
+        variable: Any = self._world.model.declared(name)
+        return np.asarray(variable.mechanism.bind()(value))
+
+    def _value(self, target: str) -> Value:
+        if target == CONTROL_INDEX:
+            return np.asarray(self.index)
+        where = self._world.slices.get(target)
+        return self.static[target] if where is None else self.state.vector[where]
+
+    def set_states(self) -> list[InterventionError]:
+        """Set states, and carry along those whose parents were set."""
+        acts = {t: na for t, na in self._requests.items() if self._is_state(t)}
+        self.state = self._instant.state.copy()
+        problems: list[InterventionError] = []
+        for target, (name, act) in acts.items():
+            value = self._wish(target, name, act)
+            try:
+                check_bounds(self._world.model.declared(target), value, self.static)
+            except InterventionError as problem:
+                problems.append(problem)
+                continue
+            if target == CONTROL_INDEX:
+                self.index = int(value)
+            else:
+                self.state.vector[self._world.slices[target]] = self._exact(target, value)
+        self._carry(acts)
+        return problems
+
+    def _exact(self, target: str, value: Value) -> Value:
+        bounds = self._world.model.declared(target).bounds
+        return value if bounds is None else bounds.nearest(value, self.static)
+
+    def _wish(self, target: str, name: str, act: Intervention) -> Value:
+        requested: Any = self._world.model.declared(name)
+        if isinstance(act, Hard):
+            value = requested.array(act.value)
+        elif isinstance(act, Draw):
+            source = requested.space(act.source) if isinstance(act.source, str) else act.source
+            values = {**self.static, **self._world.states(self.state)}
+            value = self._moment.draw(source, name, requested.shape, values)
+        else:
+            present = self._coordinates(target, name)
+            by = np.asarray(act.by)
+            value = present + by if isinstance(act, Shift) else present * by
+        return np.asarray(value if name == target else requested.inverse.bind()(value))
+
+    def _carry(self, acts: Requests) -> None:
+        """Let states follow the parents that act on them when set (a block that grows)."""
+        for variable in self._world.carried:
+            if variable.name in acts:
+                continue
+            parents = variable.set_parents()
+            old = [self._before(parent) for parent in parents]
+            new = [self._value(parent) for parent in parents]
+            if all(np.array_equal(a, b) for a, b in zip(old, new, strict=True)):
+                continue
+            where = self._world.slices[variable.name]
+            self.state.vector[where] = self._moved(variable, where, old, new)
+
+    def _moved(self, variable: Measured, where: slice, old: list[Value], new: list[Value]) -> Value:
+        if self._instant.at_start and variable.start is not None:
+            return np.asarray(variable.start.bind()(*new))
+        if variable.carry is None:
+            return self._instant.state.vector[where]
+        present = self._instant.state.vector[where]
+        return np.asarray(variable.carry.bind()(present, *old, *new))
+
+    def _before(self, name: str) -> Value:
+        where = self._world.slices.get(name)
+        return self._instant.static[name] if where is None else self._instant.state.vector[where]
+
+    def check(self, accepted: Requests, space: SpaceName | None) -> list[InterventionError]:
+        """Check bounds and the asked space, now that all other values are known."""
+        problems: list[InterventionError] = []
+        context: Values = {**self.static, **self._world.states(self.state)}
+        for target, (name, _) in accepted.items():
+            if target == "action":
+                continue
+            requested = self._world.model.declared(name)
+            try:
+                if not self._is_state(target):
+                    check_bounds(self._world.model.declared(target), self._value(target), context)
+                if space is not None:
+                    check_space(requested, self._coordinates(target, name), space, context)
+            except InterventionError as problem:
+                problems.append(problem)
+        return problems
+
+    def frozen(self, target: str, name: str, act: Intervention) -> Intervention:
+        """Replace a draw, or a change of a state, by the value that came out."""
+        if isinstance(act, Hard) or target == "action":
+            return act
+        if isinstance(act, SOFT) and not self._is_state(target):
+            return act
+        variable = self._world.model.declared(name)
+        return Hard(coerce(variable, self._coordinates(target, name)).tolist())

@@ -1,0 +1,416 @@
+"""A structural causal model, realised by a physics engine."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world.backends import Backend, make_backend
+from scm_world.backends.base import EngineSnapshot
+from scm_world.entities import ACTIONS, CONTROL_INDEX, Clock, Composition, Robot, Stage
+from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
+from scm_world.graph import SCM
+from scm_world.scene import (
+    TIMESTEP,
+    ControlMode,
+    PhysicalState,
+    Scene,
+    Structure,
+    default_parameters,
+    preset,
+)
+from scm_world.scene.kinematics import inverse_kernel
+from scm_world.tasks import Task, conventions, make_task
+from scm_world.variables import Measured, Noise
+from scm_world.variables.kinds import SpaceName
+from scm_world.world.audit import Audit
+from scm_world.world.commit import commit, nearest_feasible, refuse_overlaps
+from scm_world.world.proposal import Instant, propose
+from scm_world.world.readouts import Readouts, static_order
+from scm_world.world.snapshot import WorldSnapshot
+
+
+@final
+class World:
+    """A task as a causal model, with an engine that moves it.
+
+    Args:
+        task: A registered name, or a task.
+        backend: ``"mujoco"``, ``"bullet"``, ``"fake"``, or an engine that is not used elsewhere.
+        preset: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
+        action_mode: ``"joint_positions"``, ``"joint_torques"`` or ``"end_effector_positions"``.
+        frame_skip: Length of a control step in units of 4 ms, whatever the preset.
+        max_episode_length: In control steps; the task's own length if None.
+        conventions: ``"scm_world"``, or ``"causal_world"`` for the predecessor's.
+
+    Raises:
+        UnknownOption: One of the names does not exist.
+        MissingEngine: The engine is not installed.
+
+    Example:
+        >>> world = World("pushing", backend="fake")
+        >>> world.reset(seed=0)
+        >>> audit = world.do({"block.size": [0.07, 0.07, 0.07]})
+        >>> world["goal_block.cartesian_position"].round(3)
+        array([0.   , 0.08 , 0.035])
+        >>> world.step(np.zeros(9))
+        >>> int(world["control_index"])
+        1
+    """
+
+    def __init__(
+        self,
+        task: Task | str = "pushing",
+        *,
+        backend: Backend | str = "mujoco",
+        preset: str = "fast",
+        action_mode: str = "joint_positions",
+        frame_skip: int = 10,
+        max_episode_length: int | None = None,
+        conventions: str = "scm_world",
+    ) -> None:
+        self.task = make_task(task) if isinstance(task, str) else task
+        self.frame_skip = _positive("frame_skip", frame_skip)
+        self.control_period = TIMESTEP * self.frame_skip  # [s]
+        self.given_length = max_episode_length
+        if max_episode_length is not None:
+            _positive("max_episode_length", max_episode_length)
+        self.max_episode_length = max_episode_length or round(
+            self.task.seconds / self.control_period
+        )
+        if action_mode not in ACTIONS:
+            raise UnknownOption("action_mode", action_mode, ACTIONS)
+        self.action_mode = action_mode
+        self.conventions = _conventions(conventions)
+        self._preset = _preset(preset)
+        self._substeps = round(self.control_period / self._preset.timestep)
+        self._mode = (
+            ControlMode.JOINT_TORQUES
+            if action_mode == "joint_torques"
+            else ControlMode.JOINT_POSITIONS
+        )
+        self.backend = make_backend(backend) if isinstance(backend, str) else backend
+        self._declare()
+        self._started = False
+
+    def _declare(self) -> None:
+        clock = Clock(self.max_episode_length, self.control_period)
+        self.composition = Composition(
+            (Robot(self.action_mode), Stage(), clock, *self.task.entities()),
+            tuple(self.task.shared()),
+        )
+        self.model = SCM([*self.composition.variables(), *self.task.readouts(self.conventions)])
+        self.slices = self.composition.slices()
+        self.parameter_keys = self.composition.parameters()
+        self.carried = tuple(
+            v for v in self.model.variables if isinstance(v, Measured) and v.set_parents()
+        )
+        self.noise = Noise(0)
+        self.episode = 0
+        self._held = self.model
+        self._index = 0
+        self._clock = np.zeros((), dtype=np.int64)
+        self._now: dict[str, Value] = {}
+        self._before: dict[str, Value] = {}
+        self._readouts = Readouts(self.model, self._now, self._before)
+        self.static_names = static_order(self.model, self._readouts.order)
+        self._follow: dict[tuple[str, ...], frozenset[str]] = {}
+        self._instant: Instant | None = None
+        self._command = np.zeros(9)
+        self._reached = np.zeros(3, dtype=np.bool_)
+        bounds: Any = self.model.declared("action").bounds
+        low, high = bounds.bounds((9,), {})
+        self.action_low, self.action_high = np.array(low), np.array(high)
+
+    # --- looking ------------------------------------------------------------------------------
+
+    @property
+    def graph(self) -> SCM:
+        """The causal model as it is now, with the parameters that ``do`` holds."""
+        return self._held
+
+    @property
+    def index(self) -> int:
+        """How many control steps of the episode are over."""
+        return self._index
+
+    @cached_property
+    def structure(self) -> Structure:
+        """The bodies that the engine has to build."""
+        return Structure(blocks=self.composition.blocks, preset=self._preset)
+
+    def static_descendants(self, targets: Iterable[str]) -> frozenset[str]:
+        """Name what follows some variables at once, without physics."""
+        key = tuple(targets)
+        if key not in self._follow:
+            self._follow[key] = frozenset(self.model.structure.instant_descendants(key))
+        return self._follow[key]
+
+    def states(self, state: PhysicalState) -> dict[str, Value]:
+        """Give the states by name, as views of a vector."""
+        return {name: state.vector[where] for name, where in self.slices.items()}
+
+    def __getitem__(self, name: str) -> Value:
+        """Give the present value of one variable.
+
+        Raises:
+            UnknownVariable: No variable has this name.
+            NotReset: There is no episode yet.
+        """
+        self.model.declared(name)
+        self._require_episode()
+        self._readouts.evaluate()
+        return np.array(self._now[name])
+
+    def values(self) -> dict[str, Value]:
+        """Give the present value of every variable, as copies."""
+        self._require_episode()
+        self._readouts.evaluate()
+        return {name: np.array(self._now[name]) for name in self.model}
+
+    def previous(self) -> dict[str, Value]:
+        """Give the values of one control step ago that present variables depend on."""
+        self._require_episode()
+        return {name: np.array(value) for name, value in self._before.items()}
+
+    def evaluate(self, names: tuple[str, ...]) -> dict[str, Value]:
+        """Compute some variables and give all present values without copying them.
+
+        For loops that cannot wait; the values change with the next step.
+        """
+        self._readouts.evaluate(names)
+        return self._now
+
+    def scene(self) -> Scene:
+        """Describe the present for a picture, or for another engine."""
+        self._require_episode()
+        return self.describe(self._now, self._state.copy())
+
+    def describe(self, values: Values, state: PhysicalState) -> Scene:
+        """Describe the scene that some values stand for."""
+        parameters = dict(self._constants)
+        for name, key in self.parameter_keys.items():
+            parameters[key] = values[name]
+        goals = self.composition.goals(values)
+        return Scene(self.structure, parameters, state, goals)
+
+    # --- running ------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, do: Mapping[str, Any] | None = None
+    ) -> Audit | None:
+        """Begin an episode. Nothing that was done in the last one remains.
+
+        Args:
+            seed: Of the noise; it also makes this episode number 0. Without it the next episode
+                of the same noise begins, or of a fresh seed if there was none.
+            do: An intervention that takes part in the beginning: a block of another size stands
+                on the floor. It holds until the next reset.
+
+        Returns:
+            The audit of the intervention, or None if there was none.
+
+        Raises:
+            InterventionError: The intervention was refused. The episode has begun without it.
+        """
+        if seed is not None:
+            self.noise, self.episode = Noise(_seed(seed)), 0
+        elif not self._started:
+            self.noise, self.episode = Noise(secrets.randbits(63)), 0
+        else:
+            self.episode += 1
+        self._begin()
+        return self.do(do) if do else None
+
+    def _begin(self) -> None:
+        if self._started:
+            self.backend.restore(self._origin.engine)
+        else:
+            self._build()
+        self._held = self.model
+        self._index = 0
+        self._clock[...] = 0
+        self._now.update(self._origin.static)
+        self._now["action"] = np.zeros(9)
+        self.backend.read(self._state)
+        self._readouts.forget()
+        self._instant = self._present(at_start=True)
+
+    def _build(self) -> None:
+        static = self.model.solve(only=self.static_names)
+        self._constants = default_parameters(self.structure)
+        self._state = PhysicalState(len(self.structure.blocks))
+        for variable in self.model.variables:
+            where = self.slices.get(variable.name)
+            if where is not None and isinstance(variable, Measured):
+                self._state.vector[where] = self._first(variable, static)
+        self._now.update(static)
+        self._now.update(self.states(self._state))
+        self._now[CONTROL_INDEX] = self._clock
+        self.backend.build(self.describe(self._now, self._state.copy()))
+        engine = self.backend.snapshot()
+        self._origin = WorldSnapshot(engine=engine, static=static)
+        self._started = True
+
+    def _first(self, variable: Measured, static: Values) -> Value:
+        if variable.start is None:
+            return variable.array(variable.default)
+        known = {**static}
+        for name in variable.set_parents():
+            parent = self.model.declared(name)
+            if isinstance(parent, Measured):
+                known[name] = parent.array(parent.default)
+        parents = [known[name] for name in variable.set_parents()]
+        return np.asarray(variable.start.bind()(*parents))
+
+    def step(self, action: ArrayLike) -> None:
+        """Advance one control step.
+
+        Args:
+            action: What the action mode asks for, shape (9,) in SI units. Numbers outside the
+                action's range are clipped to it.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite.
+            NotReset: There is no episode yet.
+            EngineFailure: The engine lost the state.
+        """
+        if self._instant is None and not self._started:
+            raise NotReset
+        command = self._checked(action)
+        self._readouts.remember()
+        self._now["action"] = command
+        if self.action_mode == "end_effector_positions":
+            height = float(self._now["robot_height"])
+            joints = self._state.joint_positions
+            inverse_kernel(command, height, joints, self._command, self._reached)
+            command = self._command
+        self.backend.step(self._mode, command, self._substeps)
+        self.backend.read(self._state)
+        self._index += 1
+        self._clock[...] = self._index
+        self._instant = None
+
+    def _checked(self, action: ArrayLike) -> Floats:
+        given = np.asarray(action, dtype=np.float64)
+        if given.shape != (9,) or not np.isfinite(given.sum()):
+            raise ActionError(
+                f"an action is 9 finite numbers [{self.model.declared('action').unit}], "
+                f"got {action!r}",
+                action,
+            )
+        if "action" in self._held.interventions:
+            given = np.asarray(
+                self._held.solve({**self._now, "action": given}, only=("action",))["action"]
+            )
+        return np.minimum(np.maximum(given, self.action_low), self.action_high)
+
+    # --- intervening --------------------------------------------------------------------------
+
+    def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
+        """Intervene now, without advancing time. All of it happens, or none of it.
+
+        A parameter holds until the reset; a state is set at this instant and physics carries it
+        on. Interventions at one instant add up to one: taking one back leaves no trace.
+
+        Args:
+            request: Values, ``Shift``, ``Scale`` or ``Draw`` by name, dotted or nested.
+            space: If given, every target must lie in this space: ``"A"``, ``"B"`` or ``"A|B"``.
+
+        Returns:
+            What was requested, applied and read back, and what followed.
+
+        Raises:
+            InterventionError: The request was refused; the world is bit-identical to before.
+            NotReset: There is no episode yet.
+        """
+        self._require_episode()
+        instant = self._instant or self._present()
+        proposal = propose(self, instant, request, space)
+        refuse_overlaps(self, proposal, request, lambda: nearest_feasible(self, instant, request))
+        audit, self._instant = commit(self, instant, proposal, request)
+        return audit
+
+    def _present(self, *, at_start: bool = False) -> Instant:
+        static = {name: self._now[name] for name in self.static_names}
+        return Instant(self._held, static, self._state.copy(), self._index, at_start=at_start)
+
+    def adopt(self, model: SCM, static: Values, index: int) -> None:
+        """Take over what an intervention decided; the engine has taken over its part."""
+        self._held = model
+        self._now.update(static)
+        self._index = index
+        self._clock[...] = index
+        self.backend.read(self._state)
+
+    def current(self) -> tuple[Values, PhysicalState]:
+        """Give the live values and the live state, for the parts of a ``do``."""
+        return self._now, self._state
+
+    # --- going back ---------------------------------------------------------------------------
+
+    def snapshot(self) -> WorldSnapshot:
+        """Save everything that decides how the world goes on. It can be pickled."""
+        self._require_episode()
+        instant = self._instant
+        return WorldSnapshot(
+            engine=self.backend.snapshot(),
+            static={name: self._now[name] for name in self.static_names},
+            interventions=self._held.interventions,
+            previous=self.previous(),
+            action=np.array(self._now["action"]),
+            index=self._index,
+            seed=self.noise.seed,
+            episode=self.episode,
+            variables=tuple(self.model),
+            at_start=instant is not None and instant.at_start,
+        )
+
+    def restore(self, snapshot: WorldSnapshot) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Raises:
+            SnapshotMismatch: It is one of another task or engine.
+        """
+        if snapshot.variables != tuple(self.model):
+            raise SnapshotMismatch("the snapshot is one of another task, or of other options")
+        if not self._started:
+            self._begin()
+        engine: EngineSnapshot = snapshot.engine
+        self.backend.restore(engine)
+        self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
+        held = self.model.with_interventions(snapshot.interventions)
+        self._now["action"] = np.array(snapshot.action)
+        self.adopt(held, snapshot.static, snapshot.index)
+        for name, value in snapshot.previous.items():
+            self._before[name][...] = value
+        self._instant = self._present(at_start=snapshot.at_start)
+
+    def close(self) -> None:
+        """Free the engine."""
+        self.backend.close()
+
+    def _require_episode(self) -> None:
+        if not self._started:
+            raise NotReset
+
+
+def _positive(name: str, value: int) -> int:
+    if not isinstance(value, int | np.integer) or value < 1:
+        raise UnknownOption(name, value, ("any whole number from 1 on",))
+    return int(value)
+
+
+def _seed(seed: int) -> int:
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise UnknownOption("seed", seed, ("any whole number from 0 on",))
+    return int(seed)
+
+
+_conventions = conventions
+_preset = preset

@@ -1,0 +1,83 @@
+"""Facts about cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scm_world.scene.camera import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW, Camera
+from scm_world.scene.trifinger import TABLE_OFFSET
+
+EVERY = [*CAMERAS, *ORIGINAL_CAMERAS, OVERVIEW]
+
+
+@pytest.mark.parametrize("camera", EVERY, ids=lambda camera: camera.name)
+def test_axes_are_a_rotation(camera: Camera) -> None:
+    """Right, up and back are orthonormal and right-handed."""
+    axes = camera.axes()
+
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("camera", EVERY, ids=lambda camera: camera.name)
+def test_projection_is_that_of_the_matrices(camera: Camera) -> None:
+    """``project`` says in pixels what the two matrices say in clip space."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, size=(50, 3))
+    homogeneous = np.column_stack([points, np.ones(50)])
+    clip = homogeneous @ (camera.projection_matrix() @ camera.view_matrix()).T
+    screen = clip[:, :2] / clip[:, 3:]
+    expected = np.column_stack(
+        [
+            (1.0 + screen[:, 0]) * camera.width / 2.0,
+            (1.0 - screen[:, 1]) * camera.height / 2.0,
+            clip[:, 3],
+        ]
+    )
+
+    np.testing.assert_allclose(camera.project(points), expected, atol=1e-10)
+
+
+def test_near_and_far_bound_the_clip_space() -> None:
+    """Points on the near and far planes have clip depths -1 and 1."""
+    matrix = OVERVIEW.projection_matrix()
+    for distance, depth in ((OVERVIEW.near, -1.0), (OVERVIEW.far, 1.0)):
+        clip = matrix @ [0.0, 0.0, -distance, 1.0]
+        assert clip[2] / clip[3] == pytest.approx(depth)
+
+
+def test_target_is_in_the_middle() -> None:
+    """The optical axis goes through the center of the picture."""
+    column, row, _ = OVERVIEW.project(OVERVIEW.target)
+
+    assert (column, row) == pytest.approx((320.0, 240.0))
+
+
+@pytest.mark.parametrize("camera", [*CAMERAS, OVERVIEW], ids=lambda camera: camera.name)
+def test_our_cameras_are_upright(camera: Camera) -> None:
+    """What is higher in the world is higher in the picture."""
+    assert camera.project([0.0, 0.0, 0.1])[1] < camera.project([0.0, 0.0, 0.0])[1]
+
+
+def test_originals_have_the_published_targets() -> None:
+    """The point that the predecessor looks at, and its up vector, are the published ones."""
+    targets = [(-0.4548, -0.4053, -0.7931), (-0.0074, 0.5028, -0.8646), (0.4402, -0.4570, -0.7729)]
+    ups = [(0.5745, 0.5470, -0.6090), (-0.0223, -0.8645, -0.5025), (-0.5545, 0.5387, -0.6343)]
+    for camera, target, up in zip(ORIGINAL_CAMERAS, targets, ups, strict=True):
+        np.testing.assert_allclose(np.add(camera.target, (0, 0, TABLE_OFFSET)), target, atol=2e-4)
+        np.testing.assert_allclose(camera.up, up, atol=2e-4)
+
+
+def test_originals_miss_the_optical_axis() -> None:
+    """The predecessor's views are off by the published angles."""
+    for ours, theirs, angle in zip(CAMERAS, ORIGINAL_CAMERAS, (2.66, 1.62, 1.60), strict=True):
+        off = np.degrees(np.arccos(ours.axes()[2] @ theirs.axes()[2]))
+        assert off == pytest.approx(angle, abs=0.006)
+
+
+def test_up_along_the_axis_is_refused() -> None:
+    """A camera that looks along its up vector has no right and left."""
+    camera = Camera("lost", eye=(0.0, 0.0, 1.0), target=(0.0, 0.0, 0.0))
+
+    with pytest.raises(ValueError, match="camera 'lost': up"):
+        camera.axes()
