@@ -1,1 +1,100 @@
-"""A block-building robot, written down as a structural causal model."""
+"""A block-building robot, written down as a structural causal model.
+
+Importing this registers the environments with Gymnasium and nothing else; what is named below is
+loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+if TYPE_CHECKING:
+    from scm_world.discovery import discover
+    from scm_world.env import ScmWorldEnv
+    from scm_world.errors import ScmWorldError
+    from scm_world.graph import SCM
+    from scm_world.tasks import Task, make_task
+    from scm_world.variables import (
+        Action,
+        Box,
+        Derived,
+        Draw,
+        Exogenous,
+        Fixed,
+        Linear,
+        Measured,
+        Parent,
+        Scale,
+        Shift,
+    )
+    from scm_world.world import World
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "SCM": "graph",
+    "ScmWorldEnv": "env",
+    "ScmWorldError": "errors",
+    "Task": "tasks",
+    "World": "world",
+    "discover": "discovery",
+    "make_task": "tasks",
+    **dict.fromkeys(
+        (
+            "Action",
+            "Box",
+            "Derived",
+            "Draw",
+            "Exogenous",
+            "Fixed",
+            "Linear",
+            "Measured",
+            "Parent",
+            "Scale",
+            "Shift",
+        ),
+        "variables",
+    ),
+}
+
+__all__ = [
+    "SCM",
+    "Action",
+    "Box",
+    "Derived",
+    "Draw",
+    "Exogenous",
+    "Fixed",
+    "Linear",
+    "Measured",
+    "Parent",
+    "Scale",
+    "ScmWorldEnv",
+    "ScmWorldError",
+    "Shift",
+    "Task",
+    "World",
+    "discover",
+    "make_task",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'scm_world' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"scm_world.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])
+
+
+for _task in ("Pushing", "Reaching"):
+    _id = f"scm_world/{_task}-v0"
+    if _id not in gymnasium.registry:
+        gymnasium.register(
+            id=_id, entry_point="scm_world.env:ScmWorldEnv", kwargs={"task": _task.lower()}
+        )

@@ -88,9 +88,7 @@ class UnknownVariable(InterventionError):
 
     def __init__(self, name: str, known: Iterable[str]) -> None:
         self.suggestion = nearest(name, known)
-        super().__init__(
-            f"no variable is named {name!r}{_suggest(self.suggestion)}", variable=name
-        )
+        super().__init__(f"no variable is named {name!r}{_suggest(self.suggestion)}", variable=name)
 
 
 class NotIntervenable(InterventionError):
@@ -103,9 +101,7 @@ class NotIntervenable(InterventionError):
     def __init__(self, name: str, reason: str, causes: Iterable[str] = ()) -> None:
         self.causes = tuple(causes)
         instead = (
-            f"; intervene on a cause of it instead: {', '.join(self.causes)}"
-            if self.causes
-            else ""
+            f"; intervene on a cause of it instead: {', '.join(self.causes)}" if self.causes else ""
         )
         super().__init__(f"{name!r} {reason}{instead}", variable=name)
 
@@ -212,9 +208,7 @@ class Infeasible(InterventionError):
         nearest: The nearest value that is feasible, where one was found.
     """
 
-    def __init__(
-        self, name: str, value: Any, problems: Sequence[str], nearest: Any = None
-    ) -> None:
+    def __init__(self, name: str, value: Any, problems: Sequence[str], nearest: Any = None) -> None:
         self.problems = tuple(problems)
         self.nearest = nearest
         hint = f"; the nearest feasible value is {nearest!r}" if nearest is not None else ""

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import final
 
+import numpy as np
+
 from scm_world._types import Floats
 from scm_world.entities.base import Entity, State
 from scm_world.entities.blocks import color
 from scm_world.scene import ParameterKey, trifinger
-from scm_world.scene.kinematics import forward
+from scm_world.scene.kinematics import forward_kernel
 from scm_world.variables import Action, Box, Exogenous, Measured, Variable
 from scm_world.variables import catalogue as numbers
 
@@ -25,7 +27,9 @@ ACTIONS = {
 
 def tips(joint_positions: Floats, robot_height: Floats) -> Floats:
     """Compute the three fingertips from the joints, shape (9,) [m]."""
-    return forward(joint_positions, float(robot_height))
+    found = np.empty(9)
+    forward_kernel(joint_positions, float(robot_height), found)
+    return found
 
 
 @final

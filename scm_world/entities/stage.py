@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import final
 
-import numpy as np
-
-from scm_world._types import Floats, Value
+from scm_world._types import Value
 from scm_world.entities.base import Entity
 from scm_world.entities.blocks import color
 from scm_world.scene import ParameterKey
@@ -62,10 +60,9 @@ class Stage(Entity):
         }
 
 
-def remaining(control_index: Value, *, steps: Floats, seconds_per_step: Floats) -> Floats:
+def remaining(control_index: Value, *, steps: float, seconds_per_step: float) -> float:
     """Compute the time left [s], never below zero."""
-    left: Floats = np.maximum(steps - control_index, 0.0) * seconds_per_step
-    return left
+    return max(steps - float(control_index), 0.0) * seconds_per_step
 
 
 @final

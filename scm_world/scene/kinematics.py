@@ -89,6 +89,16 @@ def forward_kernel(joint_positions: Floats, height: float, out: Floats) -> None:
 
 
 @njit(cache=True)
+def clip_kernel(values: Floats, low: Floats, high: Floats, out: Floats) -> bool:
+    """Clip numbers to an interval each; tell whether all of them were finite."""
+    finite = True
+    for i in range(values.size):
+        finite = finite and math.isfinite(values[i])
+        out[i] = min(max(values[i], low[i]), high[i])
+    return finite
+
+
+@njit(cache=True)
 def _wrap(angle: float) -> float:
     """Bring an angle into [-pi, pi] by at most one turn."""
     if angle > math.pi:

@@ -122,9 +122,9 @@ def term(
     return Measured(name=name, parents=tuple(parents), mechanism=Function(function), doc=doc)
 
 
-def above(value: Value, *, threshold: Floats) -> Value:
+def above(value: float, *, threshold: float) -> int:
     """Tell whether a number lies above a threshold, as 0 or 1."""
-    return np.asarray(value > threshold, dtype=np.int64)
+    return int(value > threshold)
 
 
 def reward(weights: Mapping[str, float]) -> Measured:

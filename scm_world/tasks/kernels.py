@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
@@ -95,3 +96,18 @@ def reach_progress(
     return reach_distance(tips_before, goal_60, goal_120, goal_300) - reach_distance(
         tips, goal_60, goal_120, goal_300
     )
+
+
+@njit(cache=True)
+def scale_into(
+    raw: Floats,
+    low: Floats,
+    high: Floats,
+    gain: Floats,
+    offset: Floats,
+    out: NDArray[np.float32],
+) -> None:
+    """Saturate numbers at their bounds, then scale them: ``out = gain * clip(raw) + offset``."""
+    for i in range(raw.size):
+        held = min(max(raw[i], low[i]), high[i])
+        out[i] = gain[i] * held + offset[i]

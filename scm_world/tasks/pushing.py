@@ -144,11 +144,9 @@ class Pushing(Task):
 
     def goals(self, values: Values) -> tuple[Floats, Floats]:
         """Give position and quaternion of the block and of the goal, shape (7,) each."""
-        achieved, desired = (
-            np.concatenate([values[f"{e}.cartesian_position"], values[f"{e}.orientation"]])
-            for e in ("tool_block", "goal_block")
-        )
-        return achieved, desired
+        block = (values["tool_block.cartesian_position"], values["tool_block.orientation"])
+        goal = (values["goal_block.cartesian_position"], values["goal_block.orientation"])
+        return np.concatenate(block), np.concatenate(goal)
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Put the block where the goal is."""

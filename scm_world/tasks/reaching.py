@@ -38,15 +38,14 @@ GOALS = tuple(f"goal_{finger}" for finger in trifinger.FINGERS)
 _TINTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def nearness(error: Value, *, reached: Floats, far: Floats) -> Floats:
+def nearness(error: float, *, reached: float, far: float) -> float:
     """Compute the fractional success: 1 at ``reached`` or nearer, 0 at ``far`` or farther."""
-    near: Floats = 1.0 - (np.clip(error, reached, far) - reached) / (far - reached)
-    return near
+    return 1.0 - (min(max(error, reached), far) - reached) / (far - reached)
 
 
-def within(error: Value, *, reached: Floats) -> Value:
+def within(error: float, *, reached: float) -> int:
     """Tell whether the error is small enough, as 0 or 1."""
-    return np.asarray(error < reached, dtype=np.int64)
+    return int(error < reached)
 
 
 def minus_norm(vector: Floats) -> float:

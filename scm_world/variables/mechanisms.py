@@ -94,7 +94,10 @@ class Function(Frozen):
         function = self.resolve()
         if not self.constants:
             return function
-        constants = {key: np.asarray(value, float) for key, value in self.constants.items()}
+        constants = {
+            key: np.asarray(value, float) if isinstance(value, tuple) else value
+            for key, value in self.constants.items()
+        }
 
         def bound(*parents: Value, **noise: Value) -> Any:
             return function(*parents, **constants, **noise)

@@ -30,6 +30,7 @@ class Readouts:
         self._now, self._before = now, before
         self._model = model
         self._plans: dict[tuple[str, ...], tuple[_Step, ...]] = {}
+        self._fresh = False
         moving = {v.name for v in model.variables if isinstance(v, Measured)}
         follow = set(model.structure.instant_descendants(moving))
         self.order = tuple(
@@ -79,10 +80,16 @@ class Readouts:
         now = self._now
         for name, function, arguments in plan:
             now[name] = function(*[source[parent] for source, parent in arguments])
+        self._fresh = True
+
+    def stale(self) -> None:
+        """Say that the present has changed."""
+        self._fresh = False
 
     def remember(self) -> None:
         """Let the present values become those of one control step ago."""
-        self.evaluate(self.lagged)
+        if not self._fresh:
+            self.evaluate(self.lagged)
         now, before = self._now, self._before
         for name in self.lagged:
             before[name][...] = now[name]

@@ -14,7 +14,7 @@ from scm_world.backends import Backend, make_backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.entities import ACTIONS, CONTROL_INDEX, Clock, Composition, Robot, Stage
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
-from scm_world.graph import SCM
+from scm_world.graph import SCM, Moment
 from scm_world.scene import (
     TIMESTEP,
     ControlMode,
@@ -24,7 +24,7 @@ from scm_world.scene import (
     default_parameters,
     preset,
 )
-from scm_world.scene.kinematics import inverse_kernel
+from scm_world.scene.kinematics import clip_kernel, inverse_kernel
 from scm_world.tasks import Task, conventions, make_task
 from scm_world.variables import Measured, Noise
 from scm_world.variables.kinds import SpaceName
@@ -112,7 +112,9 @@ class World:
         )
         self.noise = Noise(0)
         self.episode = 0
+        self.version = 0  # counts changes of anything but what physics moves
         self._held = self.model
+        self._action_is_held = False
         self._index = 0
         self._clock = np.zeros((), dtype=np.int64)
         self._now: dict[str, Value] = {}
@@ -232,12 +234,8 @@ class World:
             self.backend.restore(self._origin.engine)
         else:
             self._build()
-        self._held = self.model
-        self._index = 0
-        self._clock[...] = 0
-        self._now.update(self._origin.static)
         self._now["action"] = np.zeros(9)
-        self.backend.read(self._state)
+        self.adopt(self.model, self._origin.static, 0)
         self._readouts.forget()
         self._instant = self._present(at_start=True)
 
@@ -294,21 +292,26 @@ class World:
         self.backend.read(self._state)
         self._index += 1
         self._clock[...] = self._index
+        self._readouts.stale()
         self._instant = None
 
     def _checked(self, action: ArrayLike) -> Floats:
-        given = np.asarray(action, dtype=np.float64)
-        if given.shape != (9,) or not np.isfinite(given.sum()):
+        given = np.ascontiguousarray(action, dtype=np.float64)
+        command = np.empty(9)
+        if given.shape != (9,) or not clip_kernel(
+            given, self.action_low, self.action_high, command
+        ):
             raise ActionError(
                 f"an action is 9 finite numbers [{self.model.declared('action').unit}], "
                 f"got {action!r}",
                 action,
             )
-        if "action" in self._held.interventions:
-            given = np.asarray(
-                self._held.solve({**self._now, "action": given}, only=("action",))["action"]
-            )
-        return np.minimum(np.maximum(given, self.action_low), self.action_high)
+        if self._action_is_held:
+            known = {**self._now, "action": command}
+            moment = Moment(self.noise, self.episode, self._index)
+            held = self._held.solve(known, moment=moment, only=("action",))["action"]
+            clip_kernel(np.array(held), self.action_low, self.action_high, command)
+        return command
 
     # --- intervening --------------------------------------------------------------------------
 
@@ -343,7 +346,10 @@ class World:
     def adopt(self, model: SCM, static: Values, index: int) -> None:
         """Take over what an intervention decided; the engine has taken over its part."""
         self._held = model
+        self._action_is_held = "action" in model.interventions
         self._now.update(static)
+        self.version += 1
+        self._readouts.stale()
         self._index = index
         self._clock[...] = index
         self.backend.read(self._state)

@@ -24,6 +24,9 @@ from scm_world.scene.scene import (
 BLOCK, FLOOR, WALL, UPPER = 1, 2, 4, 8
 MIDDLE, LOWER = (16, 32, 64), (128, 256, 512)  # one for each finger; the tip counts as lower
 
+FLOOR_MASK = BLOCK | sum(MIDDLE) | sum(LOWER)
+WALL_MASK = BLOCK | sum(LOWER)
+
 FASTEST_JOINT = 1000.0  # [rad/s] the engine would cut at 100
 
 BLOCK_SPINNING = 0.5 * SPINNING_FRICTION
@@ -61,7 +64,7 @@ def add_floor(engine: Any, client: int) -> int:
     shape = engine.createCollisionShape(
         engine.GEOM_PLANE, planeNormal=[0, 0, 1], physicsClientId=client
     )
-    return _add_static(engine, client, shape, group=FLOOR, mask=BLOCK | sum(MIDDLE) | sum(LOWER))
+    return _add_static(engine, client, shape, group=FLOOR, mask=FLOOR_MASK)
 
 
 def add_stage(engine: Any, client: int) -> tuple[int, ...]:
@@ -81,7 +84,7 @@ def add_stage(engine: Any, client: int) -> tuple[int, ...]:
             "basePosition": [radius * math.cos(angle), radius * math.sin(angle), WALL_HEIGHT / 2],
             "baseOrientation": [0, 0, math.sin(angle / 2), math.cos(angle / 2)],
         }
-        wall = _add_static(engine, client, shape, group=WALL, mask=BLOCK | sum(LOWER), **pose)
+        wall = _add_static(engine, client, shape, group=WALL, mask=WALL_MASK, **pose)
         walls.append(wall)
     return tuple(walls)
 

@@ -218,7 +218,8 @@ class BulletBackend(Backend):
         try:
             torques = client.advance(mode, numbers, substeps)
         except Exception as error:
-            self._lost = True
+            client.close()  # torques that were not stepped would count twice
+            self._base = None
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
         history.step(mode, numbers, substeps)
         self._torques, self._resting, self._saved = torques, None, None
@@ -271,6 +272,7 @@ class BulletBackend(Backend):
             self._recall(record.saved)
             self._return()
         except Exception as error:
+            self.close()
             raise EngineFailure(f"Bullet could not go there: {error}", self.name) from error
 
     def _recall(self, saved: SavedState | None) -> None:

@@ -37,6 +37,8 @@ class Client:
     def __init__(self, engine: Any) -> None:
         self.engine = engine
         self.handle = engine.connect(engine.DIRECT)
+        if self.handle < 0:
+            raise EngineFailure("Bullet has no physics client left; close some backends", "bullet")
         self.bodies = Bodies(-1, -1, ())
         self.applied: Values = {}
         self.generation = 0
@@ -61,6 +63,9 @@ class Client:
         self.bodies = Bodies(arena.add_robot(engine, handle), floor, stage)
         engine.setPhysicsEngineParameter(
             numSolverIterations=SOLVER_ITERATIONS,
+            # An early end, decided for all bodies together, would let bodies act on each other
+            # without touching.
+            solverResidualThreshold=0.0,
             deterministicOverlappingPairs=1,
             physicsClientId=handle,
         )

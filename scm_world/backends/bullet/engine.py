@@ -24,7 +24,7 @@ def load() -> Any:
     Raises:
         MissingEngine: It is not installed.
     """
-    if "pybullet" in sys.modules:
+    if sys.modules.get("pybullet") is not None:
         return sys.modules["pybullet"]
     try:
         with silence():

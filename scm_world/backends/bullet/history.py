@@ -63,6 +63,7 @@ class Past:
                 yield edits.pop()[1]
             mode, substeps, *command = self.rows[start : start + ROW]
             yield MODES[int(mode)], command, int(substeps)
+        yield from (edit for _, edit in reversed(edits))
 
     def parameters(self) -> Values:
         """Give all parameters as they are in the end."""

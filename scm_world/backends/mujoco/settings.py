@@ -33,7 +33,7 @@ class Settings:
 
 
 _SETTINGS = {
-    "fast": Settings((0.010, 1.0), (0.05, 1.0)),
+    "fast": Settings((0.010, 1.0), (0.04, 1.0)),
     "precise": Settings((0.004, 1.0), (0.02, 1.0)),
 }
 
