@@ -40,7 +40,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
         >>> nearest("tool_blok.mass", ["tool_block.mass", "floor_friction"])
         'tool_block.mass'
     """
-    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    matches = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
     return matches[0] if matches else None
 
 
@@ -48,8 +48,18 @@ def _suggest(suggestion: str | None) -> str:
     return f"; did you mean {suggestion!r}?" if suggestion else ""
 
 
+def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> ScmWorldError:
+    """Make an error from its message and attributes, without its constructor."""
+    error = kind.__new__(kind, message)
+    error.__dict__.update(data)
+    return error
+
+
 class ScmWorldError(Exception):
-    """Anything this package raises on purpose."""
+    """Anything this package raises on purpose. It can be pickled, attributes included."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (type(self), str(self), self.__dict__)
 
 
 class ModelError(ScmWorldError, ValueError):

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import networkx as nx
 from pydantic import TypeAdapter, ValidationError
 
-from scm_world.errors import ModelError
+from scm_world.errors import InterventionError, ModelError
 from scm_world.graph.scm import SCM
 from scm_world.graph.views import summary
-from scm_world.variables import AnyVariable, Function, Intervention
+from scm_world.variables import AnyVariable, Function, Intervention, Variable
 
 FORMAT = "scm_world/model/1"
 PACKAGE = "scm_world"
@@ -21,15 +22,44 @@ _VARIABLES: TypeAdapter[Any] = TypeAdapter(list[AnyVariable])
 _INTERVENTIONS: TypeAdapter[Any] = TypeAdapter(dict[str, Intervention])
 
 
+def _plain(data: Any) -> Any:
+    """Write infinities as text: JSON has no number for them."""
+    match data:
+        case dict():
+            return {key: _plain(part) for key, part in data.items()}
+        case list():
+            return [_plain(part) for part in data]
+        case float() if math.isinf(data):
+            return "Infinity" if data > 0 else "-Infinity"
+    return data
+
+
+def _functions(variables: Iterable[Variable]) -> Iterator[tuple[str, Function]]:
+    for variable in variables:
+        for field in ("mechanism", "inverse", "start", "carry"):
+            mechanism = getattr(variable, field, None)
+            if isinstance(mechanism, Function):
+                yield variable.name, mechanism
+
+
 def _check_portable(model: SCM) -> None:
     problems = [
-        f"{variable.name!r} has the function {mechanism.reference!r}, which cannot be found "
+        f"{name!r} has the function {function.reference!r}, which cannot be found "
         "under this name; define it at the top level of a module"
-        for variable in model.variables
-        for mechanism in (
-            getattr(variable, field, None) for field in ("mechanism", "inverse", "start", "carry")
-        )
-        if isinstance(mechanism, Function) and not mechanism.is_portable()
+        for name, function in _functions(model.variables)
+        if not function.is_portable()
+    ]
+    if problems:
+        raise ModelError(problems)
+
+
+def _check_trusted(variables: Iterable[Variable], trusted: tuple[str, ...]) -> None:
+    """Refuse functions from elsewhere before anything of theirs is imported."""
+    problems = [
+        f"{name!r} has the function {function.reference!r}, which lies outside the trusted "
+        f"packages {', '.join(trusted)}; pass trusted=(…) to read it"
+        for name, function in _functions(variables)
+        if not function.is_defined_in(trusted)
     ]
     if problems:
         raise ModelError(problems)
@@ -44,8 +74,10 @@ def to_dict(model: SCM) -> dict[str, Any]:
     _check_portable(model)
     return {
         "format": FORMAT,
-        "variables": _VARIABLES.dump_python(list(model.variables), mode="json"),
-        "interventions": _INTERVENTIONS.dump_python(dict(model.interventions), mode="json"),
+        "variables": _plain(_VARIABLES.dump_python(list(model.variables), mode="json")),
+        "interventions": _plain(
+            _INTERVENTIONS.dump_python(dict(model.interventions), mode="json")
+        ),
     }
 
 
@@ -59,27 +91,38 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
     Raises:
         ModelError: The data is no model, or names a function outside the trusted packages.
     """
-    if data.get("format") != FORMAT:
-        raise ModelError([f"not a model: expected format {FORMAT!r}, got {data.get('format')!r}"])
-    context = {"trusted": (PACKAGE, *trusted)}
+    found = data.get("format") if isinstance(data, dict) else data
+    if found != FORMAT:
+        raise ModelError([f"not a model: expected format {FORMAT!r}, got {found!r}"])
     try:
-        variables = _VARIABLES.validate_json(json.dumps(data["variables"]), context=context)
+        variables = _VARIABLES.validate_json(json.dumps(data["variables"]))
         held = _INTERVENTIONS.validate_json(json.dumps(data.get("interventions", {})))
     except ValidationError as error:
         raise ModelError(
             [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
         ) from None
-    return SCM(variables).with_interventions(held)
+    except (TypeError, KeyError) as error:  # a field too many, or too few
+        raise ModelError([f"not a model: {error}"]) from None
+    _check_trusted(variables, (PACKAGE, *trusted))
+    model = SCM(variables)
+    try:
+        return model.hold(held)
+    except InterventionError as error:
+        raise ModelError([f"an intervention of the file does not fit: {error}"]) from None
 
 
 def to_json(model: SCM) -> str:
     """Write a model as JSON text, without loss."""
-    return json.dumps(to_dict(model), indent=1)
+    return json.dumps(to_dict(model), indent=1, allow_nan=False)
 
 
 def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     """Read a model that ``to_json`` wrote. See ``from_dict`` for ``trusted`` and errors."""
-    return from_dict(json.loads(text), trusted=trusted)
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ModelError([f"not a model: {error}"]) from None
+    return from_dict(data, trusted=trusted)
 
 
 def to_networkx(model: SCM) -> nx.DiGraph:
@@ -93,7 +136,14 @@ def to_networkx(model: SCM) -> nx.DiGraph:
 
 
 def from_networkx(graph: nx.DiGraph, *, trusted: Sequence[str] = ()) -> SCM:
-    """Read a model from a graph that ``to_networkx`` wrote."""
+    """Read a model from a graph that ``to_networkx`` wrote.
+
+    Raises:
+        ModelError: A node has no declaration, or see ``from_dict``.
+    """
+    bare = [name for name, data in graph.nodes(data=True) if "declaration" not in data]
+    if bare:
+        raise ModelError([f"node {name!r} has no declaration" for name in bare])
     variables = [data["declaration"] for _, data in graph.nodes(data=True)]
     plain = {**graph.graph, "variables": variables}
     return from_dict(plain, trusted=trusted)

@@ -37,6 +37,9 @@ from scm_world.variables.checks import check_bounds, coerce
 def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
     """Turn a nested request into dotted names.
 
+    Raises:
+        ConflictingTargets: A name is given twice, nested and dotted.
+
     Example:
         >>> flatten({"tool_block": {"mass": 0.05}, "floor_friction": 0.4})
         {'tool_block.mass': 0.05, 'floor_friction': 0.4}
@@ -44,9 +47,12 @@ def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in request.items():
         if isinstance(value, Mapping):
-            flat.update({f"{name}.{key}": part for key, part in flatten(value).items()})
+            parts = {f"{name}.{key}": part for key, part in flatten(value).items()}
         else:
-            flat[name] = value
+            parts = {name: value}
+        for twice in flat.keys() & parts.keys():
+            raise ConflictingTargets((twice, twice), twice)
+        flat.update(parts)
     return flat
 
 
@@ -81,7 +87,7 @@ class SCM:
     def __init__(self, variables: Iterable[Variable]) -> None:
         self._declared = checked(variables)
         self._structure: Structure | None = Structure(self._declared)
-        self._order: tuple[str, ...] | None = self._structure.order
+        self._order: tuple[str, ...] = self._structure.order
         self._evaluator = Evaluator(self._declared)
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, Act] = {}
@@ -206,6 +212,7 @@ class SCM:
 
         Raises:
             InterventionError: With every problem of the request.
+            ModelError: A draw from a space that follows other variables closes a cycle.
         """
         return self._do(request, any_variable=False)
 
@@ -233,7 +240,11 @@ class SCM:
         return self.with_interventions(accepted)
 
     def with_interventions(self, accepted: Mapping[str, Intervention]) -> SCM:
-        """Apply interventions that have been checked already."""
+        """Apply interventions that have been checked already.
+
+        Raises:
+            ModelError: Draws from spaces that follow other variables close a cycle.
+        """
         model = object.__new__(SCM)
         model._declared = self._declared
         model._evaluator = self._evaluator
@@ -250,7 +261,10 @@ class SCM:
         # Cutting edges keeps every causal order valid; only a draw from a space whose bounds
         # follow other variables adds edges.
         draws = (a for a in model._acts.values() if isinstance(a.intervention, Draw))
-        model._order = None if any(source_of(act).parents() for act in draws) else self._order
+        if any(source_of(act).parents() for act in draws):
+            model._order = model.structure.order
+        else:
+            model._order = self._order
         return model
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
@@ -267,16 +281,26 @@ class SCM:
         if isinstance(value, Draw):
             if isinstance(value.source, str) and variable.space(value.source) is None:
                 raise NotIntervenable(name, f"has no space {value.source}")
+            for parent in sorted(source_of(Act(value, variable)).parents()):
+                self.declared(parent)
             return value
         if isinstance(value, Shift | Scale):
             coerce(variable, value.by) if np.ndim(value.by) else coerce(
                 variable, np.full(variable.shape, value.by)
             )
             return value
-        number = coerce(variable, value.value if isinstance(value, Hard) else value)
+        number = coerce(variable, self._plain(variable, value))
         if variable.bounds is not None and not variable.bounds.parents():
             check_bounds(variable, number, {})
         return Hard(number.tolist())
+
+    @staticmethod
+    def _plain(variable: Variable, value: Any) -> Any:
+        """Take a value out of ``Hard``, which holds the numbers of a matrix in one row."""
+        if not isinstance(value, Hard):
+            return value
+        matrix = len(variable.shape) > 1 and np.size(value.value) == np.prod(variable.shape)
+        return np.reshape(value.value, variable.shape) if matrix else value.value
 
     def _settable_causes(self, name: str) -> list[str]:
         """Name the nearest causes that can be set, past others that cannot."""
@@ -323,8 +347,6 @@ class SCM:
         """
         values: dict[str, Value] = dict(known or {})
         evaluate = self._evaluator.evaluate
-        if self._order is None:
-            self._order = self.structure.order
         for name in self._order if only is None else only:
             values[name] = evaluate(name, self._acts.get(name), values, previous or {}, moment)
         return values

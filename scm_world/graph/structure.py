@@ -8,6 +8,8 @@ from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from typing import final
 
+import networkx as nx
+
 from scm_world.errors import ModelError, nearest
 from scm_world.variables import Derived, Space, Variable
 
@@ -113,16 +115,26 @@ def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
     return frozenset(found)
 
 
-def _topological(names: Iterable[str], edges: Iterable[Edge]) -> tuple[str, ...]:
+def _topological(names: Iterable[str], edges: Sequence[Edge]) -> tuple[str, ...]:
     sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(names, ()))
     for edge in edges:
         if edge.lag == 0:
             sorter.add(edge.effect, edge.cause)
     try:
         return tuple(sorter.static_order())
-    except CycleError as error:
-        cycle = " → ".join(reversed(error.args[1]))
-        raise ModelError([f"contemporaneous edges form a cycle: {cycle}"]) from None
+    except CycleError:
+        graph = nx.DiGraph((edge.cause, edge.effect) for edge in edges if edge.lag == 0)
+        problems = [f"contemporaneous edges form a cycle: {cycle}" for cycle in _cycles(graph)]
+        raise ModelError(problems) from None
+
+
+def _cycles(graph: nx.DiGraph) -> Iterable[str]:
+    """Write down one cycle of every knot of variables that drive one another."""
+    for knot in nx.strongly_connected_components(graph):
+        part = graph.subgraph(knot)
+        if part.number_of_edges():
+            edges = nx.find_cycle(part)
+            yield " → ".join([edges[0][0], *(effect for _, effect in edges)])
 
 
 def _space_parents(variable: Variable) -> Iterable[tuple[str, str]]:
@@ -149,6 +161,8 @@ def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Ite
     for label, name in _space_parents(variable):
         if name not in known:
             yield f"{label} of {variable.name!r} depends on the unknown variable {name!r}"
+    if isinstance(variable, Derived) and variable.noise is not None and variable.noise.parents():
+        yield f"the noise of {variable.name!r} depends on a variable: let the mechanism scale it"
     if isinstance(variable, Derived) and variable.inverse is not None:
         target = known.get(variable.parents[0].name)
         if isinstance(target, Derived) and target.inverse is not None:

@@ -19,16 +19,20 @@ def summary(model: SCM) -> nx.DiGraph:
 
     Returns:
         A directed graph, which may have loops and cycles through time. Nodes carry ``kind``,
-        ``unit`` and ``role``, edges ``lags`` and ``when``.
+        ``unit`` and ``role``, edges ``lags`` and ``when``:
+        the condition, both as ``"contact or set"``, None if it always holds.
     """
     graph = nx.DiGraph()
     for name in model:
         variable: Any = model[name]
         graph.add_node(name, kind=variable.kind, unit=variable.unit, role=variable.role)
     for edge in model.edges:
-        old = graph.get_edge_data(edge.cause, edge.effect, {"lags": ()})
+        old = graph.get_edge_data(edge.cause, edge.effect, {"lags": (), "when": edge.when})
         lags = tuple(sorted({*old["lags"], edge.lag}))
-        graph.add_edge(edge.cause, edge.effect, lags=lags, when=edge.when)
+        when = edge.when
+        if old["when"] != when:
+            when = " or ".join(sorted((old["when"], when))) if old["when"] and when else None
+        graph.add_edge(edge.cause, edge.effect, lags=lags, when=when)
     return graph
 
 

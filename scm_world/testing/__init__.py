@@ -1,0 +1,1 @@
+"""Conformance suites, for whoever adds an engine, a task or a learner."""

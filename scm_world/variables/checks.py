@@ -17,6 +17,9 @@ from scm_world.errors import (
 from scm_world.variables.kinds import SpaceName, Variable
 
 
+_LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
+
+
 def _expected(variable: Variable) -> str:
     noun = {"real": "numbers", "integer": "whole numbers", "categorical": "whole numbers"}
     where = f" of shape {variable.shape}" if variable.shape else ""
@@ -46,7 +49,8 @@ def coerce(variable: Variable, value: Any) -> Value:
         raise NotFinite(variable.name, value)
     if variable.dtype == "real":
         return given.astype(np.float64)
-    if given.dtype.kind == "f" and (given != np.rint(given)).any():
+    whole = given.dtype.kind != "f" or (given == np.rint(given)).all()
+    if not whole or (np.abs(given.astype(np.float64)) >= _LARGEST).any():
         raise WrongType(variable.name, value, _expected(variable))
     return given.astype(np.int64)
 
@@ -89,12 +93,13 @@ def check_space(variable: Variable, value: Value, space: SpaceName, values: Valu
             unit=variable.unit,
         )
     if not variable.in_space(value, space, values):
+        near = variable.nearest_in_space(value, space, values)
         raise OutOfSpace(
             variable.name,
             _plain(value),
             space=space,
             allowed=declared.describe(variable.shape, values)
             + (" without A" if space == "B" and variable.a is not None else ""),
-            nearest=_plain(declared.nearest(value, values)),
+            nearest=None if near is None else _plain(near),
             unit=variable.unit,
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, final
 
+import numpy as np
 from pydantic import Field
 
 from scm_world.variables.kinds import SpaceName
@@ -18,7 +19,7 @@ Number = float | tuple[float, ...]
 
 
 def _number(value: Any) -> Any:
-    return tuple(value) if hasattr(value, "__len__") else value
+    return tuple(np.ravel(value).tolist()) if np.ndim(value) else value
 
 
 @final

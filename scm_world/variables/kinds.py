@@ -10,7 +10,16 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from scm_world._types import Value, Values
 from scm_world.variables.mechanisms import Function, Linear, Mechanism
-from scm_world.variables.spaces import Distribution, Either, Frozen, Space
+from scm_world.variables.spaces import (
+    Box,
+    Categories,
+    Distribution,
+    Either,
+    Frozen,
+    Integers,
+    Rotations,
+    Space,
+)
 
 Number = float | tuple[float, ...]
 Role = Literal["parameter", "state", "readout", "action"]
@@ -52,6 +61,20 @@ class Parent(Frozen):
 
     def __init__(self, name: Any = None, lag: int = 0, when: str | None = None) -> None:
         super().__init__(name=name, lag=lag, when=when)  # type: ignore[call-arg]
+
+
+def _without(space: Space | None, other: Space | None) -> Space | None:
+    """Leave out of a set of whole numbers those that another one has too."""
+    match space, other:
+        case Integers(low=low, high=high), Integers() if low <= other.high and other.low <= high:
+            if other.low <= low and other.high < high:
+                return Integers(other.high + 1, high)
+            if low < other.low and high <= other.high:
+                return Integers(low, other.low - 1)
+        case Categories(members=members), Categories():
+            rest = tuple(member for member in members if member not in other.members)
+            return Categories(rest) if rest else space
+    return space
 
 
 def _as_parents(value: Any) -> Any:
@@ -107,15 +130,19 @@ class Variable(Frozen):
         return np.asarray(value, dtype=kind).reshape(self.shape)
 
     def space(self, name: SpaceName) -> Space | None:
-        """Give one of the declared spaces, or their union; None where it is not declared."""
+        """Give one of the declared spaces, or their union; None where it is not declared.
+
+        Whole numbers that lie in both are left out of B; of a continuum, the border stays in the
+        set and is told apart by ``in_space``.
+        """
         match name:
             case "A":
                 return self.a
             case "B":
-                return self.b
+                return _without(self.b, self.a)
             case _:
                 both = self.a is not None and self.b is not None and self.a != self.b
-                return Either(self.a, self.b) if both else (self.a or self.b)
+                return Either(self.a, self.space("B")) if both else (self.a or self.b)
 
     def in_space(self, value: Value, name: SpaceName, values: Values) -> bool:
         """Tell whether a value lies in a space, given the values of the other variables."""
@@ -123,6 +150,23 @@ class Variable(Frozen):
         if space is None or not space.contains(value, values):
             return False
         return name != "B" or self.a is None or not self.a.contains(value, values)
+
+    def nearest_in_space(self, value: Value, name: SpaceName, values: Values) -> Value | None:
+        """Find the nearest value that lies in a space; None where none is found."""
+        space = self.space(name)
+        if space is None:
+            return None
+        candidates: list[Value] = [np.asarray(space.nearest(value, values))]
+        if isinstance(space, Box):
+            candidates.append(space.nearest_inside(value, values))
+        return next((c for c in candidates if self.in_space(c, name, values)), None)
+
+    @model_validator(mode="after")
+    def _whole_numbers_have_whole_spaces(self) -> Variable:
+        for space in (self.bounds, self.a, self.b):
+            if self.dtype != "real" and isinstance(space, Box | Rotations):
+                raise ValueError(f"{self.name}: {self.dtype} values need Integers or Categories")
+        return self
 
     @model_validator(mode="after")
     def _categories_are_listed(self) -> Variable:

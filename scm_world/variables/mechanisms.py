@@ -8,11 +8,11 @@ noise, with ``noise=``. Values carry leading batch axes; write ``size[..., 2] / 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
-from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from scm_world._types import Value
 from scm_world.errors import ModelError
@@ -54,18 +54,20 @@ class Function(Frozen):
     def _from_callable(cls, data: Any) -> Any:
         return data if isinstance(data, dict) else {"reference": data}
 
-    @field_validator("reference")
-    @classmethod
-    def _is_trusted(cls, reference: str, info: ValidationInfo) -> str:
-        trusted = (info.context or {}).get("trusted")
-        if trusted is not None and not any(
-            reference.split(":")[0].split(".")[0] == package for package in trusted
-        ):
-            raise ValueError(
-                f"{reference!r} lies outside the trusted packages {trusted}; "
-                "pass trusted=(…) to read it"
-            )
-        return reference
+    def is_defined_in(self, packages: Iterable[str]) -> bool:
+        """Tell whether the function is one of some packages, importing no other.
+
+        What a module of theirs merely imports (``"my_package.module:os.system"``) is not.
+        """
+        packages = tuple(packages)
+        if self.reference.partition(".")[0].partition(":")[0] not in packages:
+            return False
+        try:
+            found = self._look_up()
+        except (ModelError, AttributeError, ImportError):
+            return False
+        home = getattr(found, "__module__", None) or ""
+        return home.partition(".")[0] in packages
 
     def is_portable(self) -> bool:
         """Tell whether the function can be found again under its name."""

@@ -22,7 +22,7 @@ from a parent, or read from a file, is not refused for its last digit."""
 class Frozen(BaseModel):
     """A declaration: immutable, strict about its fields, and the same after a JSON round trip."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 @final
@@ -118,11 +118,18 @@ class Box(_Space):
         clipped: Floats = np.clip(value, low, high)
         return clipped
 
-    def volume(self, shape: tuple[int, ...], values: Values) -> float:
-        """Multiply the edge lengths that are not zero."""
+    def nearest_inside(self, value: Value, values: Values | None = None) -> Value:
+        """Find a nearest point that is not on the border, along edges that have a length."""
+        low, high = self.bounds(np.shape(value), values or {})
+        margin = np.minimum(2.0 * TOLERANCE, 0.5 * np.maximum(high - low, 0.0))
+        clipped: Floats = np.clip(value, low + margin, high - margin)
+        return clipped
+
+    def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
+        """Multiply the edge lengths that are not zero, shape ``(...)``."""
         low, high = self.bounds(shape, values)
-        edges = np.ravel(high - low)
-        return float(np.prod(edges[edges > 0]))
+        edges = np.where(high > low, high - low, 1.0)
+        return np.asarray(np.prod(edges, axis=tuple(range(-len(shape), 0))))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes."""
@@ -157,17 +164,18 @@ class Integers(_Space):
         super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
-        """Tell whether a value lies between the ends."""
-        return bool(np.all(value >= self.low) and np.all(value <= self.high))
+        """Tell whether a value is whole and lies between the ends."""
+        whole = np.all(value == np.rint(value))
+        return bool(whole and np.all(value >= self.low) and np.all(value <= self.high))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
         """Find the nearest whole number between the ends."""
         whole: Value = np.clip(np.rint(value), self.low, self.high).astype(np.int64)
         return whole
 
-    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+    def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Count the values."""
-        return float(self.high - self.low + 1) ** int(np.prod(shape))
+        return np.asarray(float(self.high - self.low + 1) ** int(np.prod(shape)))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes."""
@@ -208,9 +216,9 @@ class Categories(_Space):
         kept: Value = np.where(np.isin(value, self.members), value, self.members[0])
         return kept.astype(np.int64)
 
-    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+    def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Count the values."""
-        return float(len(self.members)) ** int(np.prod(shape))
+        return np.asarray(float(len(self.members)) ** int(np.prod(shape)))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes."""
@@ -257,7 +265,7 @@ class Either(_Space):
         candidates = [self.first.nearest(value, values), self.second.nearest(value, values)]
         return min(candidates, key=lambda point: float(np.sum((point - value) ** 2)))
 
-    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+    def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Add the volumes of both."""
         return self.first.volume(shape, values) + self.second.volume(shape, values)
 
@@ -305,9 +313,9 @@ class Rotations(_Space):
         unit: Value = whole / exact * np.where(whole[..., 3:] < 0, -1.0, 1.0)
         return unit + 0.0
 
-    def volume(self, shape: tuple[int, ...], values: Values) -> float:
+    def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Give the volume of the group, π²: half of the unit sphere in four dimensions."""
-        return float(np.pi**2)
+        return np.asarray(float(np.pi**2))
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes."""

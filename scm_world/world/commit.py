@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,36 +44,33 @@ def _moves_surfaces(change: Difference) -> bool:
     return change.state is not None or any(what in _MOVES for _, what in change.parameters)
 
 
-def _new_overlaps(world: World, proposal: Proposal) -> list[str]:
+def _new_overlaps(world: World, instant: Instant, proposal: Proposal) -> list[str]:
     if not _moves_surfaces(difference(world, proposal)):
         return []
     found = overlaps(world.describe(proposal.static, proposal.state), tolerance=TOLERANCE)
     if not found:
         return []
-    now, state = world.current()
-    present = overlaps(world.describe(now, state), tolerance=0.0)
+    present = overlaps(world.describe(instant.static, instant.state), tolerance=0.0)
     depth = {overlap.bodies: overlap.depth for overlap in present}
     return [str(o) for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
 
 
 def refuse_overlaps(
-    world: World,
-    proposal: Proposal,
-    request: Mapping[str, Any],
-    nearest: Callable[[], dict[str, Any] | None],
+    world: World, instant: Instant, proposal: Proposal, request: Mapping[str, Any]
 ) -> None:
     """Refuse an intervention that puts two bodies in one place.
 
-    Bodies that intersect already (a block that is being squeezed) may go on doing so.
+    Bodies that intersected when physics left them (a block that is being squeezed) may go on
+    doing so; so what was done at this instant can always be taken back.
 
     Raises:
         Infeasible: With the bodies, the depths, and the nearest value that is feasible.
     """
-    problems = _new_overlaps(world, proposal)
+    problems = _new_overlaps(world, instant, proposal)
     if problems:
         flat = flatten(request)
         name = next(iter(flat))
-        found = nearest()
+        found = nearest_feasible(world, instant, request)
         raise Infeasible(name, flat[name], problems, None if found is None else found[name])
 
 
@@ -103,7 +100,9 @@ def nearest_feasible(
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         try:
-            blocked = _new_overlaps(world, propose(world, instant, between(middle), None))
+            blocked = _new_overlaps(
+                world, instant, propose(world, instant, between(middle), None)
+            )
         except InterventionError:
             blocked = ["outside the bounds on the way"]
         low, high = (low, middle) if blocked else (middle, high)

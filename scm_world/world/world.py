@@ -29,7 +29,7 @@ from scm_world.tasks import Task, conventions, make_task
 from scm_world.variables import Measured, Noise
 from scm_world.variables.kinds import SpaceName
 from scm_world.world.audit import Audit
-from scm_world.world.commit import commit, nearest_feasible, refuse_overlaps
+from scm_world.world.commit import commit, refuse_overlaps
 from scm_world.world.proposal import Instant, propose
 from scm_world.world.readouts import Readouts, static_order
 from scm_world.world.snapshot import WorldSnapshot
@@ -140,6 +140,11 @@ class World:
     def index(self) -> int:
         """How many control steps of the episode are over."""
         return self._index
+
+    @property
+    def computed(self) -> tuple[str, ...]:
+        """Variables that are computed from what moves, causes before effects."""
+        return self._readouts.order
 
     @cached_property
     def structure(self) -> Structure:
@@ -335,7 +340,7 @@ class World:
         self._require_episode()
         instant = self._instant or self._present()
         proposal = propose(self, instant, request, space)
-        refuse_overlaps(self, proposal, request, lambda: nearest_feasible(self, instant, request))
+        refuse_overlaps(self, instant, proposal, request)
         audit, self._instant = commit(self, instant, proposal, request)
         return audit
 

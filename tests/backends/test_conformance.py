@@ -11,23 +11,31 @@ from scm_world.testing.backend import BackendConformance
 
 
 class TestMujocoFast(BackendConformance):
+    """MuJoCo with large steps."""
+
     def make(self) -> Backend:
+        """Create it."""
         return make_backend("mujoco")
 
 
-class TestMujocoPrecise(BackendConformance):
+class TestMujocoPrecise(TestMujocoFast):
+    """MuJoCo with small steps."""
+
     preset: ClassVar[Preset] = PRECISE
-
-    def make(self) -> Backend:
-        return make_backend("mujoco")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="needs pybullet")
 class TestBullet(BackendConformance):
+    """Bullet with large steps."""
+
     def make(self) -> Backend:
+        """Create it."""
         return make_backend("bullet")
 
 
 class TestFake(BackendConformance):
+    """The backend without physics."""
+
     def make(self) -> Backend:
+        """Create it."""
         return make_backend("fake")

@@ -1,0 +1,78 @@
+"""Paired experiments in a model without physics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scm_world._types import Value, Values
+from scm_world.discovery.paired import Effects, gap
+from scm_world.graph import SCM, Moment
+from scm_world.variables import Box, Categories, Integers, Noise, Variable
+
+
+def paired_effects(model: SCM, *, probes: int, seed: int) -> Effects:
+    """Find the direct effects in a structural causal model.
+
+    From each drawn unit, one variable at a time is set to another value while every other
+    variable keeps its old one; what a mechanism then says differently is a direct effect. The
+    noise is the same throughout.
+
+    Args:
+        model: Every variable of it can be set.
+        probes: How many units to draw.
+        seed: Of the units and of the values.
+    """
+    effects = Effects()
+    noise = Noise(seed)
+    for number in range(probes):
+        first = model.solve(moment=Moment(noise, number, 0))
+        at = Moment(noise, number, 1)
+        unit = model.solve(previous=first, moment=at)
+        again = model.solve(previous=first, moment=at)
+        effects.rollouts += 2
+        effects.floor = max(effects.floor, *(gap(unit[n], again[n]) for n in unit))
+        for cause in model:
+            other = _another(model[cause], unit[cause], unit, noise, number)
+            _compare(model, cause, {**unit, cause: other}, first, unit, at, effects, lag=0)
+            memory = {**first, cause: _another(model[cause], first[cause], first, noise, number)}
+            _compare(model, cause, unit, memory, unit, at, effects, lag=1)
+            effects.rollouts += 1
+    return effects
+
+
+def _compare(
+    model: SCM,
+    cause: str,
+    known: Values,
+    previous: Values,
+    unit: Values,
+    at: Moment,
+    effects: Effects,
+    *,
+    lag: int,
+) -> None:
+    for name in model:
+        if lag == 0 and name == cause:
+            continue
+        value = model.solve(known, previous=previous, moment=at, only=(name,))[name]
+        effects.see(cause, name, lag, gap(value, unit[name]))
+
+
+def _another(variable: Variable, value: Value, values: Values, noise: Noise, number: int) -> Value:
+    """Choose another value of a variable, within its bounds."""
+    n = int(np.prod(variable.shape))
+    unit = noise.uniforms(f"{variable.name}|paired", n=n, episode=number)[0]
+    direction = (0.5 + unit).reshape(variable.shape)
+    match variable.bounds:
+        case Box():
+            low, high = variable.bounds.bounds(variable.shape, values)
+            step = np.where(np.isfinite(high - low), 0.2 * (high - low), 1.0) * direction
+            return np.where(value + step > high, value - step, value + step)
+        case Integers():
+            return np.where(value < variable.bounds.high, value + 1, value - 1)
+        case Categories():
+            others = [m for m in variable.bounds.members if not np.any(value == m)]
+            return variable.array(np.broadcast_to(others[0] if others else value, variable.shape))
+        case _:
+            whole = variable.dtype != "real"
+            return value + (1 if whole else direction * (1.0 + np.abs(value)))

@@ -1,0 +1,246 @@
+"""Paired experiments in a world: same noise, same state, same action, one variable changed.
+
+From a probe state, one variable X is set to another value and everything else stays. What
+differs afterwards, bit by bit, is an effect of X. A difference is a *direct* effect if it
+remains while every other variable that X moved is held at its old value.
+
+Within the instant, variables that can be set are held by the intervention itself, and computed
+ones by handing their old value to their children. Over one control step the engine is one joint
+mechanism, so whatever differs in a state is a direct effect of what was different before; a
+computed variable has a lagged cause if it still differs while all present values are held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Floats, Value, Values
+from scm_world.discovery.probes import Probe
+from scm_world.discovery.scores import EdgeKey
+from scm_world.errors import InterventionError
+from scm_world.variables import Box, Derived, Integers, Measured, Noise, Rotations, Variable
+from scm_world.world import World
+
+STEPS = (0.05, -0.05, 0.02, -0.02, 0.005, -0.005, 0.001, -0.001)
+"""How far to move a variable, as a fraction of its bounds; smaller until it is feasible."""
+
+
+@final
+@dataclass
+class Effects:
+    """The largest effect seen so far on each ordered pair.
+
+    Attributes:
+        largest: By cause, effect and lag.
+        floor: Largest difference after something was done and undone.
+        rollouts: Control steps simulated in an experiment of their own.
+        refused: Targets for which no feasible value was found, with how often.
+    """
+
+    largest: dict[EdgeKey, float] = field(default_factory=dict)
+    floor: float = 0.0
+    rollouts: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+
+    def see(self, cause: str, effect: str, lag: int, size: float) -> None:
+        """Remember an effect if it is the largest of its pair."""
+        key = (cause, effect, lag)
+        self.largest[key] = max(size, self.largest.get(key, 0.0))
+
+    def found(self, threshold: float) -> set[EdgeKey]:
+        """List the pairs whose effect exceeds a threshold."""
+        return {key for key, size in self.largest.items() if size > threshold}
+
+
+def gap(a: Value, b: Value) -> float:
+    """Compute the largest difference of two values; NaN counts as infinite."""
+    size = float(np.max(np.abs(np.asarray(a, dtype=float) - np.asarray(b, dtype=float))))
+    return size if size == size else np.inf
+
+
+@final
+class Paired:
+    """Experiments with one world.
+
+    Args:
+        world: It is restored to the probe before every experiment.
+        seed: Of the values that targets are set to.
+    """
+
+    def __init__(self, world: World, seed: int) -> None:
+        self._world = world
+        self._noise = Noise(seed)
+        self.effects = Effects()
+        model = world.model
+        self.targets = tuple(
+            v.name
+            for v in model.variables
+            if v.settable and v.role != "action" and model.target(v.name) == v.name
+        )
+        self._aliases = frozenset(
+            v.name for v in model.variables if isinstance(v, Derived) and v.inverse is not None
+        )
+        self._computed = world.computed
+        self._static = frozenset(world.static_names)
+        reported = tuple(
+            v.name
+            for v in model.variables
+            if isinstance(v, Measured) and v.mechanism is None and not v.settable
+        )
+        self._readouts = (*reported, *self._computed)
+        self._pool: dict[str, list[Value]] = {name: [] for name in self._readouts}
+
+    def run(self, number: int, probe: Probe) -> None:
+        """Do all experiments of one probe state."""
+        self._number, self._probe = number, probe
+        self._at_once = self._restored()
+        self._earlier = self._world.previous()
+        self._later, self._memory = self._advanced(probe.action)
+        for target in self.targets:
+            self._experiment(target)
+        self._vary_action()
+        for name in self._readouts:
+            self._vary_readout(name)
+            self._pool[name] = [*self._pool[name], self._at_once[name], self._later[name]][-8:]
+
+    # --- the pieces of an experiment ----------------------------------------------------------
+
+    def _restored(self) -> dict[str, Value]:
+        self._world.restore(self._probe.snapshot)
+        return self._world.values()
+
+    def _advanced(self, action: Floats) -> tuple[dict[str, Value], dict[str, Value]]:
+        """Step once; give the values afterwards, and those that they remember."""
+        self._world.step(action)
+        self.effects.rollouts += 1
+        return self._world.values(), self._world.previous()
+
+    def _experiment(self, target: str) -> None:
+        for attempt, step in enumerate(STEPS):
+            value = self._another(self._world.model.declared(target), step, attempt)
+            if value is None:
+                return
+            self._world.restore(self._probe.snapshot)
+            try:
+                self._world.do({target: value})
+            except InterventionError:
+                continue
+            if self._within_the_instant(target, value):
+                return
+        self.effects.refused[target] = self.effects.refused.get(target, 0) + 1
+
+    def _another(self, variable: Variable, step: float, attempt: int) -> Value | None:
+        """Choose another value than the present one."""
+        present = self._at_once[variable.name]
+        n = int(np.prod(variable.shape))
+        uniforms = self._noise.uniforms(variable.name, n=n, episode=self._number, step=attempt)[0]
+        direction = (0.5 + 0.5 * uniforms).reshape(variable.shape)
+        match variable.bounds:
+            case Box():
+                low, high = variable.bounds.bounds(variable.shape, self._at_once)
+                moved = present + step * direction * (high - low)
+                inside = np.where((moved < low) | (moved > high), 2 * present - moved, moved)
+                return np.asarray(np.clip(inside, low, high))
+            case Rotations():
+                return variable.bounds.nearest(present + 4 * step * direction)
+            case Integers():
+                return np.asarray(present + 1 + attempt)
+            case _:
+                return None
+
+    def _within_the_instant(self, target: str, value: Value) -> bool:
+        """Find the effects at once and one step later; tell whether all could be done."""
+        world = self._world
+        reached = world.values()
+        moved = [n for n in reached if n != target and gap(reached[n], self._at_once[n]) > 0.0]
+        held = [n for n in moved if n not in self._aliases and n not in self._computed]
+        try:
+            self._see_settable(target, value, held)
+            self._hold(target, value, held)
+        except InterventionError:
+            return False
+        alone = world.values()
+        self._see_computed(target, [n for n in moved if n in self._computed], alone)
+        for name in moved:
+            if name in self._aliases and name in self._static:
+                self._see_alias(target, name, alone)
+        self._see_later(target)
+        self._undo(target, value)
+        return True
+
+    def _hold(self, target: str, value: Value, names: Iterable[str]) -> None:
+        """Set the target, with some other variables kept at their old values."""
+        self._world.restore(self._probe.snapshot)
+        self._world.do({target: value, **{name: self._at_once[name] for name in names}})
+
+    def _see_settable(self, target: str, value: Value, moved: list[str]) -> None:
+        for name in moved:
+            others = [other for other in moved if other != name]
+            self._hold(target, value, others)
+            size = gap(self._world[name], self._at_once[name])
+            self.effects.see(target, name, 0, size)
+
+    def _see_computed(self, cause: str, moved: list[str], alone: Values) -> None:
+        """Evaluate each computed variable with all other computed ones at their old values."""
+        known = {**alone, **{name: self._at_once[name] for name in self._computed}}
+        if cause in self._computed:
+            known[cause] = alone[cause]
+        for name in moved:
+            size = gap(self._evaluate(name, known, self._earlier), self._at_once[name])
+            self.effects.see(cause, name, 0, size)
+
+    def _see_alias(self, target: str, name: str, alone: Values) -> None:
+        self.effects.see(target, name, 0, gap(alone[name], self._at_once[name]))
+
+    def _evaluate(self, name: str, known: Values, previous: Values) -> Value:
+        return self._world.model.solve(known, previous=previous, only=(name,))[name]
+
+    def _see_later(self, target: str) -> None:
+        """Step with everything as it was but the target, and compare with the base run."""
+        after, memory = self._advanced(self._probe.action)
+        self._compare_later(target, after, memory)
+
+    def _compare_later(self, cause: str, after: Values, memory: Values) -> None:
+        for name in after:
+            variable = self._world.model.declared(name)
+            if isinstance(variable, Measured) and variable.mechanism is None:
+                self.effects.see(cause, name, 1, gap(after[name], self._later[name]))
+        self._see_memory(cause, memory)
+
+    def _see_memory(self, cause: str, memory: Values) -> None:
+        """Find computed variables that depend on the cause one step ago."""
+        own = {**self._memory, **({cause: memory[cause]} if cause in memory else {})}
+        for name in self._computed:
+            size = gap(self._evaluate(name, self._later, own), self._later[name])
+            self.effects.see(cause, name, 1, size)
+
+    def _undo(self, target: str, value: Value) -> None:
+        """Do and undo: whatever remains is not an effect but noise of the apparatus."""
+        self._world.restore(self._probe.snapshot)
+        self._world.do({target: value})
+        self._world.do({target: self._at_once[target]})
+        after, _ = self._advanced(self._probe.action)
+        worst = max(gap(after[name], self._later[name]) for name in after)
+        self.effects.floor = max(self.effects.floor, worst)
+
+    def _vary_action(self) -> None:
+        self._world.restore(self._probe.snapshot)
+        spread = self._world.action_high - self._world.action_low
+        unit = self._noise.uniforms("action", n=9, episode=self._number)[0]
+        after, memory = self._advanced(self._probe.action + 0.1 * spread * (unit - 0.5))
+        self._compare_later("action", after, memory)
+
+    def _vary_readout(self, cause: str) -> None:
+        """Give a readout another value, seen elsewhere, and watch what is computed from it.
+
+        No experiment in the world can do this; it is done in the model of the readouts.
+        """
+        for value in self._pool[cause]:
+            known = {**self._at_once, cause: value}
+            others = [name for name in self._computed if name != cause]
+            self._see_computed(cause, others, known)
+            self._see_memory(cause, {**self._memory, cause: value})

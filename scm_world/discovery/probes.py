@@ -1,0 +1,245 @@
+"""Probe states: places in state space where causes have a chance to show.
+
+An edge that needs contact shows only where there is contact. So besides free motion the probes
+hold fingers against a block, on the floor and at the wall, and blocks in the air and at the wall.
+All choices are drawn from keyed noise: probe i of a seed is the same, whatever ran before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.errors import InterventionError
+from scm_world.scene import trifinger
+from scm_world.scene.kinematics import inverse
+from scm_world.scene.scene import WALL_RADIUS
+from scm_world.variables import Noise
+from scm_world.world import World, WorldSnapshot
+
+TIP = trifinger.COLLISION["tip"].radius  # [m]
+CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch
+_DRAWS = 64
+
+
+@final
+class Dice:
+    """The random numbers of one probe.
+
+    Args:
+        noise: The seed's noise.
+        probe: Number of the probe.
+        attempt: Counts up where a choice was not feasible.
+    """
+
+    def __init__(self, noise: Noise, probe: int, attempt: int = 0) -> None:
+        self._numbers = noise.uniforms("probe", n=_DRAWS, episode=probe, step=attempt)[0]
+        self._used = 0
+
+    def between(self, low: float, high: float, n: int | None = None) -> Any:
+        """Draw one number, or an array of ``n``."""
+        count = 1 if n is None else n
+        drawn = self._numbers[self._used : self._used + count]
+        self._used += count
+        scaled = low + (high - low) * drawn
+        return float(scaled[0]) if n is None else scaled
+
+
+@final
+@dataclass(frozen=True)
+class Probe:
+    """A state to experiment in.
+
+    Attributes:
+        kind: How it came about.
+        snapshot: Of the world.
+        action: What the robot does next, shape (9,).
+    """
+
+    kind: str
+    snapshot: WorldSnapshot
+    action: Floats
+
+
+Setting = tuple[dict[str, Value], Floats]
+"""States to set, and the fingertip positions that the robot then drives at, shape (9,) [m]."""
+
+
+def _sizes(world: World) -> Floats:
+    return np.array([world[f"{name}.size"] for name in world.composition.blocks]).reshape(-1, 3)
+
+
+def _around(center: Floats, radius: float, angles: Floats, height: float) -> Floats:
+    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], axis=-1) * radius
+    points: Floats = center + ring
+    points[:, 2] = height
+    return points.ravel()
+
+
+def _facing(dice: Dice) -> Floats:
+    """Give the direction in which each finger stands, with a little spread [rad]."""
+    tips = np.array([[-0.05945, 0.15864], [0.16711, -0.02783], [-0.10766, -0.13080]])
+    directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + dice.between(-0.2, 0.2, 3)
+    return directions
+
+
+def touch(world: World, dice: Dice) -> Setting:
+    """Stand the block amid the fingers and let all three press on it."""
+    size = _sizes(world)[0]
+    name = world.composition.blocks[0]
+    place = np.array([*dice.between(-0.02, 0.02, 2), size[2] / 2])
+    angles = _facing(dice)
+    reach = np.linalg.norm(size[:2]) / 2 + TIP + CLEARANCE
+    height = dice.between(0.3, 0.8) * size[2]
+    states = {
+        f"{name}.cartesian_position": place,
+        f"{name}.euler_orientation": np.array([0.0, 0.0, dice.between(-0.8, 0.8)]),
+        "joint_positions": _joints(world, _around(place, reach, angles, height)),
+    }
+    drive = _around(place, dice.between(0.0, 0.02), angles + 0.4, dice.between(0.01, 0.06))
+    return states, drive
+
+
+def finger_on_floor(world: World, dice: Dice) -> Setting:
+    """Put the fingertips on the floor and let them rub it."""
+    angles = _facing(dice)
+    radius = dice.between(0.1, 0.13)
+    center = np.zeros(3)
+    states = {"joint_positions": _joints(world, _around(center, radius, angles, TIP + CLEARANCE))}
+    states.update(_out_of_the_way(world, dice))
+    return states, _around(center, radius - 0.02, angles + 0.2, -0.02)
+
+
+def finger_at_wall(world: World, dice: Dice) -> Setting:
+    """Put the fingertips at the ring wall and let them rub it."""
+    angles = _facing(dice)
+    center = np.zeros(3)
+    inside = WALL_RADIUS - TIP - 3e-3
+    height = dice.between(0.08, 0.14)
+    states = {"joint_positions": _joints(world, _around(center, inside, angles, height))}
+    states.update(_out_of_the_way(world, dice))
+    return states, _around(center, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
+
+
+def block_at_wall(world: World, dice: Dice) -> Setting:
+    """Let the block slide along the wall."""
+    size = _sizes(world)[0]
+    name = world.composition.blocks[0]
+    angle = dice.between(-np.pi, np.pi)
+    out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    radius = np.sqrt((WALL_RADIUS - 3e-3) ** 2 - (size[1] / 2) ** 2) - size[0] / 2
+    velocity = 0.6 * out + dice.between(0.2, 0.5) * along
+    states = {
+        f"{name}.cartesian_position": np.array([*(radius * out), size[2] / 2 + CLEARANCE]),
+        f"{name}.euler_orientation": np.array([0.0, 0.0, angle]),
+        f"{name}.linear_velocity": np.array([*velocity, 0.0]),
+    }
+    return states, _rest_tips(world)
+
+
+def block_in_air(world: World, dice: Dice) -> Setting:
+    """Let the block fall and tumble."""
+    name = world.composition.blocks[0]
+    states = {
+        f"{name}.cartesian_position": np.array([*dice.between(-0.03, 0.03, 2), 0.06]),
+        f"{name}.euler_orientation": dice.between(-0.7, 0.7, 3),
+        f"{name}.linear_velocity": dice.between(-0.3, 0.3, 3),
+        f"{name}.angular_velocity": dice.between(-8.0, 8.0, 3),
+    }
+    return states, _rest_tips(world)
+
+
+def solved(world: World, dice: Dice) -> Setting:
+    """Begin where the goal is fulfilled."""
+    return world.task.solution(world.values()), _rest_tips(world)
+
+
+def free(world: World, dice: Dice) -> Setting:
+    """Change nothing; the robot drives somewhere."""
+    tips = np.array(world["end_effector_positions"])
+    return {}, tips + dice.between(-0.05, 0.05, 9)
+
+
+def _rest_tips(world: World) -> Floats:
+    return np.array(world["end_effector_positions"])
+
+
+def _joints(world: World, tips: Floats) -> Floats:
+    near = np.array(trifinger.REST)
+    return inverse(tips, float(world["robot_height"]), near).joint_positions
+
+
+def _out_of_the_way(world: World, dice: Dice) -> dict[str, Value]:
+    return {
+        f"{name}.cartesian_position": np.array([0.0, 0.0, size[2] / 2])
+        for name, size in zip(world.composition.blocks[:1], _sizes(world), strict=False)
+    }
+
+
+_WITH_BLOCKS: tuple[Callable[[World, Dice], Setting], ...] = (
+    touch,
+    free,
+    block_at_wall,
+    finger_on_floor,
+    touch,
+    block_in_air,
+    finger_at_wall,
+    solved,
+)
+_WITHOUT_BLOCKS: tuple[Callable[[World, Dice], Setting], ...] = (
+    free,
+    finger_on_floor,
+    finger_at_wall,
+    solved,
+)
+
+
+def probes(world: World, n: int, seed: int) -> Iterator[Probe]:
+    """Prepare probe states one after another.
+
+    Args:
+        world: To experiment with; it is reset for each probe.
+        n: How many.
+        seed: Of the choices.
+    """
+    noise = Noise(seed)
+    kinds = _WITH_BLOCKS if world.composition.blocks else _WITHOUT_BLOCKS
+    for number in range(n):
+        yield _prepare(world, kinds[number % len(kinds)], noise, number)
+
+
+def _prepare(
+    world: World, scenario: Callable[[World, Dice], Setting], noise: Noise, number: int
+) -> Probe:
+    for attempt in range(20):
+        dice = Dice(noise, number, attempt)
+        world.reset(seed=number)
+        try:
+            states, drive = scenario(world, dice)
+            world.do(states)
+        except InterventionError:
+            continue
+        return _settle(world, scenario.__name__, drive, dice)
+    world.reset(seed=number)
+    return _settle(world, "start", _rest_tips(world), Dice(noise, number))
+
+
+def _settle(world: World, kind: str, drive: Floats, dice: Dice) -> Probe:
+    action = _command(world, drive, dice)
+    for _ in range(round(dice.between(0.0, 2.0))):
+        world.step(action)
+    return Probe(kind, world.snapshot(), _command(world, drive, dice))
+
+
+def _command(world: World, drive: Floats, dice: Dice) -> Floats:
+    """Turn fingertip positions into an action of the world's mode, with a little variety."""
+    if world.action_mode == "end_effector_positions":
+        return drive + dice.between(-0.005, 0.005, 9)
+    joints = _joints(world, drive) + dice.between(-0.05, 0.05, 9)
+    if world.action_mode == "joint_positions":
+        return joints
+    return np.clip(5.0 * (joints - np.array(world["joint_positions"])), -0.3, 0.3)

@@ -1,0 +1,128 @@
+"""Discovery from beginning to end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from scm_world.discovery.models import paired_effects
+from scm_world.discovery.paired import Effects, Paired
+from scm_world.discovery.probes import probes as probe_states
+from scm_world.discovery.report import DiscoveryReport, versions
+from scm_world.discovery.scores import score
+from scm_world.errors import UnknownOption
+from scm_world.graph import SCM
+from scm_world.world import World
+
+RESOLUTION = 1e-12
+"""Differences below it are not told from rounding, where the floor itself is exactly zero."""
+
+FACTOR = 10.0
+"""How far above the floor an effect must lie."""
+
+
+def discover(
+    system: World | SCM | str,
+    *,
+    probes: int = 32,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    **options: Any,
+) -> DiscoveryReport:
+    """Recover a causal graph by paired single-target interventions, and score it.
+
+    The threshold follows from the measured floor: the largest difference that is left after
+    something was done and undone. It may be interrupted (Ctrl-C); the report then covers the
+    probe states that were finished.
+
+    Args:
+        system: A world, the name of a task, or a causal model without physics.
+        probes: How many states to experiment in.
+        seed: Of states and values.
+        progress: Called with (finished, planned) after each probe state.
+        options: Arguments of ``World``, where ``system`` is a name.
+
+    Raises:
+        UnknownOption: ``probes`` is not a positive number, or a name does not exist.
+
+    Example:
+        >>> from scm_world.variables import Derived, Exogenous, Linear
+        >>> model = SCM([
+        ...     Exogenous(name="a"),
+        ...     Derived(name="b", parents=("a",), mechanism=Linear(weights=(2.0,))),
+        ... ])
+        >>> discover(model, probes=2).score.shd
+        0
+    """
+    if not isinstance(probes, int) or probes < 1:
+        raise UnknownOption("number of probes", probes, ("any whole number from 1 on",))
+    started = time.perf_counter()
+    if isinstance(system, SCM):
+        effects = paired_effects(system, probes=probes, seed=seed)
+        about = {"task": "model", "backend": "none", "preset": "none", "engine": ""}
+        return _report(system, effects, probes, probes, seed, about, started)
+    world = World(system, **options) if isinstance(system, str) else system
+    try:
+        effects, done = _experiments(world, probes, seed, progress)
+        about = {
+            "task": world.task.name,
+            "backend": world.backend.name,
+            "preset": world.structure.preset.name,
+            "engine": f"{world.backend.name} {world.backend.version}",
+        }
+        return _report(world.model, effects, done, probes, seed, about, started)
+    finally:
+        if isinstance(system, str):
+            world.close()
+
+
+def _experiments(
+    world: World, probes: int, seed: int, progress: Callable[[int, int], None] | None
+) -> tuple[Effects, int]:
+    paired = Paired(world, seed)
+    done = 0
+    try:
+        for number, probe in enumerate(probe_states(world, probes, seed)):
+            paired.run(number, probe)
+            done = number + 1
+            if progress is not None:
+                progress(done, probes)
+    except KeyboardInterrupt:
+        if done == 0:
+            raise
+    return paired.effects, done
+
+
+def _report(
+    model: SCM,
+    effects: Effects,
+    done: int,
+    planned: int,
+    seed: int,
+    about: dict[str, str],
+    started: float,
+) -> DiscoveryReport:
+    threshold = max(FACTOR * effects.floor, RESOLUTION)
+    found = effects.found(threshold)
+    declared = {edge.key for edge in model.edges}
+    inert = [size for key, size in effects.largest.items() if key not in found]
+    return DiscoveryReport(
+        task=about["task"],
+        backend=about["backend"],
+        preset=about["preset"],
+        seed=seed,
+        probes=done,
+        planned=planned,
+        rollouts=effects.rollouts,
+        floor=effects.floor,
+        threshold=threshold,
+        inert=max(inert, default=0.0),
+        score=score(found, declared),
+        found=tuple(sorted(found)),
+        declared=tuple(sorted(declared)),
+        effects={key: effects.largest[key] for key in found},
+        refused=effects.refused,
+        seconds=time.perf_counter() - started,
+        versions=versions(about["engine"]),
+    )

@@ -1,0 +1,181 @@
+"""What is special about MuJoCo."""
+
+import copy
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from scm_world.backends import BACKENDS, EngineSnapshot, make_backend
+from scm_world.backends.mujoco import MujocoBackend
+from scm_world.backends.mujoco.installation import judge
+from scm_world.backends.mujoco.model import compiled
+from scm_world.errors import MissingEngine, MixedInstallation, SnapshotMismatch, UnknownOption
+from scm_world.scene import ControlMode, Difference, Structure, default_scene, trifinger
+from scm_world.scene.kinematics import forward
+from scm_world.testing.backend import busy_scene, other_value, play
+
+REST = np.array(trifinger.REST)
+
+
+@pytest.fixture
+def backend() -> MujocoBackend:
+    """Provide MuJoCo with the busy scene."""
+    backend = MujocoBackend()
+    backend.build(busy_scene())
+    return backend
+
+
+def fields(model: mujoco.MjModel) -> dict[str, bytes]:
+    """Copy every number of a model."""
+    found = {}
+    for name, part in (("", model), ("opt.", model.opt), ("stat.", model.stat)):
+        for key in dir(part):
+            value = getattr(part, key)
+            if not key.startswith("_") and isinstance(value, (np.ndarray, float, int)):
+                found[name + key] = np.asarray(value).tobytes()
+    return found
+
+
+def test_no_engine_is_imported_before_it_is_used() -> None:
+    """Importing the backends imports neither MuJoCo nor Bullet."""
+    code = (
+        "import sys, scm_world.backends, scm_world.backends.mujoco;"
+        "print({'mujoco', 'pybullet'} & set(sys.modules))"
+    )
+    child = subprocess.run(  # noqa: S603 # our own interpreter, our own code
+        [sys.executable, "-c", code], capture_output=True, check=True, text=True
+    )
+    assert child.stdout.strip() == "set()"
+
+
+def test_unknown_backends_are_named() -> None:
+    """The error lists the backends and suggests one."""
+    with pytest.raises(UnknownOption, match=r"did you mean 'mujoco'\?") as caught:
+        make_backend("mujcoo")
+    assert caught.value.choices == BACKENDS
+
+
+@pytest.mark.parametrize(
+    "distributions",
+    [{"mujoco": "3.17.0"}, {"mujoco-core": "4.0.1"}, {"mujoco": "4.0.0", "mujoco-core": "4.0.0"}],
+)
+def test_whole_installations_are_accepted(distributions: dict[str, str]) -> None:
+    """One version in all distributions and libraries is fine."""
+    judge(distributions, [f"libmujoco.so.{version}" for version in distributions.values()][:1])
+
+
+@pytest.mark.parametrize(
+    ("distributions", "libraries"),
+    [
+        ({"mujoco": "3.17.0", "mujoco-core": "4.0.1"}, ["libmujoco.so.3.17.0"]),
+        ({"mujoco": "4.0.0"}, ["libmujoco.so.4.0.0", "libmujoco.so.3.17.0"]),
+        ({"mujoco": "4.0.0"}, ["libmujoco.so.3.3.0"]),
+    ],
+)
+def test_mixed_installations_are_refused(
+    distributions: dict[str, str], libraries: list[str]
+) -> None:
+    """Two versions in one folder are an error that names them and the repair."""
+    with pytest.raises(MixedInstallation, match="force-reinstall") as caught:
+        judge(distributions, libraries)
+    assert set(distributions) <= set(caught.value.versions)
+
+
+@pytest.mark.parametrize("distributions", [{}, {"mujoco": "3.16.0"}])
+def test_missing_and_old_installations_are_refused(distributions: dict[str, str]) -> None:
+    """No MuJoCo, or one that cannot edit sizes, is an error that says what to install."""
+    with pytest.raises(MissingEngine, match=r"mujoco>=3\.17"):
+        judge(distributions, [])
+
+
+def test_any_path_ends_in_the_same_model(backend: MujocoBackend) -> None:
+    """Edits one by one, with detours, give every number of a model that was built so."""
+    scene = busy_scene()
+    final = {key: other_value(key, value) for key, value in scene.parameters.items()}
+    for key in sorted(final):
+        backend.apply(Difference(parameters={key: 1.3 * final[key]}))
+        play(backend, 1)
+        backend.apply(Difference(parameters={key: final[key]}))
+    fresh = MujocoBackend()
+    fresh.build(scene.with_(parameters=final))
+    edited, built = fields(backend._model), fields(fresh._model)
+    assert [name for name in edited if edited[name] != built[name]] == []
+
+
+def test_the_cached_model_is_never_changed(backend: MujocoBackend) -> None:
+    """Whatever a backend does, it does to its own copy of the compiled model."""
+    cached = compiled(busy_scene().structure)
+    before = fields(cached)
+    for key, value in busy_scene().parameters.items():
+        backend.apply(Difference(parameters={key: other_value(key, value)}))
+    play(backend, 2, mode=ControlMode.JOINT_TORQUES)
+    assert fields(cached) == before
+
+
+def test_unknown_parameters_change_nothing(backend: MujocoBackend) -> None:
+    """An unknown parameter is named, and the known ones beside it are not applied."""
+    before = fields(backend._model)
+    changes = {("near", "mass"): np.array(0.05), ("nobody", "mass"): np.array(0.05)}
+    with pytest.raises(UnknownOption, match=r"nobody\.mass"):
+        backend.apply(Difference(parameters=changes))
+    assert fields(backend._model) == before
+
+
+def test_other_versions_are_refused(backend: MujocoBackend) -> None:
+    """A snapshot of another MuJoCo is refused, because it would not continue bit for bit."""
+    snapshot = backend.snapshot()
+    with pytest.raises(SnapshotMismatch, match=r"mujoco 2\.0\.0"):
+        backend.restore(EngineSnapshot("mujoco 2.0.0", snapshot.payload))
+
+
+def test_fingertips_are_where_kinematics_says(backend: MujocoBackend) -> None:
+    """The tips of the model are those of the closed form, in any pose and at any height."""
+    generator = np.random.default_rng(0)
+    for height in (0.3, 0.37):
+        backend.apply(Difference(parameters={("robot", "height"): np.array(height)}))
+        state = backend.state()
+        state.joint_positions[:] = generator.uniform(trifinger.JOINT_LOW, trifinger.JOINT_HIGH)
+        backend.apply(Difference(state=state))
+        mujoco.mj_kinematics(backend._model, backend._data)
+        tips = [backend._data.body(f"robot_finger_{f}_tip").xpos for f in trifinger.FINGERS]
+        expected = forward(state.joint_positions, height)
+        np.testing.assert_allclose(np.ravel(tips), np.ravel(expected), rtol=0, atol=1e-12)
+
+
+def test_nothing_intersects_in_the_published_poses() -> None:
+    """Neither the rest pose nor the raised pose makes fingers touch."""
+    for pose in (trifinger.REST, trifinger.RAISED):
+        scene = default_scene(Structure())
+        scene.state.joint_positions[:] = pose
+        backend = MujocoBackend()
+        backend.build(scene)
+        backend.step(ControlMode.JOINT_POSITIONS, np.array(pose), 1)
+        assert backend.contacts() == ()
+
+
+def test_the_sparse_solver_ends_where_the_dense_one_does(backend: MujocoBackend) -> None:
+    """A fault of MuJoCo 4.0.0 in the sparse solver does not show."""
+    names = tuple(f"block_{i}" for i in range(10))
+    scene = default_scene(Structure(names))
+    generator = np.random.default_rng(1)
+    scene.state.positions[:, :2] = generator.uniform(-0.06, 0.06, (10, 2))
+    scene.state.positions[:, 2] = 0.05 + 0.07 * np.arange(10)
+    backend.build(scene)
+    dense = copy.copy(backend._model)
+    dense.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    data = mujoco.MjData(dense)
+    worst = 0.0
+    for _ in range(100):
+        backend.step(ControlMode.JOINT_POSITIONS, REST, 9)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (
+            backend._data.qpos,
+            backend._data.qvel,
+            backend._data.ctrl,
+        )
+        mujoco.mj_step(dense, data)
+        backend.step(ControlMode.JOINT_POSITIONS, REST, 1)
+        worst = max(worst, float(np.abs(data.qvel - backend._data.qvel).max()))
+    assert worst < 1e-8
