@@ -115,15 +115,13 @@ class Box(_Space):
     def nearest(self, value: Value, values: Values | None = None) -> Value:
         """Find the point of the box that is nearest to a value."""
         low, high = self.bounds(np.shape(value), values or {})
-        clipped: Floats = np.clip(value, low, high)
-        return clipped
+        return np.asarray(np.clip(value, low, high))
 
     def nearest_inside(self, value: Value, values: Values | None = None) -> Value:
         """Find a nearest point that is not on the border, along edges that have a length."""
         low, high = self.bounds(np.shape(value), values or {})
         margin = np.minimum(2.0 * TOLERANCE, 0.5 * np.maximum(high - low, 0.0))
-        clipped: Floats = np.clip(value, low + margin, high - margin)
-        return clipped
+        return np.asarray(np.clip(value, low + margin, high - margin))
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Multiply the edge lengths that are not zero, shape ``(...)``."""

@@ -12,7 +12,7 @@ from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, Infeasible, InterventionError
 from scm_world.graph import flatten
 from scm_world.scene import Difference, PhysicalState
-from scm_world.scene.feasibility import overlaps
+from scm_world.scene.feasibility import Overlap, overlaps
 from scm_world.variables import Hard
 from scm_world.variables.checks import coerce
 from scm_world.world.audit import Applied, Audit
@@ -44,15 +44,17 @@ def _moves_surfaces(change: Difference) -> bool:
     return change.state is not None or any(what in _MOVES for _, what in change.parameters)
 
 
-def _new_overlaps(world: World, instant: Instant, proposal: Proposal) -> list[str]:
+def _new_overlaps(world: World, instant: Instant, proposal: Proposal) -> list[Overlap]:
+    """List overlaps deeper than what physics left; taking something back is always possible."""
     if not _moves_surfaces(difference(world, proposal)):
         return []
     found = overlaps(world.describe(proposal.static, proposal.state), tolerance=TOLERANCE)
     if not found:
         return []
-    present = overlaps(world.describe(instant.static, instant.state), tolerance=0.0)
+    values = {**world.current()[0], **instant.static}
+    present = overlaps(world.describe(values, instant.state), tolerance=0.0)
     depth = {overlap.bodies: overlap.depth for overlap in present}
-    return [str(o) for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
+    return [o for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
 
 
 def refuse_overlaps(
@@ -60,8 +62,7 @@ def refuse_overlaps(
 ) -> None:
     """Refuse an intervention that puts two bodies in one place.
 
-    Bodies that intersected when physics left them (a block that is being squeezed) may go on
-    doing so; so what was done at this instant can always be taken back.
+    Bodies that intersect already (a block that is being squeezed) may go on doing so.
 
     Raises:
         Infeasible: With the bodies, the depths, and the nearest value that is feasible.
@@ -69,9 +70,25 @@ def refuse_overlaps(
     problems = _new_overlaps(world, instant, proposal)
     if problems:
         flat = flatten(request)
-        name = next(iter(flat))
+        bodies = {body for problem in problems for body in problem.bodies}
+        name = _culprit(world, flat, bodies)
         found = nearest_feasible(world, instant, request)
-        raise Infeasible(name, flat[name], problems, None if found is None else found[name])
+        nearest = None if found is None else found[name]
+        raise Infeasible(name, flat[name], [str(p) for p in problems], nearest)
+
+
+def _culprit(world: World, names: Iterable[str], bodies: Iterable[str]) -> str:
+    """Name the target that is most likely to have moved one of the bodies."""
+
+    def blame(name: str) -> int:
+        target = world.model.target(name)
+        follow = {target, *world.static_descendants([target])}
+        if not follow & {*world.slices, *(k for k, v in world.parameter_keys.items() if v[1] in _MOVES)}:
+            return 0
+        moved = {name.partition(".")[0] for name in follow}
+        return 2 if moved & set(bodies) else 1
+
+    return max(names, key=blame)
 
 
 def nearest_feasible(
@@ -122,17 +139,18 @@ def commit(
     moved_before = {}
     if change.state is not None:
         moved_before = {name: np.array(before[name]) for name in world.slices}
-    inertia = _inertia(world, change)
-    if change:
-        world.backend.apply(change)
-        wrong = _not_taken(world, change, proposal)
-        if wrong:
-            world.backend.apply(_back(world, change, before))
-            raise EngineFailure(
-                f"the engine did not take over {', '.join(wrong)}", world.backend.name
-            )
-    world.adopt(proposal.model, proposal.static, proposal.index)
-    audit = _report(world, proposal, request, before, moved_before, inertia, change)
+    model, index, state = world.graph, world.index, world.current()[1].copy()
+    static = {name: before[name] for name in proposal.static}
+    try:
+        inertia = _inertia(world, change)
+        _apply(world, change, proposal)
+        world.adopt(proposal.model, proposal.static, proposal.index)
+        audit = _report(world, proposal, request, before, moved_before, inertia, change)
+    except BaseException:
+        if change:
+            world.backend.apply(_back(world, change, before, state))
+        world.adopt(model, static, index)
+        raise
     kept = Instant(
         instant.model,
         instant.static,
@@ -144,10 +162,21 @@ def commit(
     return audit, kept
 
 
-def _back(world: World, change: Difference, before: Mapping[str, Value]) -> Difference:
+def _apply(world: World, change: Difference, proposal: Proposal) -> None:
+    if not change:
+        return
+    world.backend.apply(change)
+    wrong = _not_taken(world, change, proposal)
+    if wrong:
+        raise EngineFailure(f"the engine did not take over {', '.join(wrong)}", world.backend.name)
+
+
+def _back(
+    world: World, change: Difference, before: Mapping[str, Value], state: PhysicalState
+) -> Difference:
     keys = {key: name for name, key in world.parameter_keys.items()}
     old = {key: before[keys[key]] for key in change.parameters}
-    return Difference(None, old, None if change.state is None else world.current()[1].copy())
+    return Difference(None, old, None if change.state is None else state)
 
 
 def _not_taken(world: World, change: Difference, proposal: Proposal) -> list[str]:
@@ -197,6 +226,9 @@ def _report(
         back = reported[key] if key is not None else None
         if where is not None:
             back = state.vector[where].copy()
+        if target == "action":
+            act = proposal.requests[target][1]
+            applied = np.array(act.value) if isinstance(act, Hard) else np.full(9, np.nan)
         if target == CONTROL_INDEX:
             back = np.asarray(world.index)
         entries[name] = Applied(name, flat[name], applied, back)

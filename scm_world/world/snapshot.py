@@ -4,13 +4,48 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.backends.base import EngineSnapshot
+from scm_world.graph import SCM
+from scm_world.scene import PhysicalState
+from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.variables import Intervention
+from scm_world.world.proposal import Instant, Requests
+
+
+@final
+@dataclass(frozen=True)
+class SavedInstant:
+    """An instant without its model, of which only the interventions are kept."""
+
+    interventions: Mapping[str, Intervention]
+    static: Mapping[str, Value]
+    vector: Floats
+    index: int
+    requests: Requests
+    at_start: bool
+
+    @classmethod
+    def of(cls, instant: Instant) -> SavedInstant:
+        """Save an instant."""
+        return cls(
+            instant.model.interventions,
+            dict(instant.static),
+            instant.state.vector.copy(),
+            instant.index,
+            dict(instant.requests),
+            instant.at_start,
+        )
+
+    def instant(self, model: SCM) -> Instant:
+        """Give the instant back, as one of a model without interventions."""
+        state = PhysicalState((len(self.vector) - ROBOT_SIZE) // BLOCK_SIZE, self.vector.copy())
+        held = model.with_interventions(self.interventions)
+        return Instant(held, self.static, state, self.index, dict(self.requests), self.at_start)
 
 
 @final
@@ -27,8 +62,8 @@ class WorldSnapshot:
         index: The control step.
         seed: Of the noise.
         episode: Number of the episode.
-        variables: Names of all variables, to tell worlds apart.
-        at_start: Whether no step has been made yet.
+        world: Task, options and names of all variables, to tell worlds apart.
+        instant: What was done at this instant so far, and where it began.
     """
 
     engine: EngineSnapshot
@@ -39,5 +74,5 @@ class WorldSnapshot:
     index: int = 0
     seed: int = 0
     episode: int = 0
-    variables: tuple[str, ...] = ()
-    at_start: bool = False
+    world: tuple[Any, ...] = ()
+    instant: SavedInstant | None = None

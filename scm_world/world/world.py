@@ -32,7 +32,7 @@ from scm_world.world.audit import Audit
 from scm_world.world.commit import commit, refuse_overlaps
 from scm_world.world.proposal import Instant, propose
 from scm_world.world.readouts import Readouts, static_order
-from scm_world.world.snapshot import WorldSnapshot
+from scm_world.world.snapshot import SavedInstant, WorldSnapshot
 
 
 @final
@@ -301,7 +301,10 @@ class World:
         self._instant = None
 
     def _checked(self, action: ArrayLike) -> Floats:
-        given = np.ascontiguousarray(action, dtype=np.float64)
+        try:
+            given = np.ascontiguousarray(action, dtype=np.float64)
+        except (TypeError, ValueError):  # text, or a ragged list
+            given = np.empty(0)
         command = np.empty(9)
         if given.shape != (9,) or not clip_kernel(
             given, self.action_low, self.action_high, command
@@ -342,6 +345,8 @@ class World:
         proposal = propose(self, instant, request, space)
         refuse_overlaps(self, instant, proposal, request)
         audit, self._instant = commit(self, instant, proposal, request)
+        if instant.at_start:
+            self._readouts.forget()
         return audit
 
     def _present(self, *, at_start: bool = False) -> Instant:
@@ -368,7 +373,6 @@ class World:
     def snapshot(self) -> WorldSnapshot:
         """Save everything that decides how the world goes on. It can be pickled."""
         self._require_episode()
-        instant = self._instant
         return WorldSnapshot(
             engine=self.backend.snapshot(),
             static={name: self._now[name] for name in self.static_names},
@@ -378,8 +382,8 @@ class World:
             index=self._index,
             seed=self.noise.seed,
             episode=self.episode,
-            variables=tuple(self.model),
-            at_start=instant is not None and instant.at_start,
+            world=self._identity,
+            instant=None if self._instant is None else SavedInstant.of(self._instant),
         )
 
     def restore(self, snapshot: WorldSnapshot) -> None:
@@ -388,7 +392,7 @@ class World:
         Raises:
             SnapshotMismatch: It is one of another task or engine.
         """
-        if snapshot.variables != tuple(self.model):
+        if snapshot.world != self._identity:
             raise SnapshotMismatch("the snapshot is one of another task, or of other options")
         if not self._started:
             self._begin()
@@ -400,7 +404,15 @@ class World:
         self.adopt(held, snapshot.static, snapshot.index)
         for name, value in snapshot.previous.items():
             self._before[name][...] = value
-        self._instant = self._present(at_start=snapshot.at_start)
+        saved = snapshot.instant
+        self._instant = None if saved is None else saved.instant(self.model)
+
+    @cached_property
+    def _identity(self) -> tuple[Any, ...]:
+        """What two worlds have in common if one can take up a snapshot of the other."""
+        options = (self._preset.name, self.action_mode, self.conventions.name)
+        numbers = (self.frame_skip, self.max_episode_length)
+        return (self.task.name, *options, *numbers, *self.model)
 
     def close(self) -> None:
         """Free the engine."""
