@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -53,7 +53,10 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         floor_friction = 0.4, engine reports 0.4
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 25}
+    metadata: dict[str, Any] = {  # noqa: RUF012 # declared by Gymnasium as an instance variable
+        "render_modes": ["rgb_array"],
+        "render_fps": 25,
+    }
 
     def __init__(
         self,
@@ -93,9 +96,7 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if not normalize_actions:
             self._middle, self._half = np.zeros(9), np.ones(9)
         bounds = (-np.ones(9), np.ones(9)) if normalize_actions else (low, high)
-        self.action_space = gymnasium.spaces.Box(
-            *(bound.astype(np.float32) for bound in bounds), dtype=np.float32
-        )
+        self.action_space = _box(*bounds)
         self._scale = self.world.control_period if self.world.conventions.reward_times_dt else 1.0
 
     def reset(
@@ -156,7 +157,7 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "reward_terms": {name: float(now[name]) for name in self._terms},
         }
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene, shape (480, 640, 3); None without ``render_mode="rgb_array"``."""
         if self.render_mode is None:
             return None
@@ -168,6 +169,11 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def close(self) -> None:
         """Free the engine."""
         self.world.close()
+
+
+def _box(low: Floats, high: Floats) -> gymnasium.Space[NDArray[np.float32]]:
+    bounds: Any = (low.astype(np.float32), high.astype(np.float32))
+    return gymnasium.spaces.Box(*bounds, dtype=np.float32)
 
 
 class _Layout:
@@ -223,7 +229,7 @@ class _Layout:
             np.broadcast_to(np.asarray(high, float).ravel(), (size,)),
         )
 
-    def space(self) -> gymnasium.spaces.Box:
+    def space(self) -> gymnasium.Space[Observation]:
         """Give the observation space; without bounds where the published ones do not hold."""
         if self._published:
             low, high = np.full(self._raw.size, -np.inf), np.full(self._raw.size, np.inf)
@@ -231,9 +237,7 @@ class _Layout:
             low, high = -np.ones(self._raw.size), np.ones(self._raw.size)
         else:
             low, high = self._low, self._high
-        return gymnasium.spaces.Box(
-            low.astype(np.float32), high.astype(np.float32), dtype=np.float32
-        )
+        return _box(low, high)
 
     def observe(self, now: Mapping[str, Value]) -> Observation:
         """Write the observation, shape (n,)."""
@@ -256,12 +260,13 @@ class _Layout:
 def _merge(pairs: list[tuple[slice, slice]]) -> list[tuple[slice, slice]]:
     """Join copies whose source and target both lie side by side."""
     merged: list[tuple[slice, slice]] = []
-    for where, source in pairs:
-        if merged and (merged[-1][0].stop, merged[-1][1].stop) == (where.start, source.start):
-            last_where, last_source = merged.pop()
-            where = slice(last_where.start, where.stop)
-            source = slice(last_source.start, source.stop)
-        merged.append((where, source))
+    for target, source in pairs:
+        if merged and (merged[-1][0].stop, merged[-1][1].stop) == (target.start, source.start):
+            before = merged.pop()
+            joined = slice(before[0].start, target.stop), slice(before[1].start, source.stop)
+            merged.append(joined)
+        else:
+            merged.append((target, source))
     return merged
 
 

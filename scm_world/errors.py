@@ -166,7 +166,7 @@ class _Outside(InterventionError):
     def __init__(self, name: str, value: Any, *, allowed: str, nearest: Any, unit: str) -> None:
         self.allowed = allowed
         self.nearest = nearest
-        unit = f" [{unit}]" if unit else ""
+        unit = "" if unit in ("", "1") else f" [{unit}]"
         super().__init__(
             f"do({name}): {value!r} is outside {allowed}{unit}; the nearest allowed value is "
             f"{nearest!r}",

@@ -136,7 +136,7 @@ class Backend(ABC):
             SnapshotMismatch: It was taken by another engine.
         """
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 # most engines have nothing to free
         """Free what the engine holds. Closing twice is harmless."""
 
     def state(self) -> PhysicalState:

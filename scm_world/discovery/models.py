@@ -67,12 +67,12 @@ def _another(variable: Variable, value: Value, values: Values, noise: Noise, num
         case Box():
             low, high = variable.bounds.bounds(variable.shape, values)
             step = np.where(np.isfinite(high - low), 0.2 * (high - low), 1.0) * direction
-            return np.where(value + step > high, value - step, value + step)
+            return np.asarray(np.where(value + step > high, value - step, value + step))
         case Integers():
-            return np.where(value < variable.bounds.high, value + 1, value - 1)
+            return np.asarray(np.where(value < variable.bounds.high, value + 1, value - 1))
         case Categories():
             others = [m for m in variable.bounds.members if not np.any(value == m)]
             return variable.array(np.broadcast_to(others[0] if others else value, variable.shape))
         case _:
             whole = variable.dtype != "real"
-            return value + (1 if whole else direction * (1.0 + np.abs(value)))
+            return np.asarray(value + (1 if whole else direction * (1.0 + np.abs(value))))

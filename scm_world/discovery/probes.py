@@ -93,7 +93,7 @@ def touch(world: World, dice: Dice) -> Setting:
     name = world.composition.blocks[0]
     place = np.array([*dice.between(-0.02, 0.02, 2), size[2] / 2])
     angles = _facing(dice)
-    reach = np.linalg.norm(size[:2]) / 2 + TIP + CLEARANCE
+    reach = float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE
     height = dice.between(0.3, 0.8) * size[2]
     states = {
         f"{name}.cartesian_position": place,
@@ -238,8 +238,8 @@ def _settle(world: World, kind: str, drive: Floats, dice: Dice) -> Probe:
 def _command(world: World, drive: Floats, dice: Dice) -> Floats:
     """Turn fingertip positions into an action of the world's mode, with a little variety."""
     if world.action_mode == "end_effector_positions":
-        return drive + dice.between(-0.005, 0.005, 9)
+        return np.asarray(drive + dice.between(-0.005, 0.005, 9))
     joints = _joints(world, drive) + dice.between(-0.05, 0.05, 9)
     if world.action_mode == "joint_positions":
-        return joints
-    return np.clip(5.0 * (joints - np.array(world["joint_positions"])), -0.3, 0.3)
+        return np.asarray(joints)
+    return np.asarray(np.clip(5.0 * (joints - np.array(world["joint_positions"])), -0.3, 0.3))

@@ -7,9 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import final
 
-import numpy as np
-
-from scm_world._types import Values
+from scm_world._types import Floats, Values
 from scm_world.scene import Goal, ParameterKey
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.variables import Function, Measured, Parent, Space, Variable
@@ -168,7 +166,7 @@ class Composition:
         return tuple(goal for goal in goals if goal is not None)
 
 
-def lowest_point(size: np.ndarray, orientation: np.ndarray) -> float:  # type: ignore[type-arg]
+def lowest_point(size: Floats, orientation: Floats) -> float:
     """Compute how far a box reaches below its center [m].
 
     Args:

@@ -130,7 +130,7 @@ class Evaluator:
         if requested.dtype != "real":
             moved = np.rint(moved).astype(np.int64)
         if requested.name == name:
-            return moved
+            return np.asarray(moved)
         return np.asarray(self._bound(requested, inverse=True)(moved))
 
     def _natural(

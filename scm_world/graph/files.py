@@ -75,9 +75,7 @@ def to_dict(model: SCM) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "variables": _plain(_VARIABLES.dump_python(list(model.variables), mode="json")),
-        "interventions": _plain(
-            _INTERVENTIONS.dump_python(dict(model.interventions), mode="json")
-        ),
+        "interventions": _plain(_INTERVENTIONS.dump_python(dict(model.interventions), mode="json")),
     }
 
 

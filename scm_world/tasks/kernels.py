@@ -63,7 +63,8 @@ def filled(
     shared = overlap_kernel(
         size, position, orientation, goal_size, goal_position, goal_orientation, work
     )
-    return min(1.0, shared / (goal_size[0] * goal_size[1] * goal_size[2]))
+    fraction: float = shared / (goal_size[0] * goal_size[1] * goal_size[2])
+    return min(1.0, fraction)
 
 
 @njit(cache=True)

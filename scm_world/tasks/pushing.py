@@ -24,7 +24,7 @@ from scm_world.tasks.base import (
     reward,
     term,
 )
-from scm_world.variables import Function, Integers, Measured, Parent, Variable
+from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
 from scm_world.variables import catalogue as numbers
 
 WEIGHTS = {
@@ -62,28 +62,21 @@ class Pushing(Task):
         tool_block_mass: float = numbers.BLOCK_MASS,
         weights: Mapping[str, float] | None = None,
     ) -> None:
-        floor_a, floor_b = (
-            numbers.cylindrical(radii, numbers.half_height(size), numbers.half_height(size))
-            for radii, size in (
-                (numbers.RADIUS_A, "block.size"),
-                (numbers.RADIUS_B, "block.size"),
-            )
-        )
         self.weights = {**WEIGHTS, **(weights or {})}
         self._tool = ToolBlock(
             "tool_block",
             size_from="block.size",
             mass=tool_block_mass,
             place=(0.0, -0.08, 0.0),
-            a=floor_a,
-            b=floor_b,
+            a=_on_the_floor("tool_block.size", numbers.RADIUS_A),
+            b=_on_the_floor("tool_block.size", numbers.RADIUS_B),
         )
         self._goal = GoalBlock(
             "goal_block",
             size_from="block.size",
             polar=(0.08, np.pi / 2),
-            a=floor_a,
-            b=floor_b,
+            a=_on_the_floor("goal_block.size", numbers.RADIUS_A),
+            b=_on_the_floor("goal_block.size", numbers.RADIUS_B),
         )
 
     def entities(self) -> Iterable[Entity]:
@@ -154,6 +147,12 @@ class Pushing(Task):
             f"tool_block.{quantity}": values[f"goal_block.{quantity}"]
             for quantity in ("cartesian_position", "orientation")
         }
+
+
+def _on_the_floor(size: str, radii: tuple[float, float]) -> Box:
+    """Give the cylindrical positions of a block that stands on the floor."""
+    height = numbers.half_height(size)
+    return numbers.cylindrical(radii, height, height)
 
 
 def aligned(

@@ -176,7 +176,10 @@ class ParameterConformance(Suite):
         assert leaks == []
 
     def test_what_touches_nothing_can_be_missing(self) -> None:
-        """Without a block that nothing touches, the others move bit-identically."""
+        """Without a block that nothing touches, the others move as before, but for rounding.
+
+        An engine may sum in another order where there are fewer bodies.
+        """
         scene = apart_scene(self.preset)
         with self.built(scene) as backend:
             expected = play(backend, 40)
@@ -185,7 +188,8 @@ class ParameterConformance(Suite):
             without = PhysicalState(1, np.delete(state.vector, np.s_[27:40]))
             fewer = Structure(("near",), preset=self.preset)
             backend.apply(Difference(structure=fewer, state=without))
-            assert same(play(backend, 40), np.delete(expected, np.s_[27:40], axis=1))
+            others = np.delete(expected, np.s_[27:40], axis=1)
+            np.testing.assert_allclose(play(backend, 40), others, rtol=0, atol=1e-7)
 
     def test_inertia_follows_mass_and_size(self, backend: Backend) -> None:
         """A block is a solid box, and the inertia of a link scales with its mass."""

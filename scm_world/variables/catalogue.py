@@ -32,7 +32,7 @@ JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
 CONTROL_INDEX_BOUNDS = Integers(0, 10**9)
 TYPE_BOUNDS = Categories((1, 2, 10, 20, 21, 23))
 
-# --- training space A and held-out space B ---------------------------------------------------------
+# --- training space A and held-out space B ---------------------------------
 JOINTS_A = Box((-1.57, -1.2, -3.0) * 3, (-0.69, 0.0, 0.0) * 3)
 JOINTS_B = Box((-0.69, 0.0, 0.0) * 3, (1.0, 1.57, 3.0) * 3)
 SIZE_A = Box(0.055, 0.075)
@@ -70,7 +70,7 @@ def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
     return Box((radii[0], -math.pi, low), (radii[1], math.pi, high))
 
 
-# --- defaults ---------------------------------------------------------------------------------------
+# --- defaults ------------------------------------------------------------------------------
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]
 SURFACE_FRICTION = 0.5
 BLOCK_FRICTION = 1.0

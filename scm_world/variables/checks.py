@@ -16,7 +16,6 @@ from scm_world.errors import (
 )
 from scm_world.variables.kinds import SpaceName, Variable
 
-
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 
 
@@ -63,8 +62,11 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
     """Refuse what is physically impossible.
 
     Raises:
+        NotFinite: It came out of a shift, a scale or other coordinates without being finite.
         OutOfBounds: With the nearest value that is possible.
     """
+    if not np.isfinite(value).all():
+        raise NotFinite(variable.name, _plain(value))
     bounds = variable.bounds
     if bounds is not None and not bounds.contains(value, values):
         raise OutOfBounds(

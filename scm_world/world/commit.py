@@ -79,14 +79,13 @@ def refuse_overlaps(
 
 def _culprit(world: World, names: Iterable[str], bodies: Iterable[str]) -> str:
     """Name the target that is most likely to have moved one of the bodies."""
+    surfaces = {*world.slices}
+    surfaces |= {name for name, key in world.parameter_keys.items() if key[1] in _MOVES}
 
-    def blame(name: str) -> int:
+    def blame(name: str) -> tuple[bool, bool]:
         target = world.model.target(name)
-        follow = {target, *world.static_descendants([target])}
-        if not follow & {*world.slices, *(k for k, v in world.parameter_keys.items() if v[1] in _MOVES)}:
-            return 0
-        moved = {name.partition(".")[0] for name in follow}
-        return 2 if moved & set(bodies) else 1
+        moved = {target, *world.static_descendants([target])} & surfaces
+        return bool({part.partition(".")[0] for part in moved} & {*bodies}), bool(moved)
 
     return max(names, key=blame)
 
@@ -117,11 +116,10 @@ def nearest_feasible(
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         try:
-            blocked = _new_overlaps(
-                world, instant, propose(world, instant, between(middle), None)
-            )
-        except InterventionError:
-            blocked = ["outside the bounds on the way"]
+            halfway = propose(world, instant, between(middle), None)
+            blocked = bool(_new_overlaps(world, instant, halfway))
+        except InterventionError:  # outside the bounds on the way
+            blocked = True
         low, high = (low, middle) if blocked else (middle, high)
     return between(low)
 
@@ -149,7 +147,7 @@ def commit(
     except BaseException:
         if change:
             world.backend.apply(_back(world, change, before, state))
-        world.adopt(model, static, index)
+        world.adopt(model, static, index, state)
         raise
     kept = Instant(
         instant.model,
@@ -203,6 +201,21 @@ def _inertia(world: World, change: Difference) -> dict[str, Value]:
     return {f"{body}.inertia": world.backend.inertia(body) for body in sorted(bodies)}
 
 
+def _outcome(world: World, proposal: Proposal, target: str) -> tuple[Value, Value | None]:
+    """Give the value that a target has now, and what the engine says it is."""
+    now, state = world.current()
+    if target == "action":
+        act = proposal.requests[target][1]
+        return (np.array(act.value) if isinstance(act, Hard) else np.full(9, np.nan)), None
+    applied = np.array(now[target])
+    if target == CONTROL_INDEX:
+        return applied, np.asarray(world.index)
+    if target in world.slices:
+        return applied, state.vector[world.slices[target]].copy()
+    key = world.parameter_keys.get(target)
+    return applied, None if key is None else world.backend.parameters([key])[key]
+
+
 def _report(
     world: World,
     proposal: Proposal,
@@ -213,34 +226,23 @@ def _report(
     change: Difference,
 ) -> Audit:
     flat = flatten(request)
-    now, state = world.current()
-    targets = {world.model.target(name) for name in proposal.asked}
-    reported = world.backend.parameters(
-        [world.parameter_keys[t] for t in targets if t in world.parameter_keys]
-    )
+    now = world.current()[0]
     entries = {}
     for name in proposal.asked:
-        target = world.model.target(name)
-        applied = np.array(now[target])
-        key, where = world.parameter_keys.get(target), world.slices.get(target)
-        back = reported[key] if key is not None else None
-        if where is not None:
-            back = state.vector[where].copy()
-        if target == "action":
-            act = proposal.requests[target][1]
-            applied = np.array(act.value) if isinstance(act, Hard) else np.full(9, np.nan)
-        if target == CONTROL_INDEX:
-            back = np.asarray(world.index)
+        applied, back = _outcome(world, proposal, world.model.target(name))
+        if name != world.model.target(name):
+            applied = world.in_coordinates(name, applied)
+            back = None if back is None else world.in_coordinates(name, back)
         entries[name] = Applied(name, flat[name], applied, back)
     followed = {
         name: (before[name], proposal.static[name])
         for name in proposal.static
-        if name not in targets
+        if name not in entries
         and proposal.static[name] is not before[name]
         and not np.array_equal(before[name], proposal.static[name])
     }
     for name, old in moved_before.items():
-        if name not in targets and not np.array_equal(old, now[name]):
+        if name not in entries and not np.array_equal(old, now[name]):
             followed[name] = (old, np.array(now[name]))
     engine = {
         body: (old, world.backend.inertia(body.removesuffix(".inertia")))

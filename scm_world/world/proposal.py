@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, final
 
@@ -14,7 +14,7 @@ from scm_world.errors import ConflictingTargets, InterventionError, raise_all
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.scene import PhysicalState
 from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Shift
-from scm_world.variables.checks import check_bounds, check_space, coerce
+from scm_world.variables.checks import check_bounds, check_space
 from scm_world.variables.kinds import SpaceName
 
 if TYPE_CHECKING:
@@ -89,14 +89,13 @@ def propose(
     accepted, problems = accept(world.model, request)
     requests: Requests = {**instant.requests, **accepted}
     draft = _Draft(world, instant, requests)
-    draft.solve_parameters()
-    problems += draft.set_states()
-    problems += draft.check(accepted, space)
+    with np.errstate(all="ignore"):  # what is not finite is refused by name
+        draft.solve_parameters()
+        problems += draft.set_states()
+        problems += draft.check(accepted, space)
     raise_all(problems)
     asked = tuple(name for name, _ in accepted.values())
-    frozen = {
-        target: (name, draft.frozen(target, name, act)) for target, (name, act) in requests.items()
-    }
+    frozen = {target: draft.frozen(target, *named) for target, named in requests.items()}
     return Proposal(draft.model, draft.static, draft.state, draft.index, frozen, asked)
 
 
@@ -123,25 +122,25 @@ class _Draft:
         self.model = self._instant.model.with_interventions(dict(acts.values()))
         targets = [target for target in acts if target in self.static]
         follow = self._world.static_descendants(targets)
+        draws = [t for t in targets if isinstance(acts[t][1], Draw)]
+        order: Iterable[str] = self._world.static_names
         known = {name: v for name, v in self.static.items() if name not in targets}
-        order = [n for n in self._world.static_names if n in follow or n in targets]
+        if draws:  # what they are drawn from may follow other variables, states among them
+            order = self.model.structure.order
+            known |= self._world.states(self._instant.state)
+        order = [n for n in order if n in self.static and (n in follow or n in targets)]
         solved = self.model.solve(known, moment=self._moment, only=order)
         self.static = {name: solved[name] for name in self.static}
-        draws = {
-            name: Hard(self._coordinates(target, name).tolist())
-            for target, (name, act) in acts.items()
-            if isinstance(act, Draw) and target in self.static
-        }
         if draws:
-            self.model = self.model.with_interventions(draws)
+            held = {target: Hard(self.static[target].tolist()) for target in draws}
+            self.model = self.model.with_interventions(held)
 
     def _coordinates(self, target: str, name: str) -> Value:
         """Give the value of a target in the coordinates that were asked for."""
         value = self._value(target)
         if name == target:
             return np.asarray(value)
-        variable: Any = self._world.model.declared(name)
-        return np.asarray(variable.mechanism.bind()(value))
+        return self._world.in_coordinates(name, value)
 
     def _value(self, target: str) -> Value:
         if target == CONTROL_INDEX:
@@ -150,23 +149,37 @@ class _Draft:
         return self.static[target] if where is None else self.state.vector[where]
 
     def set_states(self) -> list[InterventionError]:
-        """Set states, and carry along those whose parents were set."""
-        acts = {t: na for t, na in self._requests.items() if self._is_state(t)}
+        """Set states, and carry along those whose parents were set.
+
+        States that others follow come first; a shift or scale starts from where its state was
+        carried to.
+        """
         self.state = self._instant.state.copy()
         problems: list[InterventionError] = []
-        for target, (name, act) in acts.items():
-            value = self._wish(target, name, act)
-            try:
-                check_bounds(self._world.model.declared(target), value, self.static)
-            except InterventionError as problem:
-                problems.append(problem)
-                continue
-            if target == CONTROL_INDEX:
-                self.index = int(value)
-            else:
-                self.state.vector[self._world.slices[target]] = self._exact(target, value)
-        self._carry(acts)
+        followed = {variable.name for variable in self._world.carried}
+        acts = [t for t in self._requests if self._is_state(t)]
+        for target in sorted(acts, key=lambda name: name in followed):
+            if target not in followed:
+                problems += self._set(target)
+        for variable in self._world.carried:
+            name, act = self._requests.get(variable.name, (None, None))
+            if name is None or isinstance(act, SOFT):
+                self._carry(variable)
+            if name is not None:
+                problems += self._set(variable.name)
         return problems
+
+    def _set(self, target: str) -> list[InterventionError]:
+        value = self._wish(target, *self._requests[target])
+        try:
+            check_bounds(self._world.model.declared(target), value, self.static)
+        except InterventionError as problem:
+            return [problem]
+        if target == CONTROL_INDEX:
+            self.index = int(value)
+        else:
+            self.state.vector[self._world.slices[target]] = self._exact(target, value)
+        return []
 
     def _exact(self, target: str, value: Value) -> Value:
         bounds = self._world.model.declared(target).bounds
@@ -186,18 +199,15 @@ class _Draft:
             value = present + by if isinstance(act, Shift) else present * by
         return np.asarray(value if name == target else requested.inverse.bind()(value))
 
-    def _carry(self, acts: Requests) -> None:
-        """Let states follow the parents that act on them when set (a block that grows)."""
-        for variable in self._world.carried:
-            if variable.name in acts:
-                continue
-            parents = variable.set_parents()
-            old = [self._before(parent) for parent in parents]
-            new = [self._value(parent) for parent in parents]
-            if all(np.array_equal(a, b) for a, b in zip(old, new, strict=True)):
-                continue
-            where = self._world.slices[variable.name]
-            self.state.vector[where] = self._moved(variable, where, old, new)
+    def _carry(self, variable: Measured) -> None:
+        """Let a state follow the parents that act on it when set (a block that grows)."""
+        parents = variable.set_parents()
+        old = [self._before(parent) for parent in parents]
+        new = [self._value(parent) for parent in parents]
+        if all(np.array_equal(a, b) for a, b in zip(old, new, strict=True)):
+            return
+        where = self._world.slices[variable.name]
+        self.state.vector[where] = self._moved(variable, where, old, new)
 
     def _moved(self, variable: Measured, where: slice, old: list[Value], new: list[Value]) -> Value:
         if self._instant.at_start and variable.start is not None:
@@ -213,26 +223,39 @@ class _Draft:
 
     def check(self, accepted: Requests, space: SpaceName | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
-        problems: list[InterventionError] = []
         context: Values = {**self.static, **self._world.states(self.state)}
-        for target, (name, _) in accepted.items():
-            if target == "action":
-                continue
+        problems = self._check_parameters(context)
+        if space is None:
+            return problems
+        for target, (name, act) in accepted.items():
             requested = self._world.model.declared(name)
+            value = self._held_action(act) if target == "action" else None
             try:
-                if not self._is_state(target):
-                    check_bounds(self._world.model.declared(target), self._value(target), context)
-                if space is not None:
-                    check_space(requested, self._coordinates(target, name), space, context)
+                if value is None:
+                    value = self._coordinates(target, name)
+                check_space(requested, value, space, context)
             except InterventionError as problem:
                 problems.append(problem)
         return problems
 
-    def frozen(self, target: str, name: str, act: Intervention) -> Intervention:
+    def _check_parameters(self, context: Values) -> list[InterventionError]:
+        """Check the bounds of everything that changes: targets and what follows them."""
+        problems: list[InterventionError] = []
+        for name, value in self.static.items():
+            if value is self._instant.static[name]:
+                continue
+            try:
+                check_bounds(self._world.model.declared(name), value, context)
+            except InterventionError as problem:
+                problems.append(problem)
+        return problems
+
+    def _held_action(self, act: Intervention) -> Value:
+        return np.array(act.value) if isinstance(act, Hard) else np.full(9, np.nan)
+
+    def frozen(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:
         """Replace a draw, or a change of a state, by the value that came out."""
-        if isinstance(act, Hard) or target == "action":
-            return act
-        if isinstance(act, SOFT) and not self._is_state(target):
-            return act
-        variable = self._world.model.declared(name)
-        return Hard(coerce(variable, self._coordinates(target, name)).tolist())
+        soft_parameter = isinstance(act, SOFT) and not self._is_state(target)
+        if isinstance(act, Hard) or target == "action" or soft_parameter:
+            return name, act
+        return target, Hard(self._value(target).tolist())

@@ -162,6 +162,11 @@ class World:
         """Give the states by name, as views of a vector."""
         return {name: state.vector[where] for name, where in self.slices.items()}
 
+    def in_coordinates(self, name: str, value: Value) -> Value:
+        """Give a value of a quantity in other coordinates of it."""
+        variable: Any = self.model.declared(name)
+        return np.asarray(variable.mechanism.bind()(value))
+
     def __getitem__(self, name: str) -> Value:
         """Give the present value of one variable.
 
@@ -353,8 +358,17 @@ class World:
         static = {name: self._now[name] for name in self.static_names}
         return Instant(self._held, static, self._state.copy(), self._index, at_start=at_start)
 
-    def adopt(self, model: SCM, static: Values, index: int) -> None:
-        """Take over what an intervention decided; the engine has taken over its part."""
+    def adopt(
+        self, model: SCM, static: Values, index: int, state: PhysicalState | None = None
+    ) -> None:
+        """Take over what an intervention decided; the engine has taken over its part.
+
+        Args:
+            model: With the interventions that hold.
+            static: Values of everything that physics does not move.
+            index: The control step.
+            state: Where everything is; what the engine reports if None.
+        """
         self._held = model
         self._action_is_held = "action" in model.interventions
         self._now.update(static)
@@ -362,7 +376,10 @@ class World:
         self._readouts.stale()
         self._index = index
         self._clock[...] = index
-        self.backend.read(self._state)
+        if state is None:
+            self.backend.read(self._state)
+        else:
+            self._state.vector[:] = state.vector
 
     def current(self) -> tuple[Values, PhysicalState]:
         """Give the live values and the live state, for the parts of a ``do``."""

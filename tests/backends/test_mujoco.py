@@ -1,6 +1,5 @@
 """What is special about MuJoCo."""
 
-import copy
 import subprocess
 import sys
 
@@ -154,28 +153,3 @@ def test_nothing_intersects_in_the_published_poses() -> None:
         backend.build(scene)
         backend.step(ControlMode.JOINT_POSITIONS, np.array(pose), 1)
         assert backend.contacts() == ()
-
-
-def test_the_sparse_solver_ends_where_the_dense_one_does(backend: MujocoBackend) -> None:
-    """A fault of MuJoCo 4.0.0 in the sparse solver does not show."""
-    names = tuple(f"block_{i}" for i in range(10))
-    scene = default_scene(Structure(names))
-    generator = np.random.default_rng(1)
-    scene.state.positions[:, :2] = generator.uniform(-0.06, 0.06, (10, 2))
-    scene.state.positions[:, 2] = 0.05 + 0.07 * np.arange(10)
-    backend.build(scene)
-    dense = copy.copy(backend._model)
-    dense.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    data = mujoco.MjData(dense)
-    worst = 0.0
-    for _ in range(100):
-        backend.step(ControlMode.JOINT_POSITIONS, REST, 9)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = (
-            backend._data.qpos,
-            backend._data.qvel,
-            backend._data.ctrl,
-        )
-        mujoco.mj_step(dense, data)
-        backend.step(ControlMode.JOINT_POSITIONS, REST, 1)
-        worst = max(worst, float(np.abs(data.qvel - backend._data.qvel).max()))
-    assert worst < 1e-8

@@ -54,14 +54,14 @@ def write_options(spec: mujoco.MjSpec, preset: Preset) -> None:
     option.impratio = chosen.impratio
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    # Sums over a dense Jacobian are grouped by the numbers of the degrees of freedom, so that one
-    # block more would change the last digits of the others. (The fault of 4.0.0 in this branch,
-    # #3767, concerns the search direction and not where the search ends; a test watches it.)
-    option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    # A simulation that explodes must say so instead of starting again.
-    # A warm start is accepted or rejected for all islands together, so that bodies that do not
-    # touch would act on each other's last digits. Without it, a step is a function of positions,
-    # velocities and command alone, and what does not touch does exactly nothing.
+    # MuJoCo 4.0.0 factors the Hessian wrongly where the Jacobian is sparse (#3767). The price of a
+    # dense one: its sums are grouped by the numbers of the degrees of freedom, so one block more
+    # changes the last digits of the others. Parameters of what does not touch still do nothing.
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    # A simulation that explodes must say so instead of starting again. A warm start is accepted
+    # or rejected for all islands together, so that bodies that do not touch would act on each
+    # other's last digits; without it, a step is a function of positions, velocities and command
+    # alone, and a parameter of what does not touch does exactly nothing.
     off = mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
     option.disableflags = int(off)
     option.enableflags = 0  # sleeping islands, in particular, cannot be restored exactly
