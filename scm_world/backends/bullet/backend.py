@@ -282,7 +282,7 @@ class BulletBackend(Backend):
         if saved.client is self._spare:
             self._base, self._spare = self._spare, self._base
         if saved.client is self._base:
-            saved.client.load(saved.number)
+            saved.client.load(saved.ticket)
             saved.client.edit(self._before)
             self._lost, self._saved = False, saved
 

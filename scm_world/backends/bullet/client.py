@@ -46,7 +46,8 @@ class Client:
         self._spec: ControllerSpec | None = None
         self._laws: dict[ControlMode, Law] = {}
         self._untouched: list[float] | None = None
-        self._saved: set[int] = set()
+        self._saved: dict[int, int] = {}  # ticket to the engine's number, which it uses again
+        self._tickets = 0
         self._doomed: list[int] = []
         self._close = weakref.finalize(self, _disconnect, engine, self.handle)
 
@@ -195,26 +196,25 @@ class Client:
             raise EngineFailure("Bullet did not take the state that was set", "bullet")
 
     def save(self) -> int:
-        """Keep the engine's own state in this process and return its number."""
+        """Keep the engine's own state in this process and return a ticket for it."""
         self._bury()
-        number: int = self.engine.saveState(physicsClientId=self.handle)
-        self._saved.add(number)
-        return number
+        self._tickets += 1
+        self._saved[self._tickets] = self.engine.saveState(physicsClientId=self.handle)
+        return self._tickets
 
-    def load(self, number: int) -> None:
+    def load(self, ticket: int) -> None:
         """Go back to a state saved in this generation. Parameters are not part of it."""
-        self.engine.restoreState(stateId=number, physicsClientId=self.handle)
+        self.engine.restoreState(stateId=self._saved[ticket], physicsClientId=self.handle)
         self._untouched = None
 
-    def forget(self, number: int) -> None:
+    def forget(self, ticket: int) -> None:
         """Free a saved state, at the next quiet moment: this may run amid an engine call."""
-        self._doomed.append(number)
+        self._doomed.append(ticket)
 
     def _bury(self) -> None:
         while self._doomed:
-            number = self._doomed.pop()
-            if number in self._saved:
-                self._saved.remove(number)
+            number = self._saved.pop(self._doomed.pop(), None)
+            if number is not None:
                 self.engine.removeState(number, physicsClientId=self.handle)
 
 

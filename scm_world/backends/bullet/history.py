@@ -25,8 +25,8 @@ class SavedState:
     def __init__(self, client: Client) -> None:
         self.client = client
         self.generation = client.generation
-        self.number = client.save()
-        weakref.finalize(self, client.forget, self.number).atexit = False
+        self.ticket = client.save()
+        weakref.finalize(self, client.forget, self.ticket).atexit = False
 
     def usable(self) -> bool:
         """Tell whether the client still stands where the state is exact."""

@@ -1,0 +1,261 @@
+"""Facts about declarations, and about the values that are given to them."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from scm_world.errors import (
+    ModelError,
+    NotFinite,
+    OutOfBounds,
+    OutOfSpace,
+    WrongShape,
+    WrongType,
+)
+from scm_world.variables import (
+    Action,
+    Affine,
+    AnyVariable,
+    Box,
+    Categories,
+    Derived,
+    Draw,
+    Either,
+    Exogenous,
+    Fixed,
+    Function,
+    Hard,
+    Integers,
+    Intervention,
+    Linear,
+    Measured,
+    Normal,
+    Parent,
+    Rotations,
+    Scale,
+    Shift,
+    names,
+)
+from scm_world.variables.checks import check_bounds, check_space, coerce
+
+
+def double(x: Any, *, by: Any = 2.0) -> Any:
+    """Multiply."""
+    return by * x
+
+
+VARIABLES = [
+    Exogenous(name="free", bounds=Box(-math.inf, math.inf), doc="Any number."),
+    Exogenous(
+        name="place",
+        unit="m",
+        shape=(3,),
+        a=Box((0.0, 0.0, Affine(parent="free", scale=0.5)), (1.0, math.inf, 0.1)),
+        b=Box(-1.0, 0.0),
+        default=(0.1, 0.2, 0.3),
+        distribution=Normal(0.1, 0.2),
+    ),
+    Exogenous(name="count", dtype="integer", bounds=Integers(0, 9), default=3),
+    Exogenous(name="kind", dtype="categorical", bounds=Categories((1, 20)), default=20),
+    Exogenous(name="turn", shape=(4,), bounds=Rotations(), default=(0.0, 0.0, 0.0, 1.0)),
+    Exogenous(name="gap", distribution=Either(Box(0.0, 1.0), Box(2.0, 3.0)), default=0.5),
+    Exogenous(name="matrix", shape=(2, 2), default=(1.0, 2.0, 3.0, 4.0)),
+    Derived(
+        name="sum",
+        parents=("free", Parent("gap", 1)),
+        mechanism=Linear(weights=(1.0, -0.1), intercept=0.3),
+        noise=Normal(0.0, 0.1),
+        start=0.7,
+    ),
+    Derived(
+        name="twice",
+        parents=("free",),
+        mechanism=Function(double, constants={"by": 3.0}),
+        inverse=double,
+    ),
+    Measured(
+        name="state",
+        parents=(Parent("free", 1, "contact"), Parent("gap", 0, "set")),
+        settable_state=True,
+        start=double,
+        carry=Function(double, constants={"by": (1.0, 2.0)}),
+    ),
+    Measured(name="readout", parents=("free",), mechanism=double),
+    Action(name="action", shape=(9,), bounds=Box(-1.0, 1.0)),
+    Fixed(name="constant", value=(1.0, 2.0), shape=(2,), intervenable=True),
+]
+
+
+@pytest.mark.parametrize("variable", VARIABLES, ids=lambda v: v.name)
+def test_every_kind_of_variable_survives_json(variable: Any) -> None:
+    """Written and read again, a declaration is equal and of the same kind."""
+    adapter: TypeAdapter[Any] = TypeAdapter(AnyVariable)
+    plain = adapter.dump_python(variable, mode="json")
+    again = adapter.validate_python(json.loads(json.dumps(plain)))
+    assert again == variable
+    assert type(again) is type(variable)
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        Hard(0.1),
+        Hard((1.0, 2.0)),
+        Hard(np.array([[1.0, 2.0], [3.0, 4.0]])),
+        Shift(-0.1),
+        Scale([2.0, 3.0]),
+        Draw("A|B"),
+        Draw(Normal(0.1, 0.2)),
+        Draw(Box(0.0, Affine(parent="x"))),
+    ],
+    ids=repr,
+)
+def test_every_intervention_survives_json(act: Any) -> None:
+    """Written and read again, an intervention is equal."""
+    adapter: TypeAdapter[Any] = TypeAdapter(Intervention)
+    assert adapter.validate_json(adapter.dump_json(act)) == act
+
+
+def test_declarations_are_frozen() -> None:
+    """Nothing can be changed, and no field can be misspelled."""
+    with pytest.raises(ValidationError):
+        VARIABLES[0].name = "other"
+    with pytest.raises(ValidationError):
+        Exogenous(name="x", defualt=1.0)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Exogenous(name=""),
+        lambda: Exogenous(name="x", shape=(3,)),
+        lambda: Exogenous(name="x", shape=(3,), default=(1.0, 2.0)),
+        lambda: Exogenous(name="x", dtype="categorical"),
+        lambda: Derived(name="x", parents="parent", mechanism=double),
+        lambda: Derived(name="x", parents=("a", "b"), mechanism=Linear(weights=(1.0,))),
+        lambda: Derived(name="x", parents=("a", "b"), mechanism=double, inverse=double),
+        lambda: Normal(0.0, -1.0),
+        lambda: Categories(()),
+        lambda: Parent("x", 2),
+        lambda: Draw("C"),
+    ],
+)
+def test_a_declaration_that_makes_no_sense_is_refused(make: Any) -> None:
+    """Missing components, wrong numbers of weights and the like are found at once."""
+    with pytest.raises(ValueError):  # noqa: PT011 pydantic words it
+        make()
+
+
+def test_roles_follow_from_the_kind() -> None:
+    """Parameters hold, states are set at an instant, readouts are not set."""
+    roles = {v.name: (v.role, v.settable) for v in VARIABLES}
+    assert roles["free"] == ("parameter", True)
+    assert roles["twice"] == ("parameter", True)
+    assert roles["state"] == ("state", True)
+    assert roles["readout"] == ("readout", False)
+    assert roles["action"] == ("action", True)
+    assert roles["constant"] == ("parameter", True)
+    assert not Fixed(name="fact", value=1.0).settable
+
+
+def test_parents_are_named_by_lag() -> None:
+    """Edges can be asked for by their lag."""
+    parents = (Parent("a"), Parent("b", 1))
+    assert names(parents) == ("a", "b")
+    assert names(parents, lag=1) == ("b",)
+
+
+def test_the_union_of_equal_spaces_is_the_space() -> None:
+    """A|B of a variable with one space, or with two equal ones, is that space."""
+    box = Box(0.0, 1.0)
+    assert Exogenous(name="x", a=box, b=box).space("A|B") == box
+    assert Exogenous(name="x", b=box).space("A|B") == box
+    assert Exogenous(name="x").space("A|B") is None
+
+
+def test_a_lambda_works_and_is_equal_to_itself_only() -> None:
+    """Functions without a name are told apart by identity."""
+    first, second = Function(lambda x: x), Function(lambda x: x)
+    assert first.bind()(3.0) == 3.0
+    assert first == first  # noqa: PLR0124
+    assert first != second
+    assert not first.is_portable()
+    assert Function(double).is_portable()
+
+
+def test_a_name_that_is_no_function_is_an_error() -> None:
+    """A constant of a module cannot be called."""
+    with pytest.raises(ModelError, match="is not a function"):
+        Function("math:pi").resolve()
+
+
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [
+        ("heavy", WrongType),
+        (None, WrongType),
+        (True, WrongType),
+        (1j, WrongType),
+        ({1.0}, WrongType),
+        ([[1.0], [1.0, 2.0]], WrongType),
+        (10**400, WrongType),
+        (Box(0.0, 1.0), WrongType),
+        (1.0, WrongShape),
+        ([1.0, 2.0], WrongShape),
+        ([[1.0, 2.0, 3.0]], WrongShape),
+        ([1.0, 2.0, math.nan], NotFinite),
+        ([1.0, -math.inf, 3.0], NotFinite),
+    ],
+    ids=repr,
+)
+def test_what_is_no_vector_of_numbers_is_refused(value: Any, error: type[Exception]) -> None:
+    """Type, shape and finiteness are told apart."""
+    with pytest.raises(error):
+        coerce(VARIABLES[1], value)
+
+
+@pytest.mark.parametrize("value", [[1, 2, 3], (1.0, 2, 3), np.float32([1, 2, 3])], ids=repr)
+def test_numbers_of_any_kind_are_taken(value: Any) -> None:
+    """Lists, tuples and arrays of any number type become 64-bit floats."""
+    taken = coerce(VARIABLES[1], value)
+    assert taken.dtype == np.float64
+    np.testing.assert_array_equal(taken, [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("value", [2.5, 1e300, 2**60, "2"], ids=repr)
+def test_an_integer_takes_whole_numbers_only(value: Any) -> None:
+    """Halves, and numbers that a file could not hold, are refused; 2.0 is 2."""
+    with pytest.raises(WrongType):
+        coerce(VARIABLES[2], value)
+    assert coerce(VARIABLES[2], 2.0).dtype == np.int64
+
+
+def test_the_nearest_value_inside_the_bounds_is_offered() -> None:
+    """An error about bounds carries what is allowed and what is nearest."""
+    mass = Exogenous(name="mass", unit="kg", bounds=Box(0.1, 2.0))
+    with pytest.raises(OutOfBounds) as caught:
+        check_bounds(mass, np.array(3.0), {})
+    assert (caught.value.variable, caught.value.value, caught.value.nearest) == ("mass", 3.0, 2.0)
+    with pytest.raises(NotFinite):
+        check_bounds(mass, np.array(math.inf), {})
+
+
+@pytest.mark.parametrize("space", ["A", "B", "A|B"])
+def test_a_variable_without_spaces_lies_in_none(space: Any) -> None:
+    """Asking for a space that is not declared is an error, not a pass."""
+    with pytest.raises(OutOfSpace, match="none is declared"):
+        check_space(Exogenous(name="x"), np.array(0.0), space, {})
+
+
+def test_an_error_about_b_offers_a_value_of_b() -> None:
+    """The nearest value of B is one that B accepts, though its border belongs to A."""
+    mass = Exogenous(name="mass", unit="kg", a=Box(0.015, 0.045), b=Box(0.045, 0.1))
+    with pytest.raises(OutOfSpace, match="without A") as caught:
+        check_space(mass, np.array(0.03), "B", {})
+    check_space(mass, np.array(caught.value.nearest), "B", {})
