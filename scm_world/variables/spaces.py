@@ -233,6 +233,9 @@ class Categories(_Space):
         return "{" + ", ".join(map(str, self.members)) + "}"
 
 
+_Part = Annotated[Box | Integers | Categories, Field(discriminator="kind")]
+
+
 @final
 class Either(_Space):
     """The union of two spaces: not their hull. A draw is uniform over both.
@@ -244,8 +247,8 @@ class Either(_Space):
     """
 
     kind: Literal["either"] = "either"
-    first: Box | Integers | Categories
-    second: Box | Integers | Categories
+    first: _Part
+    second: _Part
 
     def __init__(self, first: Any, second: Any, **fields: Any) -> None:
         super().__init__(first=first, second=second, **fields)  # type: ignore[call-arg]

@@ -69,9 +69,7 @@ def test_the_global_generator_plays_no_part() -> None:
 def test_other_keys_give_independent_noise(first: dict, second: dict) -> None:
     """Streams of other variables, seeds, episodes and steps are not correlated."""
 
-    def stream(
-        seed: int = 0, variable: str = "x", episode: int = 0, step: int = 0
-    ) -> np.ndarray:
+    def stream(seed: int = 0, variable: str = "x", episode: int = 0, step: int = 0) -> np.ndarray:
         return Noise(seed).uniforms(variable, n=4, episode=episode, step=step, count=2_000)
 
     a, b = stream(**first).ravel(), stream(**second).ravel()

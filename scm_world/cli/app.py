@@ -1,0 +1,164 @@
+"""The commands and their options. What they do is loaded when they are called."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from scm_world.errors import ScmWorldError
+
+
+class Commands(TyperGroup):
+    """All commands: what this package raises on purpose becomes one line and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        from scm_world.cli.console import fail
+
+        try:
+            return super().invoke(ctx)
+        except ScmWorldError as error:
+            fail(str(error))
+            raise typer.Exit(2) from None
+        except BrokenPipeError:  # the reader has seen enough
+            raise
+        except OSError as error:
+            fail(f"{error.strerror}: {error.filename}")
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            fail("interrupted before there was a result")
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=Commands,
+    name="scm-world",
+    help="A block-building robot, written down as a structural causal model.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+class Format(StrEnum):
+    """How a graph is written down."""
+
+    TABLE = "table"
+    DOT = "dot"
+    JSON = "json"
+    PNG = "png"
+
+
+Task = Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.")]
+Backend = Annotated[str, typer.Option(help="Physics engine: mujoco, bullet or fake.")]
+Preset = Annotated[str, typer.Option(help="Numerical settings: fast or precise.")]
+Seed = Annotated[int, typer.Option(min=0, help="Of every random choice.")]
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Folder for the results.", show_default="under scm-world-results"),
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from scm_world import __version__
+
+        typer.echo(f"scm-world {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
+    ] = False,
+) -> None:
+    """A block-building robot, written down as a structural causal model."""
+
+
+@app.command()
+def discover(
+    task: Task,
+    backend: Backend = "mujoco",
+    probes: Annotated[int, typer.Option(min=1, help="How many states to experiment in.")] = 32,
+    seed: Seed = 0,
+    preset: Preset = "fast",
+    out: Out = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if the SHD is not 0.")] = False,
+) -> None:
+    """Recover the causal graph of a task by experiments, and score it.
+
+    Ctrl-C gives the result so far (exit code 130).
+    """
+    from scm_world.cli.discovery import Options, run
+
+    options = Options(task, backend, preset, probes, seed)
+    raise typer.Exit(run(options, out=out, strict=strict))
+
+
+@app.command()
+def graph(
+    task: Task,
+    format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.TABLE,
+    out: Annotated[Path | None, typer.Option(help="File to write to.")] = None,
+    action_mode: Annotated[
+        str,
+        typer.Option(help="joint_positions, joint_torques or end_effector_positions."),
+    ] = "joint_positions",
+) -> None:
+    """Show the declared causal graph of a task."""
+    from scm_world.cli.graphs import run
+
+    run(task, format_.value, out, action_mode)
+
+
+@app.command()
+def do(
+    task: Task,
+    assignments: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="NAME=VALUE...",
+            help="A number, a list 1,2,3 or [1,2,3], shift:0.1, scale:2, or draw:A.",
+        ),
+    ],
+    backend: Backend = "mujoco",
+    steps: Annotated[int, typer.Option(min=0, help="Control steps to run afterwards.")] = 25,
+    seed: Seed = 0,
+    preset: Preset = "fast",
+    space: Annotated[
+        str | None, typer.Option(help="Refuse values outside this space: A, B or 'A|B'.")
+    ] = None,
+    show_all: Annotated[
+        bool, typer.Option("--all", help="Show descendants that did not move, too.")
+    ] = False,
+    out: Out = None,
+) -> None:
+    """Intervene on a task and show what followed, beside the same world left alone."""
+    from scm_world.cli.intervene import Options, run
+
+    options = Options(task, backend, preset, seed, steps, space)
+    raise typer.Exit(run(assignments, options, show_all=show_all, out=out))
+
+
+@app.command(name="list")
+def list_() -> None:
+    """List tasks, engines, presets, conventions and environments."""
+    from scm_world.cli.listing import run
+
+    run()
+
+
+def main() -> None:
+    """Run the command line."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError):
+            stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+    app()

@@ -1,0 +1,449 @@
+"""Facts about structural causal models: built, mutilated, solved, sampled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scm_world.errors import (
+    ConflictingTargets,
+    ModelError,
+    NotFinite,
+    NotIntervenable,
+    OutOfBounds,
+    SeveralProblems,
+    UnknownVariable,
+    WrongShape,
+    WrongType,
+)
+from scm_world.graph import SCM, Edge, Moment, flatten
+from scm_world.variables import (
+    Affine,
+    Box,
+    Derived,
+    Draw,
+    Exogenous,
+    Fixed,
+    Hard,
+    Integers,
+    Linear,
+    Measured,
+    Noise,
+    Normal,
+    Parent,
+    Scale,
+    Shift,
+)
+
+
+def plus_one(x: Any) -> Any:
+    """Add one."""
+    return x + 1.0
+
+
+def minus_one(x: Any) -> Any:
+    """Take one away."""
+    return x - 1.0
+
+
+def small() -> SCM:
+    """Build a model with every kind of static variable: cause, effect, coordinates, readout."""
+    return SCM(
+        [
+            Exogenous(
+                name="block.mass",
+                unit="kg",
+                default=0.02,
+                bounds=Box(0.0, 2.0),
+                a=Box(0.01, 0.05),
+                b=Box(0.05, 0.1),
+                distribution=Box(0.01, 0.03),
+            ),
+            Exogenous(name="friction", default=0.5, distribution=Normal(0.5, 0.1)),
+            Exogenous(name="count", dtype="integer", bounds=Integers(0, 9), default=3),
+            Derived(
+                name="weight",
+                unit="N",
+                parents=("block.mass",),
+                mechanism=Linear(weights=(10.0,)),
+                a=Box(0.0, Affine(parent="friction")),
+            ),
+            Derived(
+                name="drag",
+                parents=("weight", "friction"),
+                mechanism=Linear(weights=(1.0, 2.0)),
+                noise=Normal(0.0, 0.01),
+            ),
+            Derived(
+                name="friction_plus",
+                parents=("friction",),
+                mechanism=plus_one,
+                inverse=minus_one,
+                a=Box(1.2, 1.4),
+            ),
+            Measured(name="readout", parents=("drag",), mechanism=plus_one),
+            Fixed(name="kind", value=7.0),
+        ]
+    )
+
+
+# --- building ------------------------------------------------------------------------------------
+
+
+def test_all_faults_of_a_model_are_reported_together() -> None:
+    """Duplicates, unknown parents and every cycle come in one error, with the nearest names."""
+    copy = Linear(weights=(1.0,))
+    with pytest.raises(ModelError) as caught:
+        SCM(
+            [
+                Exogenous(name="mass"),
+                Exogenous(name="mass"),
+                Derived(name="weight", parents=("maas",), mechanism=copy),
+                Derived(name="p", parents=("q",), mechanism=copy),
+                Derived(name="q", parents=("p",), mechanism=copy),
+                Derived(name="self", parents=("self",), mechanism=copy),
+                Derived(name="dup", parents=("p", "p"), mechanism=Linear(weights=(1.0, 2.0))),
+                Exogenous(name="place", a=Box(0.0, Affine(parent="siez"))),
+                Derived(
+                    name="noisy",
+                    parents=("mass",),
+                    mechanism=copy,
+                    noise=Box(0.0, Affine(parent="mass")),
+                ),
+            ]
+        )
+    text = "\n".join(caught.value.problems)
+    assert len(caught.value.problems) == 7
+    for fault in (
+        "'mass' is declared twice",
+        "unknown parent 'maas'; did you mean 'mass'?",
+        "p → q → p",
+        "self → self",
+        "names the parent 'p' twice with lag 0",
+        "space A of 'place' depends on the unknown variable 'siez'",
+        "the noise of 'noisy' depends on a variable",
+    ):
+        assert fault in text or fault.replace("p → q → p", "q → p → q") in text
+
+
+def test_a_cycle_through_time_is_no_cycle() -> None:
+    """Lagged edges may lead back."""
+    copy = Linear(weights=(0.5,))
+    model = SCM(
+        [
+            Derived(name="x", parents=(Parent("y", 1),), mechanism=copy),
+            Derived(name="y", parents=("x",), mechanism=copy),
+        ]
+    )
+    assert model.descendants("x") == {"x", "y"}
+
+
+def test_the_structure_can_be_asked_for() -> None:
+    """Parents, children, ancestors and descendants are those of the declarations."""
+    model = small()
+    assert model.parents("drag") == ("weight", "friction")
+    assert model.children("friction") == ("drag", "friction_plus")
+    assert model.ancestors("readout") == {"drag", "weight", "friction", "block.mass"}
+    assert model.descendants("block.mass") == {"weight", "drag", "readout"}
+    assert Edge("block.mass", "weight") in model.edges
+    with pytest.raises(UnknownVariable, match="did you mean 'friction'"):
+        model.parents("fricton")
+
+
+def test_a_model_behaves_like_a_mapping_of_names() -> None:
+    """Length, membership, iteration, items and the text."""
+    model = small()
+    assert len(model) == 8
+    assert "drag" in model
+    assert "nothing" not in model
+    assert next(iter(model)) == "block.mass"
+    assert model["drag"] == model.declared("drag")
+    assert repr(model.do({"friction": 0.1})) == "SCM(8 variables, do(friction))"
+    assert model != "a model"
+
+
+# --- do -------------------------------------------------------------------------------------------
+
+
+def test_do_is_pure() -> None:
+    """The first model is as it was, edges, values and all."""
+    model = small()
+    before, values = model.edges, model.solve()
+    other = model.do({"weight": 3.0})
+    assert other is not model
+    assert model == small()
+    assert model.edges == before
+    assert model.solve() == values
+    assert other != model
+
+
+def test_a_hard_intervention_cuts_the_edges_into_its_target() -> None:
+    """The node becomes a constant; its effects stay, its causes are gone."""
+    model = small().do({"weight": 3.0})
+    assert model.parents("weight") == ()
+    assert model.children("weight") == ("drag",)
+    weight = model["weight"]
+    assert isinstance(weight, Fixed)
+    assert (weight.value, weight.unit) == (3.0, "N")
+    assert model.do({"block.mass": 1.0}).solve()["drag"] == 3.0 + 2.0 * 0.5
+
+
+def test_a_draw_cuts_the_edges_into_its_target() -> None:
+    """The node becomes a root with a distribution."""
+    model = small().do({"weight": Draw(Normal(1.0, 0.1))})
+    assert model.parents("weight") == ()
+    assert isinstance(model["weight"], Exogenous)
+    values = model.sample(4_000, seed=0)
+    assert values["weight"].mean() == pytest.approx(1.0, abs=0.01)
+    assert abs(np.corrcoef(values["weight"], values["block.mass"])[0, 1]) < 0.05
+
+
+@pytest.mark.parametrize(("act", "expected"), [(Shift(1.0), 1.2), (Scale(3.0), 0.6)], ids=repr)
+def test_shift_and_scale_keep_the_edges(act: Any, expected: float) -> None:
+    """The parents go on mattering."""
+    model = small().do({"weight": act})
+    assert model.parents("weight") == ("block.mass",)
+    assert model.solve()["weight"] == pytest.approx(expected)
+    heavier = model.do({"block.mass": 0.04}).solve()["weight"]
+    assert heavier == pytest.approx(expected + (0.2 if isinstance(act, Shift) else 0.6))
+
+
+def test_a_draw_from_a_space_that_follows_a_variable_adds_the_edge() -> None:
+    """What bounds the draw is a parent of what is drawn, and is computed first."""
+    model = small().do({"weight": Draw("A")})
+    assert model.parents("weight") == ("friction",)
+    values = model.sample(500, seed=1)
+    assert (values["weight"] <= values["friction"]).all()
+    fixed = model.do({"friction": 0.001}).sample(100, seed=1)
+    assert (fixed["weight"] <= 0.001).all()
+
+
+def test_a_draw_that_would_depend_on_itself_is_refused_at_once() -> None:
+    """Bounds that follow an effect of the target close a cycle."""
+    with pytest.raises(ModelError, match="cycle"):
+        small().do({"block.mass": Draw(Box(0.0, Affine(parent="weight")))})
+    with pytest.raises(UnknownVariable):
+        small().do({"block.mass": Draw(Box(0.0, Affine(parent="wieght")))})
+
+
+def test_coordinates_set_the_quantity_itself() -> None:
+    """An intervention on coordinates is one on their parent, through the inverse."""
+    model = small().do({"friction_plus": 1.3})
+    assert model.target("friction_plus") == "friction"
+    assert model.interventions == {"friction_plus": Hard(1.3)}
+    values = model.solve()
+    assert values["friction"] == pytest.approx(0.3)
+    assert values["friction_plus"] == pytest.approx(1.3)
+    assert model.parents("friction_plus") == ("friction",)
+    assert isinstance(model["friction"], Fixed)
+
+
+@pytest.mark.parametrize(
+    ("act", "expected"), [(Shift(0.1), 0.6), (Scale(2.0), 2.0), (Draw("A"), None)], ids=repr
+)
+def test_soft_interventions_in_coordinates_happen_there(act: Any, expected: float | None) -> None:
+    """Twice 1.5 is 3, which is 2 in the other coordinates."""
+    model = small().do({"friction_plus": act})
+    value = model.solve(moment=Moment(Noise(0)), known={"friction": np.asarray(0.5)})["friction"]
+    if expected is None:
+        assert 0.2 <= value <= 0.4
+    else:
+        assert value == pytest.approx(expected)
+
+
+def test_a_later_do_in_other_coordinates_takes_the_place_of_an_earlier_one() -> None:
+    """One quantity has one intervention, whatever it is called."""
+    model = small().do({"friction_plus": 1.3}).do({"friction": 0.9})
+    assert model == small().do({"friction": 0.9})
+    assert model.do({"friction_plus": 1.1}).solve()["friction"] == pytest.approx(0.1)
+
+
+def test_two_names_of_one_quantity_conflict() -> None:
+    """A quantity cannot be set twice in one do, in two coordinates or in two spellings."""
+    with pytest.raises(ConflictingTargets) as caught:
+        small().do({"friction": 0.1, "friction_plus": 1.3})
+    assert caught.value.names == ("friction", "friction_plus")
+    with pytest.raises(ConflictingTargets):
+        small().do({"block": {"mass": 0.1}, "block.mass": 0.2})
+
+
+def test_nested_requests_are_dotted_ones() -> None:
+    """A dictionary of dictionaries means the same."""
+    nested, dotted = {"block": {"mass": 0.1}}, {"block.mass": 0.1}
+    assert flatten(nested) == dotted
+    assert small().do(nested) == small().do(dotted)
+
+
+@pytest.mark.parametrize(
+    ("request_", "error"),
+    [
+        ({"wieght": 1.0}, UnknownVariable),
+        ({5: 1.0}, UnknownVariable),
+        ({"block.mass": "x"}, WrongType),
+        ({"block.mass": [1.0]}, WrongShape),
+        ({"block.mass": Shift([1.0])}, WrongShape),
+        ({"block.mass": float("nan")}, NotFinite),
+        ({"block.mass": Scale(float("inf"))}, NotFinite),
+        ({"block.mass": 3.0}, OutOfBounds),
+        ({"count": 0.5}, WrongType),
+        ({"readout": 1.0}, NotIntervenable),
+        ({"kind": 1.0}, NotIntervenable),
+        ({"friction": Draw("A")}, NotIntervenable),
+    ],
+    ids=repr,
+)
+def test_what_cannot_be_done_is_refused(request_: Any, error: type[Exception]) -> None:
+    """Each fault has its own error."""
+    with pytest.raises(error):
+        small().do(request_)
+
+
+def test_all_faults_of_a_do_are_reported_together() -> None:
+    """The order is that of the request."""
+    with pytest.raises(SeveralProblems) as caught:
+        small().do({"wieght": 1.0, "readout": 2.0, "block.mass": -1.0, "friction": 0.1})
+    kinds = [type(problem) for problem in caught.value.problems]
+    assert kinds == [UnknownVariable, NotIntervenable, OutOfBounds]
+
+
+def test_the_causes_of_a_readout_are_those_that_can_be_set() -> None:
+    """The error about a readout leads to the nearest settable causes."""
+    with pytest.raises(NotIntervenable) as caught:
+        small().do({"readout": 1.0})
+    assert caught.value.causes == ("drag",)
+
+
+def test_a_readout_can_be_held_in_the_model() -> None:
+    """No experiment can do it; in the model it isolates a direct effect."""
+    assert small().hold({"readout": 1.0}).solve()["readout"] == 1.0
+
+
+def test_matrices_can_be_set() -> None:
+    """A variable of two axes takes a matrix, in a do and from another model."""
+    model = SCM([Exogenous(name="m", shape=(2, 2), default=(0.0,) * 4)])
+    held = model.do({"m": [[1.0, 2.0], [3.0, 4.0]]})
+    assert held.solve()["m"].tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert model.do(held.interventions) == held
+
+
+ACTS = st.one_of(
+    st.floats(0.0, 2.0),
+    st.floats(-0.1, 0.1).map(Shift),
+    st.floats(0.5, 2.0).map(Scale),
+    st.sampled_from([Draw(Normal(0.1, 0.01)), Draw(Box(0.0, 1.0)), Hard(0.2)]),
+)
+REQUESTS = st.dictionaries(st.sampled_from(["block.mass", "friction", "weight", "drag"]), ACTS)
+
+
+@settings(max_examples=60, deadline=None)
+@given(a=REQUESTS, b=REQUESTS)
+def test_two_dos_are_one(a: dict[str, Any], b: dict[str, Any]) -> None:
+    """do(a).do(b) is do of both with b on top: the model, its edges and its samples."""
+    split, joint = small().do(a).do(b), small().do({**a, **b})
+    assert split == joint
+    assert set(split.edges) == set(joint.edges)
+    one, other = split.sample(3, seed=0), joint.sample(3, seed=0)
+    assert all(np.array_equal(one[name], other[name]) for name in small())
+
+
+@settings(max_examples=40, deadline=None)
+@given(a=REQUESTS)
+def test_do_moves_descendants_only(a: dict[str, Any]) -> None:
+    """With the same noise everything else keeps its value, bit for bit."""
+    model = small()
+    moved = {d for name in a for d in model.descendants(name)} | set(a)
+    before, after = model.sample(5, seed=3), model.do(a).sample(5, seed=3)
+    for name in set(model) - moved:
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+# --- solving and sampling --------------------------------------------------------------------------
+
+
+def test_solve_without_a_moment_is_without_noise() -> None:
+    """Defaults stand for draws, zeros for noise."""
+    values = small().solve()
+    assert float(values["drag"]) == pytest.approx(0.2 + 1.0)
+    assert values["count"].dtype == np.int64
+
+
+def test_solve_takes_batches() -> None:
+    """Leading axes broadcast."""
+    masses = np.linspace(0.0, 1.0, 12).reshape(4, 3)
+    values = small().solve({"block.mass": masses})
+    np.testing.assert_allclose(values["drag"], 10.0 * masses + 1.0)
+
+
+def test_solve_needs_what_the_model_does_not_compute() -> None:
+    """A state has no mechanism here, so its value has to be given."""
+    model = SCM([Measured(name="pose", settable_state=True), Exogenous(name="size", default=1.0)])
+    with pytest.raises(ModelError, match="give its value"):
+        model.solve()
+    assert model.solve({"pose": np.array(2.0)})["pose"] == 2.0
+
+
+def test_a_draw_needs_a_moment() -> None:
+    """Without one there is no noise to draw from."""
+    with pytest.raises(ModelError, match="moment"):
+        small().do({"weight": Draw(Normal())}).solve()
+
+
+@pytest.mark.parametrize(
+    "act", [{}, {"weight": Draw("A")}, {"block.mass": Draw("A|B")}, {"drag": Shift(1.0)}], ids=repr
+)
+def test_a_row_of_a_sample_can_be_drawn_alone(act: dict[str, Any]) -> None:
+    """sample(1, first=i) is row i: results do not depend on how many are drawn."""
+    model = small().do(act)
+    rows = model.sample(20, seed=9)
+    for i in (0, 7, 19):
+        alone = model.sample(1, seed=9, first=i)
+        for name in model:
+            np.testing.assert_array_equal(alone[name][0], rows[name][i])
+
+
+def lagged() -> SCM:
+    """Build a process with memory."""
+    return SCM(
+        [
+            Exogenous(name="push", distribution=Normal(0.0, 1.0)),
+            Derived(
+                name="x",
+                parents=(Parent("x", 1), "push"),
+                mechanism=Linear(weights=(0.5, 1.0)),
+                noise=Normal(0.0, 0.1),
+                start=8.0,
+            ),
+            Derived(name="y", parents=(Parent("x", 1),), mechanism=Linear(weights=(2.0,))),
+        ]
+    )
+
+
+def test_a_process_is_sampled_step_by_step() -> None:
+    """Lagged parents are those of the step before, and the declared start before the first."""
+    values = lagged().sample(50, seed=0, steps=6)
+    assert values["x"].shape == (50, 6)
+    np.testing.assert_array_equal(values["y"][:, 1:], 2.0 * values["x"][:, :-1])
+    np.testing.assert_array_equal(values["y"][:, 0], 16.0)
+    residual = values["x"][:, 1:] - 0.5 * values["x"][:, :-1] - values["push"][:, 1:]
+    assert residual.std() == pytest.approx(0.1, abs=0.02)
+    with pytest.raises(ModelError, match="how many steps"):
+        lagged().sample(2, seed=0)
+
+
+def test_longer_processes_begin_like_shorter_ones() -> None:
+    """Neither the number of steps nor that of episodes shifts the noise."""
+    short, long = lagged().sample(2, seed=0, steps=3), lagged().sample(5, seed=0, steps=9)
+    for name in lagged():
+        np.testing.assert_array_equal(short[name], long[name][:2, :3])
+
+
+def test_do_on_a_process_does_not_shift_its_noise() -> None:
+    """What does not follow the target keeps its value at every step."""
+    before = lagged().sample(4, seed=0, steps=5)
+    after = lagged().do({"x": 0.0}).sample(4, seed=0, steps=5)
+    np.testing.assert_array_equal(before["push"], after["push"])
+    np.testing.assert_array_equal(after["y"][:, 1:], np.zeros((4, 4)))

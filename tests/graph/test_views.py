@@ -1,0 +1,134 @@
+"""Facts about graphs of models: views through time and d-separation."""
+
+from __future__ import annotations
+
+import networkx as nx
+import pytest
+
+from scm_world.errors import UnknownVariable
+from scm_world.graph import SCM, contemporaneous, d_separated, summary, two_slice
+from scm_world.variables import Derived, Exogenous, Linear, Measured, Parent
+
+
+def graph(*edges: str) -> SCM:
+    """Build a linear model from edges such as ``"a>b"``; ``"a-1>b"`` has a lag."""
+    parents: dict[str, list[Parent]] = {}
+    for edge in edges:
+        cause, effect = edge.split(">")
+        name, _, lag = cause.partition("-")
+        parents.setdefault(name, [])
+        parents.setdefault(effect, []).append(Parent(name, int(lag or 0)))
+    return SCM(
+        [
+            Derived(name=name, parents=tuple(p), mechanism=Linear(weights=(1.0,) * len(p)))
+            if p
+            else Exogenous(name=name)
+            for name, p in parents.items()
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("edges", "x", "y", "given", "separated"),
+    [
+        (("a>b", "b>c"), "a", "c", (), False),
+        (("a>b", "b>c"), "a", "c", "b", True),
+        (("b>a", "b>c"), "a", "c", (), False),
+        (("b>a", "b>c"), "a", "c", "b", True),
+        (("a>b", "c>b"), "a", "c", (), True),
+        (("a>b", "c>b"), "a", "c", "b", False),
+        (("a>b", "c>b", "b>d"), "a", "c", "d", False),
+        (("a>b", "c>b", "b>d"), "a", "c", "bd", False),
+        # M-bias: adjusting for the collider m opens a path between treatment and outcome.
+        (("u>t", "u>m", "v>m", "v>o"), "t", "o", (), True),
+        (("u>t", "u>m", "v>m", "v>o"), "t", "o", "m", False),
+        (("u>t", "u>m", "v>m", "v>o"), "t", "o", "mv", True),
+    ],
+)
+def test_d_separation_of_known_graphs(
+    edges: tuple[str, ...], x: str, y: str, given: str, separated: bool
+) -> None:
+    """Chains and forks are blocked by their middle, colliders are opened by it."""
+    assert d_separated(graph(*edges), x, y, list(given)) is separated
+
+
+def test_d_separation_through_time() -> None:
+    """Plain names mean now, pairs the step before."""
+    process = graph("x-1>x", "x-1>y", "y-1>y")
+    assert not d_separated(process, ["x"], ["y"])
+    assert d_separated(process, ["x"], ["y"], [("x", -1), ("y", -1)])
+    assert not d_separated(process, [("x", -1)], ["y"], [("y", -1)])
+
+
+def test_d_separation_after_do_is_that_of_the_mutilated_graph() -> None:
+    """A cut variable no longer carries what its causes say."""
+    chain = graph("a>b", "b>c")
+    assert not d_separated(chain, ["a"], ["c"])
+    assert d_separated(chain.do({"b": 1.0}), ["a"], ["c"])
+
+
+def test_a_node_that_does_not_exist_is_an_error() -> None:
+    """Misspelt names are suggested, slices that are not drawn refused."""
+    with pytest.raises(UnknownVariable, match="did you mean 'abc'"):
+        d_separated(SCM([Exogenous(name="abc"), Exogenous(name="x")]), ["x"], ["abd"])
+    with pytest.raises(UnknownVariable):
+        d_separated(graph("x-1>x"), [("x", -2)], ["x"])
+
+
+def conditional() -> SCM:
+    """Build a model with conditions and parallel edges."""
+    return SCM(
+        [
+            Exogenous(name="size", unit="m"),
+            Derived(name="half", parents=("size",), mechanism=Linear(weights=(0.5,))),
+            Measured(
+                name="pose",
+                parents=(
+                    Parent("pose", 1),
+                    Parent("size", 1, "contact"),
+                    Parent("size", 0, "set"),
+                ),
+                settable_state=True,
+            ),
+            Measured(name="far", parents=("pose",), mechanism=Linear(weights=(1.0,))),
+        ]
+    )
+
+
+def test_the_summary_has_one_edge_per_pair() -> None:
+    """It says with which lags, and under which conditions."""
+    view = summary(conditional())
+    assert view.edges["size", "pose"] == {"lags": (0, 1), "when": "contact or set"}
+    assert view.edges["pose", "pose"] == {"lags": (1,), "when": None}
+    assert view.nodes["size"] == {"kind": "exogenous", "unit": "m", "role": "parameter"}
+    assert view.nodes["pose"]["role"] == "state"
+
+
+def test_two_slices_are_a_directed_acyclic_graph() -> None:
+    """Edges within an instant appear twice, lagged ones once; parameters persist."""
+    view = two_slice(conditional())
+    assert nx.is_directed_acyclic_graph(view)
+    assert set(view.edges) == {
+        (("size", -1), ("half", -1)),
+        (("size", 0), ("half", 0)),
+        (("size", -1), ("pose", -1)),
+        (("size", 0), ("pose", 0)),
+        (("pose", -1), ("far", -1)),
+        (("pose", 0), ("far", 0)),
+        (("pose", -1), ("pose", 0)),
+        (("size", -1), ("pose", 0)),
+        (("size", -1), ("size", 0)),
+    }
+    assert view.edges[("size", -1), ("size", 0)]["persists"]
+
+
+def test_the_graph_of_an_instant_has_no_lagged_edges() -> None:
+    """Only what acts at once is drawn, and it has no cycle."""
+    view = contemporaneous(conditional())
+    assert nx.is_directed_acyclic_graph(view)
+    assert set(view.edges) == {("size", "half"), ("size", "pose"), ("pose", "far")}
+
+
+def test_views_of_a_mutilated_model_are_mutilated() -> None:
+    """What do has cut is not drawn."""
+    assert ("size", "half") not in summary(conditional().do({"half": 0.1})).edges

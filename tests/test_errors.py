@@ -1,0 +1,225 @@
+"""Facts about errors: what they say, what they carry, and that they travel."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pickle
+from typing import Any
+
+import pytest
+
+from scm_world import errors
+from scm_world.errors import (
+    ActionError,
+    ConflictingTargets,
+    EngineError,
+    EngineFailure,
+    Infeasible,
+    InterventionError,
+    MissingEngine,
+    MixedInstallation,
+    ModelError,
+    NotFinite,
+    NotIntervenable,
+    NotReset,
+    OutOfBounds,
+    OutOfSpace,
+    ScmWorldError,
+    SeveralProblems,
+    SnapshotMismatch,
+    UnknownOption,
+    UnknownVariable,
+    WrongShape,
+    WrongType,
+    nearest,
+    raise_all,
+)
+
+CLASSES = [
+    c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, ScmWorldError)
+]
+
+EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
+    (
+        UnknownVariable("tool_blok.mass", ["floor_friction", "tool_block.mass"]),
+        "no variable is named 'tool_blok.mass'; did you mean 'tool_block.mass'?",
+        {"variable": "tool_blok.mass", "suggestion": "tool_block.mass"},
+    ),
+    (
+        UnknownVariable("zzz", ["tool_block.mass"]),
+        "no variable is named 'zzz'",
+        {"suggestion": None},
+    ),
+    (
+        NotIntervenable("tool_block.speed", "is measured, not set", ["tool_block.mass"]),
+        "'tool_block.speed' is measured, not set; intervene on a cause of it instead: "
+        "tool_block.mass",
+        {"variable": "tool_block.speed", "causes": ("tool_block.mass",)},
+    ),
+    (
+        WrongShape("block.size", 0.1, (3,), ()),
+        "do(block.size): expected shape (3,), got ()",
+        {"variable": "block.size", "value": 0.1, "expected": (3,), "actual": ()},
+    ),
+    (
+        WrongType("m", "x", "numbers"),
+        "do(m): expected numbers, got 'x' of type str",
+        {"value": "x", "expected": "numbers"},
+    ),
+    (
+        NotFinite("m", float("inf")),
+        "do(m): every number must be finite, got inf",
+        {"variable": "m", "value": float("inf")},
+    ),
+    (
+        OutOfBounds("m", 3.0, allowed="[0, 2]", nearest=2.0, unit="kg"),
+        "do(m): 3.0 is outside [0, 2] [kg]; the nearest allowed value is 2.0",
+        {"variable": "m", "value": 3.0, "allowed": "[0, 2]", "nearest": 2.0},
+    ),
+    (
+        OutOfBounds("mu", 3.0, allowed="[0, 2]", nearest=2.0, unit="1"),
+        "do(mu): 3.0 is outside [0, 2]; the nearest allowed value is 2.0",
+        {},
+    ),
+    (
+        OutOfSpace("m", 3.0, space="B", allowed="[1, 2]", nearest=2.0, unit="kg"),
+        "do(m): 3.0 is outside space B = [1, 2] [kg]; the nearest allowed value is 2.0",
+        {"space": "B", "allowed": "space B = [1, 2]", "nearest": 2.0},
+    ),
+    (
+        ConflictingTargets(("p", "q"), "p"),
+        "'p' and 'q' both set 'p'; give one of them",
+        {"variable": "p", "names": ("p", "q")},
+    ),
+    (
+        Infeasible("p", [0.0], ["'a' lies 3 mm deep in 'b'"], [1.0]),
+        "do(p): [0.0] is not feasible: 'a' lies 3 mm deep in 'b'; the nearest feasible value is "
+        "[1.0]",
+        {"problems": ("'a' lies 3 mm deep in 'b'",), "nearest": [1.0]},
+    ),
+    (
+        SeveralProblems([UnknownVariable("x", []), NotFinite("m", 1.0)]),
+        "2 problems, nothing was changed:\n"
+        "  - no variable is named 'x'\n"
+        "  - do(m): every number must be finite, got 1.0",
+        {"variable": "x"},
+    ),
+    (
+        ModelError(["one", "two"]),
+        "the model has 2 problem(s):\n  - one\n  - two",
+        {"problems": ("one", "two")},
+    ),
+    (ActionError("an action is 9 numbers", 3), "an action is 9 numbers", {"action": 3}),
+    (NotReset(), "the world has no episode yet; call reset() first", {}),
+    (
+        UnknownOption("task", "pushin", ["reaching", "pushing"]),
+        "no task is named 'pushin'; did you mean 'pushing'?; there are: reaching, pushing",
+        {"option": "task", "value": "pushin", "choices": ("reaching", "pushing")},
+    ),
+    (
+        MissingEngine("bullet", "pip install pybullet", "no wheel"),
+        "the bullet engine is not installed (no wheel); try: pip install pybullet",
+        {"engine": "bullet", "install": "pip install pybullet"},
+    ),
+    (
+        MixedInstallation("mujoco", {"mujoco": "3.2", "mujoco-core": "4.0"}, "pip install x"),
+        "the mujoco installation mixes versions (mujoco 3.2, mujoco-core 4.0); repair it with: "
+        "pip install x",
+        {"versions": {"mujoco": "3.2", "mujoco-core": "4.0"}, "repair": "pip install x"},
+    ),
+    (EngineFailure("lost", "fake"), "lost", {"engine": "fake"}),
+    (SnapshotMismatch("another scene"), "another scene", {}),
+]
+
+
+def identify(value: Any) -> str | None:
+    """Name an example by its class."""
+    return type(value).__name__ if isinstance(value, ScmWorldError) else None
+
+
+@pytest.mark.parametrize(("error", "message", "data"), EXAMPLES, ids=identify)
+def test_errors_say_what_was_given_and_what_is_allowed(
+    error: ScmWorldError, message: str, data: dict[str, Any]
+) -> None:
+    """The message is as promised, and the data are attributes."""
+    assert str(error) == message
+    assert {name: getattr(error, name) for name in data} == data
+
+
+@pytest.mark.parametrize(("error", "message", "data"), EXAMPLES, ids=identify)
+@pytest.mark.parametrize("travel", [lambda e: pickle.loads(pickle.dumps(e)), copy.copy])  # noqa: S301
+def test_errors_travel_between_processes(
+    error: ScmWorldError, message: str, data: dict[str, Any], travel: Any
+) -> None:
+    """An error that was pickled says and carries the same."""
+    again = travel(error)
+    assert type(again) is type(error)
+    assert str(again) == message
+    assert {name: getattr(again, name) for name in data} == data
+
+
+def test_several_problems_travel_with_their_parts() -> None:
+    """Each problem keeps its own data."""
+    parts = [WrongShape("block.size", 0.1, (3,), ()), UnknownVariable("x", ["y"])]
+    again = pickle.loads(pickle.dumps(SeveralProblems(parts)))  # noqa: S301
+    assert [type(p) for p in again.problems] == [WrongShape, UnknownVariable]
+    assert again.problems[0].expected == (3,)
+
+
+def test_every_error_is_shown_here() -> None:
+    """A new class needs an example above."""
+    abstract = {ScmWorldError, InterventionError, EngineError, errors._Outside}
+    assert {type(error) for error, _, _ in EXAMPLES} == set(CLASSES) - abstract
+
+
+@pytest.mark.parametrize("kind", CLASSES, ids=lambda c: c.__name__)
+def test_every_error_is_documented_and_exported(kind: type[ScmWorldError]) -> None:
+    """It is drawn in the tree of the module, listed in __all__, and has a docstring."""
+    assert kind.__doc__
+    if not kind.__name__.startswith("_"):
+        assert kind.__name__ in errors.__all__
+        assert kind.__name__ in (errors.__doc__ or "")
+
+
+def test_all_is_honest() -> None:
+    """Every listed name exists."""
+    assert len(set(errors.__all__)) == len(errors.__all__)
+    assert all(hasattr(errors, name) for name in errors.__all__)
+
+
+@pytest.mark.parametrize(
+    ("kind", "builtin"),
+    [
+        (InterventionError, ValueError),
+        (ModelError, ValueError),
+        (ActionError, ValueError),
+        (UnknownOption, ValueError),
+        (NotReset, RuntimeError),
+        (EngineError, RuntimeError),
+        (MissingEngine, ImportError),
+    ],
+)
+def test_errors_are_what_python_would_call_them(
+    kind: type[Exception], builtin: type[Exception]
+) -> None:
+    """Code that knows nothing of this package catches the builtin class."""
+    assert issubclass(kind, builtin)
+
+
+def test_raise_all_raises_what_there_is() -> None:
+    """Nothing, the one problem itself, or all of them."""
+    one, other = NotFinite("a", 1.0), NotFinite("b", 1.0)
+    raise_all([])
+    with pytest.raises(NotFinite) as caught:
+        raise_all([one])
+    assert caught.value is one
+    with pytest.raises(SeveralProblems) as several:
+        raise_all([one, other])
+    assert several.value.problems == (one, other)
+
+
+def test_nothing_is_near_when_nothing_is_alike() -> None:
+    """A suggestion is made only where it helps."""
+    assert nearest("mass", []) is None
+    assert nearest("qqq", ["mass"]) is None
