@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-WIDTH = 140  # [characters] where there is no terminal to ask
+WIDTH = 160  # [characters] where there is no terminal to ask
 RESULTS = Path("scm-world-results")
 
 
-def console(*, stderr: bool = False, file: IO[str] | None = None) -> Console:
+def console(*, stderr: bool = False, file: IO[str] | None = None, width: int = WIDTH) -> Console:
     """Open the terminal; plain text of a fixed width where there is none."""
     from rich.console import Console
 
     terminal = Console(stderr=stderr, file=file, highlight=False)
     if terminal.is_terminal:
         return terminal
-    return Console(stderr=stderr, file=file, highlight=False, width=WIDTH)
+    return Console(stderr=stderr, file=file, highlight=False, width=width)
 
 
 def table(*headers: str, title: str = "", caption: str = "") -> Table:
@@ -48,6 +48,14 @@ def table(*headers: str, title: str = "", caption: str = "") -> Table:
     )
     for header in headers:
         made.add_column(header, overflow="fold")
+    return made
+
+
+def keep_whole(made: Table, terminal: Console, *columns: int) -> Table:
+    """Do not break the words in some columns where there is room enough."""
+    if terminal.width >= WIDTH:
+        for column in columns:
+            made.columns[column].no_wrap = True
     return made
 
 
@@ -75,10 +83,14 @@ def show(value: Any, *, per_line: int = 3) -> str:
         >>> show(0.0200001), show([1.0, -0.0, 2.5])
         ('0.02', '1 0 2.5')
     """
-    numbers = [f"{float(x) + 0.0:.4g}" for x in np.ravel(value)]
+    numbers = [_show(float(x)) for x in np.ravel(value)]
     step = 2 if len(numbers) == 4 else per_line
     rows = [" ".join(numbers[i : i + step]) for i in range(0, len(numbers), step)]
     return "\n".join(rows)
+
+
+def _show(number: float) -> str:
+    return f"{number:.1e}" if 0.0 < abs(number) < 1e-4 else f"{number + 0.0:.4g}"
 
 
 def plain(value: Any) -> Any:
@@ -86,6 +98,8 @@ def plain(value: Any) -> Any:
     match value:
         case np.ndarray() | np.generic():
             return plain(value.tolist())
+        case dict():
+            return {key: plain(part) for key, part in value.items()}
         case list() | tuple():
             return [plain(part) for part in value]
         case float() if not np.isfinite(value):

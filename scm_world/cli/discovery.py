@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, final
 
 from rich.text import Text
 
-from scm_world.cli.console import RESULTS, check_writable, console, staged, table, written
+from scm_world.cli.console import (
+    RESULTS,
+    check_writable,
+    console,
+    keep_whole,
+    staged,
+    table,
+    written,
+)
 from scm_world.discovery import DiscoveryReport, discover
 from scm_world.discovery.names import by_entity
 from scm_world.discovery.plots import draw_graphs
@@ -72,8 +80,10 @@ def _progress(probes: int) -> Iterator[Callable[[int, int], None]]:
     terminal = console(stderr=True)
     if not terminal.is_terminal:
         steps = {max(1, round(probes * quarter / 4)) for quarter in range(1, 5)}
-        yield lambda done, planned: (
-            terminal.print(f"probe state {done} of {planned}") if done in steps else None
+        yield (
+            lambda done, planned: (
+                terminal.print(f"probe state {done} of {planned}") if done in steps else None
+            )
         )
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
@@ -85,7 +95,7 @@ def _progress(probes: int) -> Iterator[Callable[[int, int], None]]:
 
 
 def _print(terminal: Console, report: DiscoveryReport, names: tuple[str, ...]) -> None:
-    terminal.print(_edges(report, names))
+    terminal.print(keep_whole(_edges(report, names), terminal, 0))
     used = {name for edge in (*report.found, *report.declared) for name in edge[:2]}
     alone = [name for name in names if name not in used]
     if alone:
@@ -109,7 +119,7 @@ def _edges(report: DiscoveryReport, names: Iterable[str]) -> Table:
         for lag, cell in enumerate(cells):
             like = first.setdefault(cell.plain, effect)
             if like != effect and len(cell) > LONG:
-                cells[lag] = Text(f"the same as of {like}", style="italic")
+                cells[lag] = Text(f"same as {like}", style="italic")
         count = sum(edge[1] == effect for edge in report.found)
         made.add_row(Text(effect, style="bold"), *cells, str(count))
     return made

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import final
+from itertools import pairwise
+from typing import Any, final
 
 import networkx as nx
 
@@ -39,7 +40,6 @@ class Drawing:
     Attributes:
         places: Center of each node.
         kinds: Kind of each node; ``"hub"`` for a node that stands for many arrows.
-        units: Unit of each node.
         box: Width and height of a node.
         arrows: What to draw between them.
         loops: Nodes whose only feedback is on themselves.
@@ -48,7 +48,6 @@ class Drawing:
 
     places: dict[str, Point]
     kinds: dict[str, str]
-    units: dict[str, str]
     box: Point
     arrows: tuple[Arrow, ...]
     loops: tuple[str, ...]
@@ -102,12 +101,22 @@ def _forward(graph: nx.DiGraph) -> nx.DiGraph:
 def _levels(ahead: nx.DiGraph) -> dict[str, int]:
     """Put effects right of their causes, and causes without causes right before an effect."""
     level: dict[str, int] = {}
-    for name in nx.topological_sort(ahead):
-        level[name] = 1 + max((level[cause] for cause in ahead.predecessors(name)), default=-1)
-    for name in ahead:
+    order = list(nx.topological_sort(ahead))
+    for name in order:
+        level[name] = _after(ahead, level, name)
+    for name in order:
         if not ahead.in_degree(name) and ahead.out_degree(name):
-            level[name] = min(level[effect] for effect in ahead.successors(name)) - 1
+            effects = list(ahead.successors(name))
+            going_on = [effect for effect in effects if ahead.out_degree(effect)]
+            level[name] = min(level[effect] for effect in going_on or effects) - 1
+    for name in order:
+        if ahead.in_degree(name) and not ahead.out_degree(name):
+            level[name] = _after(ahead, level, name)
     return level
+
+
+def _after(ahead: nx.DiGraph, level: dict[str, int], name: str) -> int:
+    return 1 + max((level[cause] for cause in ahead.predecessors(name)), default=-1)
 
 
 Step = tuple[str, str, int]
@@ -127,40 +136,86 @@ def _chains(ahead: nx.DiGraph, level: dict[str, int]) -> dict[tuple[str, str], l
     }
 
 
+def _neighbours(chains: Iterable[list[Item]]) -> dict[Item, list[Item]]:
+    found: dict[Item, list[Item]] = {}
+    for chain in chains:
+        for one, other in pairwise(chain):
+            found.setdefault(one, []).append(other)
+            found.setdefault(other, []).append(one)
+    return found
+
+
 def _order(
-    names: Sequence[str], level: dict[str, int], chains: Iterable[list[Item]]
+    level: dict[str, int], chains: Iterable[list[Item]], near: dict[Item, list[Item]]
 ) -> list[list[Item]]:
-    """Order every layer so that few arrows cross: each item at the mean of its neighbours.
+    """Order every layer so that few arrows cross: each item at the mean of its neighbors.
 
     Source:
         Sugiyama, Tagawa and Toda, *Methods for visual understanding of hierarchical system
         structures*, 1981.
     """
     layers: list[list[Item]] = [[] for _ in range(1 + max(level.values(), default=-1))]
-    neighbours: dict[Item, list[Item]] = {name: [] for name in names}
-    for name in names:
-        layers[level[name]].append(name)
+    for name, number in level.items():
+        layers[number].append(name)
     for chain in chains:
-        for item in chain[1:-1]:
-            layers[item[2] if isinstance(item, tuple) else level[item]].append(item)
-        for one, other in zip(chain, chain[1:], strict=False):
-            neighbours.setdefault(one, []).append(other)
-            neighbours.setdefault(other, []).append(one)
-    at = {item: i / max(len(layer), 1) for layer in layers for i, item in enumerate(layer)}
+        for step in chain[1:-1]:
+            layers[int(step[2])].append(step)
+    at = {item: i / len(layer) for layer in layers for i, item in enumerate(layer)}
     for sweep in range(24):
         for layer in layers if sweep % 2 == 0 else reversed(layers):
-            mean = {i: _mean([at[n] for n in neighbours[i]], at[i]) for i in layer}
-            layer.sort(key=lambda item, mean=mean: mean[item])  # type: ignore[misc]
+            mean = {item: _mean(near.get(item, ()), at, at[item]) for item in layer}
+            layer.sort(key=mean.__getitem__)
             at.update({item: (i + 0.5) / len(layer) for i, item in enumerate(layer)})
     return layers
 
 
-def _mean(numbers: Sequence[float], default: float) -> float:
-    return sum(numbers) / len(numbers) if numbers else default
+def _mean(items: Sequence[Item], at: Mapping[Item, float], default: float) -> float:
+    return sum(at[item] for item in items) / len(items) if items else default
+
+
+def _heights(
+    layers: list[list[Item]], near: dict[Item, list[Item]], top: float, bottom: float
+) -> dict[Item, float]:
+    """Give every item a height near those of its neighbors, and room above and below."""
+    most = max(sum(_room(item) for item in layer) for layer in layers)
+    scale = min(1.35, (bottom - top) / most)
+    y: dict[Item, float] = {}
+    for layer in layers:
+        step = (bottom - top) / len(layer)
+        y.update({item: top + (i + 0.5) * step for i, item in enumerate(layer)})
+    for sweep in range(16):
+        for layer in layers if sweep % 2 == 0 else reversed(layers):
+            wanted = [_mean(near.get(item, ()), y, y[item]) for item in layer]
+            rooms = [scale * _room(item) for item in layer]
+            y.update(zip(layer, _apart(wanted, rooms, top, bottom), strict=True))
+    middle = (min(y.values()) + max(y.values())) / 2
+    return {item: height + (top + bottom) / 2 - middle for item, height in y.items()}
+
+
+def _room(item: Item) -> float:
+    return 46.0 if isinstance(item, str) else 22.0
+
+
+def _apart(wanted: list[float], rooms: list[float], top: float, bottom: float) -> list[float]:
+    """Move numbers apart, in their order, within two ends."""
+    gaps = [(a + b) / 2 for a, b in pairwise(rooms)]
+    down, up = list(wanted), list(wanted)
+    for i, gap in enumerate(gaps):
+        down[i + 1] = max(down[i + 1], down[i] + gap)
+    for i, gap in reversed(list(enumerate(gaps))):
+        up[i] = min(up[i], up[i + 1] - gap)
+    found = [(a + b) / 2 for a, b in zip(down, up, strict=True)]
+    found[0] = max(found[0], top + rooms[0] / 2)
+    for i, gap in enumerate(gaps):
+        found[i + 1] = max(found[i + 1], found[i] + gap)
+    found[-1] = min(found[-1], bottom - rooms[-1] / 2)
+    for i, gap in reversed(list(enumerate(gaps))):
+        found[i] = min(found[i], found[i + 1] - gap)
+    return found
 
 
 def lay_out(
-    model: SCM, *, width: float = 1600.0, top: float = 60.0, bottom: float = 790.0
+    model: SCM, *, width: float = 1600.0, top: float = 85.0, bottom: float = 840.0
 ) -> Drawing:
     """Find a place for everything.
 
@@ -171,32 +226,28 @@ def lay_out(
         bottom: Where it ends [pixels].
     """
     graph, families = _drawn(model)
-    names = [*(n for n in families.members if n in graph), *filter(_is_hub, graph)]
     ahead = _forward(graph)
     level = _levels(ahead)
     chains = _chains(ahead, level)
-    layers = _order(names, level, chains.values())
+    near = _neighbours(chains.values())
+    layers = _order(level, chains.values(), near)
+    y = _heights(layers, near, top, bottom) if layers else {}
     gap = width / max(len(layers), 1)
     box = (min(170.0, 0.72 * gap), 32.0)
-    places: dict[Item, Point] = {}
-    for number, layer in enumerate(layers):
-        weights = [1.0 if isinstance(item, str) else 0.45 for item in layer]
-        pitch = (bottom - top) / max(sum(weights), 1.0)
-        pitch = min(pitch, 90.0)
-        y = (top + bottom - pitch * sum(weights)) / 2
-        for item, weight in zip(layer, weights, strict=True):
-            places[item] = (gap * (number + 0.5), y + pitch * weight / 2)
-            y += pitch * weight
-    first = {label: model.declared(found[0]) for label, found in families.members.items()}
+    places = {item: (gap * (n + 0.5), y[item]) for n, layer in enumerate(layers) for item in layer}
+    shown = {n: _first(model, families, n) for n in graph}
     return Drawing(
-        places={name: places[name] for name in names},
-        kinds={n: "hub" if _is_hub(n) else str(first[n].kind) for n in names},  # type: ignore[attr-defined]
-        units={n: "" if _is_hub(n) else first[n].unit for n in names},
+        places={name: places[name] for name in graph},
+        kinds={name: "hub" if v is None else v.kind for name, v in shown.items()},
         box=box,
         arrows=tuple(_arrows(graph, ahead, chains, places, box)),
-        loops=tuple(n for n in names if graph.has_edge(n, n)),
-        alone=tuple(by_entity(n for n in model if families.of[n] not in graph)),
+        loops=tuple(name for name in graph if graph.has_edge(name, name)),
+        alone=tuple(by_entity(name for name in model if families.of[name] not in graph)),
     )
+
+
+def _first(model: SCM, families: Families, name: str) -> Any:
+    return None if _is_hub(name) else model.declared(families.members[name][0])
 
 
 def _arrows(
@@ -211,5 +262,7 @@ def _arrows(
         (x0, y0), (x1, y1) = places[cause], places[effect]
         path = ((x0 + box[0] / 2, y0), *inner, (x1 - box[0] / 2, y1))
         back = graph.has_edge(effect, cause) and not ahead.has_edge(effect, cause)
-        for lag in sorted(graph.edges[cause, effect]["lags"]):
-            yield Arrow(path, lag, back)
+        lags = graph.edges[cause, effect]["lags"]
+        for lag in sorted(lags):
+            aside = (8.0 * lag - 4.0) if len(lags) > 1 else 0.0
+            yield Arrow(tuple((x, y + aside) for x, y in path), lag, back)

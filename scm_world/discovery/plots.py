@@ -127,7 +127,7 @@ def draw_graphs(report: DiscoveryReport, path: Path | str) -> None:
     matrix = _Matrix(report)
     figure = _figure()
     axes = figure.subplots(1, 2, sharey=True)
-    figure.subplots_adjust(left=0.155, right=0.992, bottom=0.295, top=0.855, wspace=0.02)
+    figure.subplots_adjust(left=0.155, right=0.992, bottom=0.255, top=0.855, wspace=0.02)
     titles = (
         f"DECLARED: {len(report.declared)} edges",
         f"FOUND: {len(report.found)} edges",
@@ -147,7 +147,7 @@ def draw_graphs(report: DiscoveryReport, path: Path | str) -> None:
 def _spot(matrix: _Matrix, cause: str, effect: str, lag: int) -> tuple[float, float]:
     """Find the place of an edge; two lags of one pair stand side by side."""
     both = (cause, effect, 1 - lag) in matrix.cells
-    aside = (0.22 if lag else -0.22) if both else 0.0
+    aside = (0.26 if lag else -0.26) if both else 0.0
     return matrix.causes.index(cause) + aside, float(matrix.effects.index(effect))
 
 
@@ -179,13 +179,13 @@ def _grid(ax: Axes, matrix: _Matrix) -> None:
 
 def _draw_declared(ax: Axes, spot: tuple[float, float], lag: int, cell: _Cell) -> None:
     if cell.matched or cell.missing:
-        ax.scatter(*spot, s=52, marker=MARKERS[lag], color="#4a5568", zorder=3, lw=0)
+        ax.scatter(*spot, s=46, marker=MARKERS[lag], color="#4a5568", zorder=3, lw=0)
 
 
 def _draw_found(ax: Axes, spot: tuple[float, float], lag: int, cell: _Cell) -> None:
     """Draw what was found, and over it what was missed or found too much."""
     if cell.matched:
-        ax.scatter(*spot, s=52, marker=MARKERS[lag], color=MATCHED, zorder=3, lw=0)
+        ax.scatter(*spot, s=46, marker=MARKERS[lag], color=MATCHED, zorder=3, lw=0)
     if cell.extra:
         ax.scatter(*spot, s=170, marker="s", color=EXTRA, zorder=2.5, lw=0)
         ax.scatter(*spot, s=40, marker=MARKERS[lag], color="white", zorder=3, lw=0)
@@ -193,7 +193,7 @@ def _draw_found(ax: Axes, spot: tuple[float, float], lag: int, cell: _Cell) -> N
         ax.scatter(*spot, s=90, marker="X", fc="white", ec=MISSING, zorder=4, lw=1.6)
         ax.scatter(*spot, s=9, marker=MARKERS[lag], color=MISSING, zorder=5, lw=0)
     if cell.missing and cell.matched:
-        label = f"{cell.missing} of {cell.missing + cell.matched}"
+        label = f"{cell.missing} of {cell.missing + cell.matched} missed"
         place = {"xytext": (7, 5), "textcoords": "offset points"}
         ax.annotate(label, spot, color=MISSING, fontsize=7, zorder=6, **place)  # type: ignore[arg-type]
 
@@ -226,14 +226,20 @@ def _legend(figure: Figure) -> None:
         key("s", "found, not declared", EXTRA, markersize=11),
         key("X", "declared, not found", MISSING, **hollow),
     ]
-    place = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
-    figure.legend(handles=handles, ncol=2, frameon=False, fontsize=10, **place)
+    figure.legend(
+        handles=handles,
+        ncol=2,
+        frameon=False,
+        fontsize=10,
+        loc="upper right",
+        bbox_to_anchor=(0.995, 0.995),
+    )
 
 
 # --- a declared model ---------------------------------------------------------------------------
 
 
-def draw_model(model: SCM, path: Path | str) -> None:
+def draw_model(model: SCM, path: Path | str, *, title: str = "") -> None:
     """Draw a model as a layered graph, causes left of effects.
 
     Variables that differ in numbers only and have the same edges are one node. Where several
@@ -242,6 +248,7 @@ def draw_model(model: SCM, path: Path | str) -> None:
     Args:
         model: Any model.
         path: Of the PNG, 1600 x 900 pixels.
+        title: What the model is.
     """
     drawing = lay_out(model)
     figure = _figure()
@@ -253,8 +260,9 @@ def draw_model(model: SCM, path: Path | str) -> None:
         _arrow(ax, arrow)
     for name, (x, y) in drawing.places.items():
         _node(ax, drawing, name, x, y)
-    title = f"{len(model)} variables, {len(model.edges)} edges"
-    ax.text(20, 34, title, fontsize=15, weight="bold", color=INK)
+    ax.text(20, 34, title or "causal model", fontsize=17, weight="bold", color=INK)
+    size = f"{len(model)} variables, {len(model.edges)} edges"
+    ax.text(20, 62, size, fontsize=12, color=INK)
     _model_legend(ax, drawing)
     _save(figure, path)
 
@@ -296,14 +304,29 @@ def _node(ax: Axes, drawing: Drawing, name: str, x: float, y: float) -> None:
     text = f"{upper}.\n{lower}" if dot else upper
     longest = max(map(len, text.split("\n")))
     size = min(9.0, 1.15 * width / longest)
-    ax.text(x, y, text, ha="center", va="center", fontsize=size, color=ink, zorder=4, linespacing=1.05)
+    center = {"ha": "center", "va": "center", "linespacing": 1.05}
+    ax.text(x, y, text, fontsize=size, color=ink, zorder=4, **center)  # type: ignore[arg-type]
     if name in drawing.loops:
-        loop = {"connectionstyle": "arc3,rad=-1.3", "arrowstyle": "-|>", "mutation_scale": 8}
-        ends = ((x - 16, y - height / 2), (x + 16, y - height / 2))
-        style = {"color": LAGGED, "linestyle": (0, (3, 2)), "shrinkA": 0, "shrinkB": 0, "zorder": 2}
-        from matplotlib.patches import FancyArrowPatch
+        _loop(ax, x, y - height / 2)
 
-        ax.add_patch(FancyArrowPatch(*ends, **loop, **style))  # type: ignore[arg-type]
+
+def _loop(ax: Axes, x: float, y: float) -> None:
+    """Draw the arrow from a node to itself, one control step later."""
+    from matplotlib.patches import FancyArrowPatch
+
+    loop = FancyArrowPatch(
+        (x - 16, y),
+        (x + 16, y),
+        connectionstyle="arc3,rad=-1.3",
+        arrowstyle="-|>",
+        mutation_scale=8,
+        color=LAGGED,
+        linestyle=(0, (3, 2)),
+        shrinkA=0,
+        shrinkB=0,
+        zorder=2,
+    )
+    ax.add_patch(loop)
 
 
 def _model_legend(ax: Axes, drawing: Drawing) -> None:
@@ -318,8 +341,14 @@ def _model_legend(ax: Axes, drawing: Drawing) -> None:
     if "hub" in drawing.kinds.values():
         label = "each arrow in stands for one to every node it points at"
         handles.append(Patch(fc=INK, label=label))
-    place = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
-    ax.legend(handles=handles, ncol=len(handles), frameon=False, fontsize=10, **place)
+    ax.legend(
+        handles=handles,
+        ncol=4,
+        frameon=False,
+        fontsize=10,
+        loc="upper right",
+        bbox_to_anchor=(0.995, 0.995),
+    )
     if drawing.alone:
         words = textwrap.fill(f"No edge at all: {', '.join(drawing.alone)}", 190)
         ax.text(20, HEIGHT - 18, words, fontsize=10, color=INK, va="bottom")

@@ -101,7 +101,7 @@ def check_space(variable: Variable, value: Value, space: SpaceName, values: Valu
             _plain(value),
             space=space,
             allowed=declared.describe(variable.shape, values)
-            + (" without A" if space == "B" and variable.a is not None else ""),
+            + (" without A" if space == "B" and variable.a not in (None, variable.b) else ""),
             nearest=None if near is None else _plain(near),
             unit=variable.unit,
         )

@@ -96,7 +96,8 @@ class Variable(Frozen):
         dtype: ``"real"``, ``"integer"`` or ``"categorical"``.
         bounds: What is physically possible, or None for anything finite.
         a: The training space, or None.
-        b: The held-out space, or None. A point that lies in both belongs to A.
+        b: The held-out space, or None. A point that lies in both belongs to A, unless the two are
+            the same space: then nothing is held out.
         doc: One sentence.
     """
 
@@ -149,7 +150,9 @@ class Variable(Frozen):
         space = self.space(name)
         if space is None or not space.contains(value, values):
             return False
-        return name != "B" or self.a is None or not self.a.contains(value, values)
+        if name != "B" or self.a is None or self.a == self.b:
+            return True
+        return not self.a.contains(value, values)
 
     def nearest_in_space(self, value: Value, name: SpaceName, values: Values) -> Value | None:
         """Find the nearest value that lies in a space; None where none is found."""

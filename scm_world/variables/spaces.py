@@ -7,6 +7,7 @@ that lies on the floor is half its size). They are evaluated when asked, never s
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -107,8 +108,19 @@ class Box(_Space):
         """Evaluate both corners, each of shape ``(..., *shape)``."""
         return _evaluate(self.low, shape, values), _evaluate(self.high, shape, values)
 
+    @cached_property
+    def _widened(self) -> tuple[Floats, Floats] | None:
+        """Both corners, the tolerance included, where they follow no variable."""
+        if self.parents():
+            return None
+        low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
+        return low - TOLERANCE, high + TOLERANCE
+
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Tell whether a value lies inside, borders included."""
+        if self._widened is not None and np.ndim(value) < 2:
+            low, high = self._widened
+            return bool((value >= low).all() and (value <= high).all())
         low, high = self.bounds(np.shape(value), values or {})
         return bool(np.all(value >= low - TOLERANCE) and np.all(value <= high + TOLERANCE))
 

@@ -33,6 +33,7 @@ from scm_world.world.commit import commit, refuse_overlaps
 from scm_world.world.proposal import Instant, propose
 from scm_world.world.readouts import Readouts, static_order
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
+from scm_world.world.start import beginning, whole_number
 
 
 @final
@@ -75,11 +76,11 @@ class World:
         conventions: str = "scm_world",
     ) -> None:
         self.task = make_task(task) if isinstance(task, str) else task
-        self.frame_skip = _positive("frame_skip", frame_skip)
+        self.frame_skip = whole_number("frame_skip", frame_skip, least=1)
         self.control_period = TIMESTEP * self.frame_skip  # [s]
         self.given_length = max_episode_length
         if max_episode_length is not None:
-            _positive("max_episode_length", max_episode_length)
+            whole_number("max_episode_length", max_episode_length, least=1)
         self.max_episode_length = max_episode_length or round(
             self.task.seconds / self.control_period
         )
@@ -231,7 +232,7 @@ class World:
             InterventionError: The intervention was refused. The episode has begun without it.
         """
         if seed is not None:
-            self.noise, self.episode = Noise(_seed(seed)), 0
+            self.noise, self.episode = Noise(whole_number("seed", seed, least=0)), 0
         elif not self._started:
             self.noise, self.episode = Noise(secrets.randbits(63)), 0
         else:
@@ -250,31 +251,15 @@ class World:
         self._instant = self._present(at_start=True)
 
     def _build(self) -> None:
-        static = self.model.solve(only=self.static_names)
+        blocks = len(self.structure.blocks)
+        static, self._state = beginning(self.model, self.static_names, self.slices, blocks)
         self._constants = default_parameters(self.structure)
-        self._state = PhysicalState(len(self.structure.blocks))
-        for variable in self.model.variables:
-            where = self.slices.get(variable.name)
-            if where is not None and isinstance(variable, Measured):
-                self._state.vector[where] = self._first(variable, static)
         self._now.update(static)
         self._now.update(self.states(self._state))
         self._now[CONTROL_INDEX] = self._clock
         self.backend.build(self.describe(self._now, self._state.copy()))
-        engine = self.backend.snapshot()
-        self._origin = WorldSnapshot(engine=engine, static=static)
+        self._origin = WorldSnapshot(engine=self.backend.snapshot(), static=static)
         self._started = True
-
-    def _first(self, variable: Measured, static: Values) -> Value:
-        if variable.start is None:
-            return variable.array(variable.default)
-        known = {**static}
-        for name in variable.set_parents():
-            parent = self.model.declared(name)
-            if isinstance(parent, Measured):
-                known[name] = parent.array(parent.default)
-        parents = [known[name] for name in variable.set_parents()]
-        return np.asarray(variable.start.bind()(*parents))
 
     def step(self, action: ArrayLike) -> None:
         """Advance one control step.
@@ -438,18 +423,6 @@ class World:
     def _require_episode(self) -> None:
         if not self._started:
             raise NotReset
-
-
-def _positive(name: str, value: int) -> int:
-    if not isinstance(value, int | np.integer) or value < 1:
-        raise UnknownOption(name, value, ("any whole number from 1 on",))
-    return int(value)
-
-
-def _seed(seed: int) -> int:
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise UnknownOption("seed", seed, ("any whole number from 0 on",))
-    return int(seed)
 
 
 _conventions = conventions

@@ -141,6 +141,12 @@ def test_where_a_and_b_touch_the_point_belongs_to_a() -> None:
     assert mass.in_space(np.array(0.0450001), "B", {})
 
 
+def test_equal_spaces_hold_nothing_out() -> None:
+    """Where A and B are the same space, B accepts what it draws."""
+    turn = Exogenous(name="turn", a=Box(-1.0, 1.0), b=Box(-1.0, 1.0))
+    assert turn.in_space(np.array(0.3), "B", {})
+
+
 def test_whole_numbers_of_a_are_never_drawn_from_b() -> None:
     """A number that both sets have belongs to A alone."""
     count = Exogenous(name="n", dtype="integer", a=Integers(1, 4), b=Integers(4, 6))

@@ -99,10 +99,13 @@ def state(structure: Structure, given: PhysicalState) -> list[float]:
 
     Raises:
         ValueError: It is a state of another number of blocks.
+        EngineFailure: A number is not finite.
     """
     if given.n_blocks != len(structure.blocks):
         raise ValueError(f"expected a state of {len(structure.blocks)} blocks, got {given!r}")
     numbers: list[float] = given.vector.tolist()
+    if not math.isfinite(sum(numbers)):
+        raise EngineFailure(f"a state must be finite, got {given!r}", "bullet")
     for start in range(ROBOT_SIZE + 3, len(numbers), BLOCK_SIZE):
         turn = numbers[start : start + 4]
         square = sum(part * part for part in turn)

@@ -1,0 +1,159 @@
+"""``scm-world do``: one world with the intervention, its twin without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from scm_world._types import Floats, Value, Values
+from scm_world.cli.assignments import parse_assignments
+from scm_world.cli.console import RESULTS, check_writable, console
+from scm_world.discovery.paired import gap
+from scm_world.errors import UnknownOption
+from scm_world.scene import Scene
+from scm_world.world import Audit, World
+
+SPACES = ("A", "B", "A|B")
+
+
+@final
+@dataclass(frozen=True)
+class Options:
+    """Where to intervene.
+
+    Attributes:
+        task: Name of the task.
+        backend: Name of the engine.
+        preset: Numerical settings.
+        seed: Of the noise.
+        steps: Control steps to run afterwards.
+        space: The space that values must lie in, or None.
+    """
+
+    task: str
+    backend: str
+    preset: str
+    seed: int
+    steps: int
+    space: str | None
+
+
+@final
+@dataclass(frozen=True)
+class Row:
+    """What became of one variable.
+
+    Attributes:
+        name: Of the variable.
+        unit: Its unit.
+        follows: Whether it is a descendant of a target in the declared graph.
+        before: Value at the start.
+        at_once: Value right after the intervention.
+        after: Value at the end.
+        alone: Value at the end of the twin without the intervention.
+    """
+
+    name: str
+    unit: str
+    follows: bool
+    before: Value
+    at_once: Value
+    after: Value
+    alone: Value
+
+    @property
+    def difference(self) -> float:
+        """The largest difference of the two ends."""
+        return gap(self.after, self.alone)
+
+    @property
+    def moved(self) -> bool:
+        """Whether the intervention changed it, at once or later."""
+        return self.difference > 0.0 or gap(self.at_once, self.before) > 0.0
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a paired run.
+
+    Attributes:
+        options: Where it was done.
+        engine: Name and version of the engine.
+        audit: Of the intervention.
+        rows: One for each variable that is not a target.
+        before: The scene at the start.
+        after: The scene at the end.
+    """
+
+    options: Options
+    engine: str
+    audit: Audit
+    rows: tuple[Row, ...]
+    before: Scene
+    after: Scene
+
+    @property
+    def astray(self) -> tuple[str, ...]:
+        """Variables that moved although no declared path leads to them."""
+        return tuple(row.name for row in self.rows if row.moved and not row.follows)
+
+
+def run(assignments: Sequence[str], options: Options, *, show_all: bool, out: Path | None) -> int:
+    """Intervene, print, write; return the exit code."""
+    from scm_world.cli.outcome import report, save
+
+    if options.space is not None and options.space not in SPACES:
+        raise UnknownOption("space", options.space, SPACES)
+    request = parse_assignments(assignments)
+    folder = out or RESULTS / f"do-{options.task}-{options.backend}-seed{options.seed}"
+    check_writable(folder, folder=True)
+    outcome = paired(request, options)
+    save(outcome, folder)
+    report(console(), outcome, folder, show_all=show_all)
+    return int(bool(outcome.astray))
+
+
+def paired(request: dict[str, Any], options: Options) -> Outcome:
+    """Run a world with an intervention, and again without it: same noise, same actions.
+
+    Raises:
+        InterventionError: The intervention was refused.
+        UnknownOption: A name does not exist.
+    """
+    world = World(options.task, backend=options.backend, preset=options.preset)
+    try:
+        world.reset(seed=options.seed)
+        start, before, scene = world.snapshot(), world.values(), world.scene()
+        hold = before["joint_positions"]
+        space: Any = options.space
+        audit = world.do(request, space=space)
+        at_once = world.values()
+        after = _advance(world, hold, options.steps)
+        last = world.scene()
+        world.restore(start)
+        alone = _advance(world, hold, options.steps)
+        rows = _rows(world, audit, (before, at_once, after, alone))
+        engine = f"{world.backend.name} {world.backend.version}"
+        return Outcome(options, engine, audit, rows, scene, last)
+    finally:
+        world.close()
+
+
+def _advance(world: World, action: Floats, steps: int) -> dict[str, Value]:
+    for _ in range(steps):
+        world.step(action)
+    return world.values()
+
+
+def _rows(world: World, audit: Audit, values: tuple[Values, ...]) -> tuple[Row, ...]:
+    model = world.model
+    targets = {model.target(name) for name in audit.targets}
+    follow = frozenset[str]().union(*(model.descendants(name) for name in targets))
+    return tuple(
+        Row(name, model.declared(name).unit, name in follow, *(v[name] for v in values))
+        for name in model
+        if name not in targets or name in follow
+    )

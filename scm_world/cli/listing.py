@@ -1,0 +1,48 @@
+"""``scm-world list``."""
+
+from __future__ import annotations
+
+from rich.text import Text
+
+from scm_world.backends import BACKENDS, make_backend
+from scm_world.cli.console import console, table
+from scm_world.entities import ACTIONS
+from scm_world.env import IDS
+from scm_world.errors import EngineError
+from scm_world.scene.presets import PRESETS
+from scm_world.tasks import CONVENTIONS, TASKS
+
+
+def _first_line(text: str | None) -> str:
+    return (text or "").strip().partition("\n")[0]
+
+
+def _engine(name: str) -> Text:
+    """Say which version of an engine there is, or why there is none."""
+    try:
+        backend = make_backend(name)
+    except EngineError as error:
+        return Text(f"not available: {error}", style="yellow")
+    try:
+        return Text(f"available, version {backend.version}", style="green")
+    finally:
+        backend.close()
+
+
+def run() -> None:
+    """List what can be chosen."""
+    made = table("", "name", "")
+    made.show_header = False
+    sections: dict[str, dict[str, str | Text]] = {
+        "tasks": {name: _first_line(task.__doc__) for name, task in TASKS.items()},
+        "backends": {name: _engine(name) for name in BACKENDS},
+        "presets": {p.name: f"physics steps of {1000 * p.timestep:g} ms" for p in PRESETS.values()},
+        "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},
+        "conventions": dict.fromkeys(CONVENTIONS, ""),
+        "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
+    }
+    for title, rows in sections.items():
+        for number, (name, about) in enumerate(rows.items()):
+            made.add_row(Text("" if number else title, style="bold"), name, about)
+        made.add_section()
+    console().print(made)

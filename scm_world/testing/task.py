@@ -1,0 +1,275 @@
+"""A conformance suite for tasks.
+
+Subclass it in a test file, say how to make a world of the task, and pytest runs the rest::
+
+    class TestMyTask(TaskConformance):
+        def make(self) -> World:
+            return World(MyTask(), backend="fake")
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from scm_world._types import Floats, Value
+from scm_world.entities import CONTROL_INDEX
+from scm_world.errors import Infeasible
+from scm_world.graph import from_json, to_json
+from scm_world.scene import Scene, trifinger
+from scm_world.variables import Box, Draw, Integers, Noise, Rotations, Variable
+from scm_world.variables.kinds import SpaceName
+from scm_world.world import World
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
+_SPACES: tuple[SpaceName, ...] = ("A", "B")
+_SEED = 20_26
+
+
+class TaskConformance:
+    """Every promise that a task makes, as a test.
+
+    Attributes:
+        fulfilled: The fractional success that its own solution reaches at least.
+        episodes: How many random episodes the suite plays.
+        steps: How many control steps of each.
+    """
+
+    fulfilled: ClassVar[float] = 0.99
+    episodes: ClassVar[int] = 3
+    steps: ClassVar[int] = 40
+
+    def make(self) -> World:
+        """Create a world of the task."""
+        raise NotImplementedError
+
+    @pytest.fixture
+    def world(self) -> Iterator[World]:
+        """Provide a world at the start of an episode."""
+        world = self.make()
+        world.reset(seed=_SEED)
+        yield world
+        world.close()
+
+    # --- declarations ---------------------------------------------------------------------------
+
+    def test_names_are_unique_and_published(self, world: World) -> None:
+        """Names are ``entity.quantity``, and none stands for two things."""
+        declared = [variable.name for variable in _declared(world)]
+        assert len(set(declared)) == len(declared)
+        assert not [name for name in declared if not _NAME.fullmatch(name)]
+
+    def test_every_variable_is_documented(self, world: World) -> None:
+        """Each has a unit, and a sentence that begins with a capital and ends with a full stop."""
+        for variable in world.model.variables:
+            assert variable.unit, variable.name
+            assert re.fullmatch(r"[A-Z0-9].*\.", variable.doc, re.DOTALL), variable.name
+
+    def test_what_can_be_set_is_bounded(self, world: World) -> None:
+        """Each quantity that ``do`` accepts says what is physically possible."""
+        model = world.model
+        unbounded = [
+            name
+            for name in model
+            if model.declared(name).settable
+            and model.target(name) == name
+            and model.declared(name).bounds is None
+        ]
+        assert not unbounded
+
+    def test_the_start_lies_within_bounds(self, world: World) -> None:
+        """Every default is possible."""
+        assert not out_of_bounds(world)
+
+    @pytest.mark.parametrize("space", _SPACES)
+    def test_spaces_lie_within_bounds(self, world: World, space: SpaceName) -> None:
+        """Whatever is drawn from A or B, in any coordinates, is possible."""
+        values, noise = world.values(), Noise(_SEED)
+        for variable in world.model.variables:
+            source = variable.space(space)
+            if source is None:
+                continue
+            target = world.model.declared(world.model.target(variable.name))
+            for episode in range(20):
+                value = noise.draw(
+                    source, variable.name, variable.shape, values, episode=episode
+                )[0]
+                assert variable.in_space(value, space, values), variable.name
+                if target is not variable:
+                    value = np.asarray(_inverse(variable)(value))
+                bounds = target.bounds
+                assert bounds is None or bounds.contains(value, values), variable.name
+
+    def test_the_model_survives_json(self, world: World) -> None:
+        """Written and read again it is the same model."""
+        assert from_json(to_json(world.model), trusted=(type(world.task).__module__,)) == (
+            world.model
+        )
+
+    def test_what_is_observed_is_declared(self, world: World) -> None:
+        """The observation consists of variables, and low ends lie below high ones."""
+        for part in world.task.observed():
+            assert part.variable in world.model
+            low, high = part.published
+            assert (np.asarray(low) <= np.asarray(high)).all()
+            if part.low is not None:
+                assert (np.asarray(part.low) < np.asarray(part.high)).all()
+
+    # --- physics --------------------------------------------------------------------------------
+
+    def test_every_quantity_is_realised(self, world: World) -> None:
+        """Setting any parameter or state changes the scene: a body, a motion or a goal."""
+        for name in _quantities(world):
+            world.reset(seed=_SEED)
+            before = world.scene()
+            world.do({name: nearby(world, name)})
+            assert _differ(before, world.scene()), name
+
+    def test_every_quantity_is_read_back(self, world: World) -> None:
+        """What the engine knows it reports as it was given, and the model agrees."""
+        for name in _quantities(world):
+            world.reset(seed=_SEED)
+            wanted = nearby(world, name)
+            entry = world.do({name: wanted}).targets[name]
+            np.testing.assert_array_equal(entry.applied, world[name])
+            np.testing.assert_allclose(entry.applied, wanted, rtol=1e-9, atol=1e-12)
+            if name in world.parameter_keys or name in world.slices:
+                assert entry.read_back is not None, name
+                np.testing.assert_allclose(entry.read_back, wanted, rtol=1e-6, atol=1e-9)
+
+    def test_values_stay_within_bounds(self, world: World) -> None:
+        """In random episodes no value is impossible or undefined."""
+        for _ in self._random(world):
+            assert not out_of_bounds(world)
+
+    # --- what counts ----------------------------------------------------------------------------
+
+    def test_the_reward_is_the_weighted_sum_of_its_terms(self, world: World) -> None:
+        """At every step, and each term is a number."""
+        weights = world.task.weights
+        for _ in self._random(world):
+            values = world.values()
+            terms = {name: float(values[name]) for name in weights}
+            assert np.isfinite(list(terms.values())).all()
+            expected = sum(weight * terms[name] for name, weight in weights.items())
+            assert float(values["reward"]) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+    def test_fractional_success_is_a_fraction(self, world: World) -> None:
+        """It lies in [0, 1]; success is 0 or 1."""
+        for _ in self._random(world):
+            values = world.values()
+            assert 0.0 <= float(values["fractional_success"]) <= 1.0
+            assert int(values["success"]) in (0, 1)
+
+    def test_standing_still_is_not_success(self, world: World) -> None:
+        """At the start there is something left to do, and nothing has been earned."""
+        assert world["success"] == 0
+        assert world["reward"] == pytest.approx(
+            world.task.weights["fractional_success"] * world["fractional_success"]
+        )
+
+    def test_the_solution_fulfils_the_task(self, world: World) -> None:
+        """After the intervention that the task calls its solution, it is solved."""
+        world.do(world.task.solution(world.values()))
+        assert float(world["fractional_success"]) >= self.fulfilled
+        assert world["success"] == 1
+
+    def test_achieved_and_desired_are_alike(self, world: World) -> None:
+        """Both are arrays of one shape, of finite numbers, equal once the task is solved."""
+        achieved, desired = world.task.goals(world.values())
+        assert achieved.shape == desired.shape
+        assert np.isfinite(achieved).all()
+        assert np.isfinite(desired).all()
+        world.do(world.task.solution(world.values()))
+        np.testing.assert_allclose(*world.task.goals(world.values()), atol=0.02)
+
+    def _random(self, world: World) -> Iterator[int]:
+        """Play random episodes, each with interventions drawn from A at its start."""
+        generator = np.random.default_rng(_SEED)
+        for episode in range(self.episodes):
+            world.reset(seed=episode)
+            for name in _quantities(world):
+                if world.model[name].a is not None and name in world.static_names:
+                    try:
+                        world.do({name: Draw("A")})
+                    except Infeasible:  # a large block where a finger is
+                        continue
+            for step in range(self.steps):
+                world.step(_command(world, generator))
+                yield step
+
+
+def nearby(world: World, name: str) -> Value:
+    """Give another possible value of a variable, near the present one."""
+    variable, value = world.model.declared(name), world[name]
+    match variable.bounds:
+        case Box() as box:
+            low, high = box.bounds(variable.shape, world.values())
+            return np.asarray(value + 0.02 * (low + 0.37 * (high - low) - value))
+        case Integers():
+            return np.asarray(value + 1)
+        case Rotations():
+            return np.array([0.0, 0.0, np.sin(0.05), np.cos(0.05)])
+        case _:
+            raise ValueError(f"{name} has no bounds to choose from")
+
+
+def out_of_bounds(world: World) -> list[str]:
+    """Name the variables whose present value is impossible, or not a number."""
+    values = world.values()
+    return [
+        variable.name
+        for variable in world.model.variables
+        if not np.isfinite(values[variable.name]).all()
+        or not (
+            variable.bounds is None or variable.bounds.contains(values[variable.name], values)
+        )
+    ]
+
+
+def _declared(world: World) -> list[Variable]:
+    """List the declarations as they were written down, duplicates included."""
+    return [
+        *world.composition.variables(),
+        *world.task.readouts(world.conventions),
+    ]
+
+
+def _quantities(world: World) -> list[str]:
+    """Name every parameter and state that can be set, each in its own coordinates."""
+    model = world.model
+    return [
+        name
+        for name in model
+        if model.declared(name).settable
+        and model.target(name) == name
+        and name not in ("action", CONTROL_INDEX)
+    ]
+
+
+def _differ(one: Scene, other: Scene) -> bool:
+    parameters = any(
+        not np.array_equal(value, other.parameters[key]) for key, value in one.parameters.items()
+    )
+    goals = any(
+        not np.array_equal(getattr(mine, what), getattr(theirs, what))
+        for mine, theirs in zip(one.goals, other.goals, strict=True)
+        for what in ("size", "position", "orientation", "color")
+    )
+    return parameters or goals or one.state != other.state
+
+
+def _inverse(variable: Variable) -> Any:
+    inverse: Any = getattr(variable, "inverse", None)
+    return inverse.bind()
+
+
+def _command(world: World, generator: np.random.Generator) -> Floats:
+    """Draw an action: near the rest pose, or anywhere in its range."""
+    if world.action_mode == "joint_positions":
+        return np.asarray(np.array(trifinger.REST) + generator.uniform(-0.8, 0.8, 9))
+    return np.asarray(generator.uniform(world.action_low, world.action_high))

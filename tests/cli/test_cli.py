@@ -1,0 +1,402 @@
+"""The command line: what it prints, what it writes, and how it refuses."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from matplotlib.image import imread
+from typer.testing import CliRunner, Result
+
+from scm_world.cli import app
+from scm_world.cli.assignments import parse_assignments, parse_value
+from scm_world.errors import ConflictingTargets
+from scm_world.variables import Draw, Scale, Shift
+
+KEYS = {
+    "task",
+    "backend",
+    "seed",
+    "probes",
+    "rollouts",
+    "floor",
+    "shd",
+    "precision",
+    "recall",
+    "f1",
+    "undeclared",
+    "missed",
+    "seconds",
+    "versions",
+}
+CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run where nothing is lost."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("FORCE_COLOR", "COLUMNS", "TTY_COMPATIBLE", "GITHUB_ACTIONS"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def call(*arguments: str) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [*arguments])
+
+
+def read(path: str) -> dict[str, Any]:
+    """Read a JSON file."""
+    found: dict[str, Any] = json.loads(Path(path).read_text())
+    return found
+
+
+def files() -> list[str]:
+    """List everything below the present folder."""
+    return sorted(str(path) for path in Path().rglob("*"))
+
+
+# --- discover ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", ["reaching", "pushing"])
+def test_discover_writes_a_report_and_a_picture(task: str) -> None:
+    """Discovery prints the graph and its scores, and writes both files."""
+    result = call("discover", task, "--probes", "2", "--seed", "3", "--out", "here")
+
+    assert result.exit_code == 0, result.output
+    assert "Recovered graph" in result.stdout
+    assert "SHD" in result.stdout
+    report = read("here/report.json")
+    assert set(report) >= KEYS
+    assert (report["task"], report["backend"]) == (task, "mujoco")
+    assert (report["seed"], report["probes"]) == (3, 2)
+    assert report["versions"]["mujoco"] in result.stdout
+    assert imread("here/graphs.png").shape[:2] == (900, 1600)
+
+
+def test_discover_says_where_the_default_folder_is() -> None:
+    """Without --out the results lie in a folder named after the run."""
+    result = call("discover", "reaching", "--backend", "fake", "--probes", "1")
+
+    assert result.exit_code == 0, result.output
+    folder = "scm-world-results/discover-reaching-fake-seed0"
+    assert f"{folder}/report.json" in result.stdout
+    assert Path(folder, "graphs.png").exists()
+
+
+def test_missing_edges_are_marked_and_strict_fails() -> None:
+    """Without physics edges are missing: each has a symbol, and --strict exits 1."""
+    result = call("discover", "reaching", "--backend", "fake", "--probes", "1", "--strict")
+
+    assert result.exit_code == 1
+    assert "[-] " in result.stdout
+    assert read("scm-world-results/discover-reaching-fake-seed0/report.json")["shd"] > 0
+
+
+def test_an_interrupted_discovery_reports_what_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C after the first probe state gives a partial report and exit code 130."""
+    from scm_world.discovery.paired import Paired
+
+    run = Paired.run
+
+    def interrupted(self: Paired, number: int, probe: Any) -> None:
+        if number == 1:
+            raise KeyboardInterrupt
+        run(self, number, probe)
+
+    monkeypatch.setattr(Paired, "run", interrupted)
+    result = call("discover", "reaching", "--probes", "3", "--out", "here")
+
+    assert result.exit_code == 130
+    assert "1 of 3: interrupted" in result.stdout
+    assert read("here/report.json")["complete"] is False
+
+
+def test_interrupted_before_the_first_probe_state_writes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ctrl-C before there is anything to report is one line and exit code 130."""
+    from scm_world.discovery.paired import Paired
+
+    def interrupted(self: Paired, number: int, probe: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Paired, "run", interrupted)
+    result = call("discover", "reaching", "--out", "here")
+
+    assert result.exit_code == 130
+    assert "interrupted" in result.stderr
+    assert files() == []
+
+
+# --- graph ---------------------------------------------------------------------------------------
+
+
+def test_graph_as_table_names_every_kind_of_column() -> None:
+    """The table has every variable, links in few words, and no line is cut off."""
+    result = call("graph", "pushing")
+
+    assert result.exit_code == 0, result.output
+    assert "robot_finger_{60,120,300}_link_{1,2}.mass" in result.stdout
+    assert "0.015 to 0.045" in result.stdout
+    assert "lag 0: fractional_success" in result.stdout
+    assert "…" not in result.stdout
+
+
+def test_graph_as_json_is_the_model() -> None:
+    """What is printed as JSON can be read back."""
+    from scm_world.graph import from_json
+    from scm_world.world import World
+
+    result = call("graph", "reaching", "--format", "json", "--action-mode", "joint_torques")
+
+    expected = World("reaching", backend="fake", action_mode="joint_torques").model
+    assert from_json(result.stdout) == expected
+
+
+@pytest.mark.parametrize("form", ["table", "dot", "json"])
+def test_graph_goes_to_a_file(form: str) -> None:
+    """With --out standard output stays empty and the file has the text."""
+    shown = call("graph", "reaching", "--format", form).stdout
+    result = call("graph", "reaching", "--format", form, "--out", "deep/graph.txt")
+
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert Path("deep/graph.txt").read_text() == shown
+
+
+def test_graph_as_picture_has_a_default_name() -> None:
+    """The picture of the declared graph is a PNG of 1600 x 900."""
+    result = call("graph", "reaching", "--format", "png")
+
+    assert result.exit_code == 0, result.output
+    assert imread("reaching-graph.png").shape[:2] == (900, 1600)
+
+
+# --- do ------------------------------------------------------------------------------------------
+
+
+def test_do_shows_the_audit_and_what_followed() -> None:
+    """A larger block moves its descendants, and nothing else."""
+    result = call("do", "pushing", "block.size=[0.07,0.07,0.07]", "--steps", "2", "--out", "here")
+
+    assert result.exit_code == 0, result.output
+    assert "goal_block.cartesian_position" in result.stdout
+    assert "descendants did not move" in result.stdout
+    found = read("here/result.json")
+    assert found["audit"]["block.size"]["applied"] == [0.07, 0.07, 0.07]
+    assert found["moved_without_a_path"] == []
+    row = found["variables"]["tool_block.size"]
+    assert (row["before"][0], row["after"][0], row["without"][0]) == (0.065, 0.07, 0.065)
+    assert found["versions"]["mujoco"]
+
+
+def test_do_takes_pictures() -> None:
+    """Before, after, and both side by side; a colour is seen."""
+    assert (
+        call("do", "pushing", "tool_block.color=0,0,1", "--steps", "1", "--out", "o").exit_code == 0
+    )
+
+    before, after, both = (imread(f"o/{name}.png") for name in ("before", "after", "scene"))
+    assert before.shape == after.shape
+    assert not np.array_equal(before, after)
+    assert both.shape[1] > 2 * before.shape[1]
+
+
+def test_do_reads_back_from_the_engine() -> None:
+    """Shifts, scales and draws are applied, and the engine agrees."""
+    given = ("tool_block.mass=scale:2", "floor_friction=draw:B", "joint_positions=shift:0.01")
+    assert call("do", "pushing", *given, "--steps", "0", "--out", "o").exit_code == 0
+
+    audit = read("o/result.json")["audit"]
+    assert audit["tool_block.mass"]["read_back"] == pytest.approx(0.04)
+    assert 0.6 <= audit["floor_friction"]["read_back"] <= 0.8
+    assert audit["joint_positions"]["requested"] == {"kind": "shift", "by": 0.01}
+
+
+def test_all_shows_descendants_that_did_not_move() -> None:
+    """With --all there is a row for every descendant."""
+    arguments = ("do", "pushing", "tool_block.mass=0.04", "--backend", "fake", "--steps", "1")
+    moved, every = call(*arguments).stdout, call(*arguments, "--all").stdout
+
+    assert "tool_block.linear_velocity" not in moved
+    assert "tool_block.linear_velocity" in every
+
+
+def test_a_change_without_a_path_is_loud(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If a variable moves that is no descendant, it is named and the exit code is 1."""
+    from scm_world.graph import SCM
+
+    monkeypatch.setattr(SCM, "descendants", lambda self, name: frozenset())
+    result = call("do", "pushing", "block.size=0.07,0.07,0.07", "--steps", "0", "--backend", "fake")
+
+    assert result.exit_code == 1
+    assert "MOVED WITHOUT A DECLARED PATH" in result.stdout
+    assert "tool_block.size" in result.stdout
+
+
+# --- list, version, help -------------------------------------------------------------------------
+
+
+def test_list_names_what_there_is() -> None:
+    """Tasks, engines with their version, presets, conventions and environments."""
+    shown = call("list").stdout
+
+    for name in ("pushing", "mujoco", "precise", "causal_world", "scm_world/Pushing-v0"):
+        assert name in shown
+    assert "available, version" in shown
+
+
+def test_version() -> None:
+    """--version is the version of the package."""
+    from scm_world import __version__
+
+    assert call("--version").stdout == f"scm-world {__version__}\n"
+
+
+def test_help_is_fast_and_loads_no_engine() -> None:
+    """Help comes within a second; neither engines nor matplotlib are loaded for it."""
+    code = (
+        "import sys; from scm_world.cli import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "bad = {'mujoco', 'pybullet', 'matplotlib', 'numba', 'networkx'} & set(sys.modules)\n"
+        "sys.exit(','.join(bad))"
+    )
+    started = time.perf_counter()
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert time.perf_counter() - started < 2.0  # one second, and as much for a busy machine
+
+
+def test_the_module_is_the_command() -> None:
+    """``python -m scm_world`` runs, is plain when piped, and errors have no traceback."""
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "scm_world", "graph", "pushin"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: no task is named 'pushin'; did you mean 'pushing'?")
+    assert done.stderr.count("\n") == 1
+    assert not CONTROL.search(done.stderr)
+
+
+# --- refusing ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("discover", "pushin"), "did you mean 'pushing'?"),
+        (("discover", "pushing", "--backend", "mujco"), "did you mean 'mujoco'?"),
+        (("discover", "pushing", "--preset", "fats"), "did you mean 'fast'?"),
+        (("discover", "pushing", "--probes", "0"), "--probes"),
+        (("discover", "pushing", "--seed", "-1"), "--seed"),
+        (("graph", "pushing", "--action-mode", "torques"), "did you mean 'joint_torques'?"),
+        (("graph", "pushing", "--format", "svg"), "--format"),
+        (("do", "pushing", "tool_block.mas=0.1"), "did you mean 'tool_block.mass'?"),
+        (("do", "pushing", "tool_block.mass=heavy"), "expected numbers, got 'heavy'"),
+        (("do", "pushing", "tool_block.mass=nan"), "must be finite"),
+        (("do", "pushing", "tool_block.mass=-1"), "the nearest allowed value"),
+        (("do", "pushing", "gravity=1,2"), "expected shape (3,), got (2,)"),
+        (("do", "pushing", "success=1"), "intervene on a cause"),
+        (("do", "pushing", "gravity=1,2,3", "tool_block.mass=9e9"), "tool_block.mass"),
+        (("do", "pushing", "tool_block.mass=0.09", "--space", "A"), "outside space A"),
+        (("do", "pushing", "tool_block.mass=0.09", "--space", "C"), "no space is named 'C'"),
+        (("do", "pushing", "tool_block.mass"), "name=value"),
+        (("do", "pushing", "tool_block.mass=shift:x"), "expected numbers"),
+        (("do", "pushing", "tool_block.mass=1", "tool_block.mass=2"), "both set"),
+    ],
+)
+def test_bad_input_is_one_clean_message(arguments: tuple[str, ...], message: str) -> None:
+    """Every mistake has exit code 2, says what is allowed, and leaves nothing behind."""
+    result = call(*arguments)
+
+    assert result.exit_code == 2
+    assert message in " ".join(result.stderr.replace("│", " ").split())
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+    assert files() == []
+
+
+@pytest.mark.parametrize("command", [("discover", "reaching"), ("do", "pushing", "gravity=0,0,-5")])
+def test_a_file_in_the_way_is_found_before_the_work(command: tuple[str, ...]) -> None:
+    """Where the folder for the results is a file, nothing is run."""
+    Path("taken").write_text("mine")
+    result = call(*command, "--out", "taken")
+
+    assert result.exit_code == 2
+    assert "is a file" in " ".join(result.stderr.split())
+    assert Path("taken").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("discover", "reaching", "--backend", "fake", "--probes", "1"),
+        ("do", "pushing", "tool_block.mass=0.04", "--backend", "fake", "--steps", "1"),
+        ("list",),
+    ],
+)
+def test_piped_output_is_plain(arguments: tuple[str, ...]) -> None:
+    """There are no control codes, and no cell is cut off."""
+    result = call(*arguments)
+
+    assert result.exit_code == 0, result.output
+    assert not CONTROL.search(result.output)
+    assert "…" not in result.output
+
+
+# --- values --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3", 3),
+        ("-0.5", -0.5),
+        ("1e-3", 0.001),
+        ("1,2,3", [1, 2, 3]),
+        (" [ 1, 2.5 ] ", [1, 2.5]),
+        ("[1]", [1]),
+        ("[]", []),
+        ("1,,2", [1, "", 2]),
+        ("heavy", "heavy"),
+        ("shift:0.1", Shift(0.1)),
+        ("shift:[0,0,1]", Shift((0, 0, 1))),
+        ("Scale: 2", Scale(2)),
+        ("draw:A", Draw("A")),
+        ("draw:A|B", Draw("A|B")),
+    ],
+)
+def test_values_are_read(text: str, value: object) -> None:
+    """Numbers, lists and interventions; what is none is left to the model."""
+    assert parse_value(text) == value
+
+
+@pytest.mark.parametrize("text", ["", " ", "shift:", "shift:x", "draw:C", "jump:1"])
+def test_what_is_no_value_is_refused(text: str) -> None:
+    """An empty value and an unknown intervention are usage errors."""
+    with pytest.raises(typer.BadParameter):
+        parse_value(text)
+
+
+def test_assignments_are_read() -> None:
+    """A value may contain further equal signs only where the model refuses it."""
+    assert parse_assignments(["a=1", " b =2,3"]) == {"a": 1, "b": [2, 3]}
+    with pytest.raises(typer.BadParameter, match="name=value"):
+        parse_assignments(["a"])
+    with pytest.raises(ConflictingTargets):
+        parse_assignments(["a=1", "a=2"])

@@ -1,0 +1,129 @@
+"""Pictures of graphs, and the few words that name many variables."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from scm_world.discovery import DiscoveryReport, discover, score
+from scm_world.discovery.layers import lay_out
+from scm_world.discovery.names import Families, braces, by_entity
+from scm_world.discovery.plots import EXTRA, MATCHED, MISSING, draw_graphs, draw_model
+from scm_world.discovery.scores import EdgeKey
+from scm_world.graph import SCM
+from scm_world.variables import Derived, Exogenous, Linear, Parent
+from scm_world.world import World
+
+MODEL = SCM(
+    [
+        Exogenous(name="a"),
+        Derived(name="b", parents=("a",), mechanism=Linear(weights=(2.0,))),
+        Derived(name="c", parents=("b", Parent("a", 1)), mechanism=Linear(weights=(1.0, 1.0))),
+    ]
+)
+
+
+def report(found: tuple[EdgeKey, ...], declared: tuple[EdgeKey, ...]) -> DiscoveryReport:
+    """Write a report with these edges."""
+    return DiscoveryReport(
+        task="model",
+        backend="none",
+        preset="none",
+        seed=0,
+        probes=1,
+        planned=1,
+        rollouts=1,
+        floor=0.0,
+        threshold=1e-12,
+        inert=0.0,
+        score=score(found, declared),
+        found=found,
+        declared=declared,
+        effects=dict.fromkeys(found, 1.0),
+        refused={},
+        seconds=0.0,
+        versions={},
+    )
+
+
+def shows(path: Path, color: str) -> bool:
+    """Tell whether a good part of a picture below its legend has a color."""
+    rgb = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    picture = imread(path)[100:, :, :3]
+    return bool((np.abs(picture - rgb).max(axis=-1) < 0.02).sum() > 5)
+
+
+def test_matched_missing_and_extra_edges_differ(tmp_path: Path) -> None:
+    """Each of the three has its color, and appears only where there is one."""
+    edges = (("a", "b", 0), ("b", "c", 0), ("b", "c", 1))
+    draw_graphs(report(edges, edges), tmp_path / "equal.png")
+    draw_graphs(report(edges[:2], edges[1:]), tmp_path / "other.png")
+
+    seen = [shows(tmp_path / "equal.png", color) for color in (MATCHED, EXTRA, MISSING)]
+    assert seen == [True, False, False]
+    assert all(shows(tmp_path / "other.png", color) for color in (MATCHED, EXTRA, MISSING))
+
+
+@pytest.mark.parametrize("edges", [(), (("a", "a", 1),)])
+def test_hardly_any_edge_is_drawn_too(tmp_path: Path, edges: tuple[EdgeKey, ...]) -> None:
+    """An empty graph and a lone loop are pictures like any other."""
+    draw_graphs(report(edges, edges), tmp_path / "graphs.png")
+    assert imread(tmp_path / "graphs.png").shape[:2] == (900, 1600)
+
+
+def test_a_report_of_a_model_is_drawn(tmp_path: Path) -> None:
+    """Discovery in a model without physics has a picture as well."""
+    draw_graphs(discover(MODEL, probes=2), tmp_path / "graphs.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["graphs.png"]
+
+
+@pytest.mark.parametrize("model", [MODEL, SCM([]), SCM([Exogenous(name="a")])])
+def test_models_are_drawn(tmp_path: Path, model: SCM) -> None:
+    """Any model has a picture, even one without edges."""
+    draw_model(model, tmp_path / "model.png")
+    assert imread(tmp_path / "model.png").shape[:2] == (900, 1600)
+
+
+def test_causes_stand_left_of_their_effects_and_boxes_apart() -> None:
+    """In the drawing of pushing arrows go right, and no two boxes overlap."""
+    drawing = lay_out(World("pushing", backend="fake").model)
+
+    assert all(arrow.path[0][0] < arrow.path[-1][0] for arrow in drawing.arrows)
+    width, height = drawing.box
+    places = np.array(list(drawing.places.values()))
+    apart = np.abs(places[:, None] - places)
+    touching = (apart[..., 0] < width) & (apart[..., 1] < height)
+    assert touching.sum() == len(places)
+    assert (places[:, 1] > 60).all()
+    assert (places[:, 1] < 860).all()
+
+
+def test_drawing_loads_no_pyplot(tmp_path: Path) -> None:
+    """Importing costs no matplotlib, and drawing leaves its global state alone."""
+    code = (
+        "import sys\n"
+        "from scm_world.discovery.plots import draw_model\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        "from scm_world.graph import SCM\n"
+        f"draw_model(SCM([]), {str(tmp_path / 'm.png')!r})\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)  # noqa: S603
+
+
+def test_short_names_are_without_loss() -> None:
+    """Braces stand for a full product of numbers; what is missing is not pretended."""
+    names = ["x_1_a_1", "x_1_a_2", "x_2_a_1"]
+    assert braces(names) == ["x_1_a_{1,2}", "x_2_a_1"]
+    assert braces([*names, "x_2_a_2"]) == ["x_{1,2}_a_{1,2}"]
+    assert by_entity(["b.m", "b.s", "g"]) == ["b.{m, s}", "g"]
+    assert by_entity([]) == []
+
+
+def test_families_have_the_same_edges() -> None:
+    """Variables that differ in more than a number are drawn apart."""
+    families = Families(["b_1", "b_2", "b_3", "c"], [("b_1", "c", 0), ("b_2", "c", 0)])
+    assert families.members == {"b_{1,2}": ("b_1", "b_2"), "b_3": ("b_3",), "c": ("c",)}

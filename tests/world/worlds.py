@@ -1,0 +1,144 @@
+"""Worlds to test with, and what happens in them."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.scene import trifinger
+from scm_world.variables import Draw, Scale, Shift
+from scm_world.world import World
+
+TASKS = ("reaching", "pushing")
+BACKENDS = ("fake", "mujoco", "bullet")
+NEEDS_BULLET = pytest.mark.skipif(
+    importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
+)
+PARAMS = [
+    pytest.param(b, t, id=f"{b}-{t}", marks=NEEDS_BULLET if b == "bullet" else ())
+    for b in BACKENDS
+    for t in TASKS
+]
+PUSHING = [
+    pytest.param(b, "pushing", id=b, marks=NEEDS_BULLET if b == "bullet" else ()) for b in BACKENDS
+]
+PHYSICS = [p for p in PUSHING if p.id != "fake"]
+
+REST = np.array(trifinger.REST)
+
+_WORLDS: dict[tuple[str, str], World] = {}
+
+
+def shared(backend: str, task: str) -> World:
+    """Give the one world of this kind; resetting it leaves no trace, as a test shows."""
+    key = (backend, task)
+    if key not in _WORLDS:
+        _WORLDS[key] = World(task, backend=backend)
+    return _WORLDS[key]
+
+
+def actions(n: int, seed: int = 0, spread: float = 0.4) -> np.ndarray:
+    """Draw joint positions around the rest pose, shape (n, 9)."""
+    return REST + np.random.default_rng(seed).uniform(-spread, spread, (n, 9))
+
+
+def begin(backend: str, task: str, steps: int = 3) -> World:
+    """Give a world in the middle of an episode."""
+    world = shared(backend, task)
+    world.reset(seed=0)
+    play(world, actions(steps, seed=7))
+    return world
+
+
+def play(world: World, commands: Iterable[Any]) -> np.ndarray:
+    """Take actions.
+
+    Returns:
+        State and reward after each of them, shape (n, 28 + 13 blocks).
+    """
+    rows = []
+    for command in commands:
+        world.step(command)
+        now = world.evaluate(("reward", "fractional_success"))
+        state = world.current()[1].vector
+        rows.append([*state, now["reward"], now["fractional_success"]])
+    return np.array(rows)
+
+
+def same(first: dict[str, Any], second: dict[str, Any]) -> bool:
+    """Compare all values of two worlds bit for bit."""
+    return first.keys() == second.keys() and all(
+        np.asarray(first[name]).tobytes() == np.asarray(second[name]).tobytes() for name in first
+    )
+
+
+def differing(first: dict[str, Any], second: dict[str, Any]) -> set[str]:
+    """Name the values that differ."""
+    return {name for name in first if not np.array_equal(first[name], second[name])}
+
+
+def other(world: World, name: str) -> np.ndarray:
+    """Give another value of a variable, not far from the present one."""
+    quantity = name.rpartition(".")[2]
+    value = world[name]
+    match quantity:
+        case "size":
+            return value + 0.004
+        case "cartesian_position" | "cylindrical_position":
+            return value + np.array([0.003, 0.004, 0.02])
+        case "orientation":
+            return np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
+        case "euler_orientation":
+            return np.array([0.0, 0.0, 0.2])
+        case "linear_velocity" | "angular_velocity" | "joint_velocities":
+            return value + 0.3
+        case "joint_positions":
+            return value + np.tile([0.0, -0.02, 0.01], 3)
+        case "gravity":
+            return value + np.array([0.5, -0.3, 1.0])
+        case "robot_height":
+            return value + 0.01
+        case "control_index":
+            return value + 4
+        case "color" | "floor_color" | "stage_color":
+            return np.array([0.2, 0.7, 0.4])
+        case _:
+            return value * 0.8
+
+
+def settable(world: World) -> list[str]:
+    """Name everything that do accepts, but for the action."""
+    model = world.model
+    return [n for n in model if model.declared(model.target(n)).settable and n != "action"]
+
+
+def story(backend: str, task: str) -> str:
+    """Play an episode with all kinds of interventions, and hash everything in it."""
+    world = World(task, backend=backend)
+    digest = hashlib.sha256()
+
+    def note() -> None:
+        for name, value in sorted(world.values().items()):
+            digest.update(name.encode())
+            digest.update(np.asarray(value).tobytes())
+
+    world.reset(seed=5, do={"floor_friction": Draw("A"), "robot_height": 0.345})
+    note()
+    for episode in range(2):
+        for step, command in enumerate(actions(12, seed=episode)):
+            world.step(command)
+            if step == 4:
+                world.do({"robot_finger_60_link_2.mass": Scale(0.7), "stage_friction": Draw("B")})
+            if step == 6:
+                world.do({"joint_velocities": Shift(0.1), "gravity": Draw("A|B")})
+            if step == 8 and task == "pushing":
+                world.do({"block.size": Shift(0.004), "goal_block": {"polar": Draw("A")}})
+            note()
+        world.reset()
+    world.close()
+    return digest.hexdigest()
