@@ -135,14 +135,8 @@ def _words(request: Any) -> str:
 def _print_rows(terminal: Console, outcome: Outcome, *, show_all: bool) -> None:
     """Write one row per descendant that moved, or per descendant."""
     steps = outcome.options.steps
-    headers = (
-        "descendant",
-        "unit",
-        "before",
-        "right after",
-        f"after {steps} steps",
-        "without the do()",
-    )
+    end = f"after {steps} steps"
+    headers = ("descendant", "unit", "before", "right after", end, "without the do()")
     follow = [row for row in outcome.rows if row.follows]
     made = table(*headers, "difference", title="What followed")
     for row in follow:

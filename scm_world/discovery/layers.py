@@ -258,7 +258,8 @@ def _arrows(
     box: Point,
 ) -> Iterable[Arrow]:
     for (cause, effect), chain in chains.items():
-        inner = [places[item] for item in chain[1:-1]]
+        beside = [places[item] for item in chain[1:-1]]
+        inner = [(x + side, y) for x, y in beside for side in (-box[0] / 2, box[0] / 2)]
         (x0, y0), (x1, y1) = places[cause], places[effect]
         path = ((x0 + box[0] / 2, y0), *inner, (x1 - box[0] / 2, y1))
         back = graph.has_edge(effect, cause) and not ahead.has_edge(effect, cause)

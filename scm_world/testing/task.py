@@ -95,9 +95,9 @@ class TaskConformance:
                 continue
             target = world.model.declared(world.model.target(variable.name))
             for episode in range(20):
-                value = noise.draw(
-                    source, variable.name, variable.shape, values, episode=episode
-                )[0]
+                value = noise.draw(source, variable.name, variable.shape, values, episode=episode)[
+                    0
+                ]
                 assert variable.in_space(value, space, values), variable.name
                 if target is not variable:
                     value = np.asarray(_inverse(variable)(value))
@@ -225,9 +225,7 @@ def out_of_bounds(world: World) -> list[str]:
         variable.name
         for variable in world.model.variables
         if not np.isfinite(values[variable.name]).all()
-        or not (
-            variable.bounds is None or variable.bounds.contains(values[variable.name], values)
-        )
+        or not (variable.bounds is None or variable.bounds.contains(values[variable.name], values))
     ]
 
 
@@ -269,7 +267,12 @@ def _inverse(variable: Variable) -> Any:
 
 
 def _command(world: World, generator: np.random.Generator) -> Floats:
-    """Draw an action: near the rest pose, or anywhere in its range."""
-    if world.action_mode == "joint_positions":
-        return np.asarray(np.array(trifinger.REST) + generator.uniform(-0.8, 0.8, 9))
-    return np.asarray(generator.uniform(world.action_low, world.action_high))
+    """Draw an action: anywhere in its range, now and then at its ends, or near the rest pose."""
+    low, high = world.action_low, world.action_high
+    match generator.integers(4):
+        case 0:
+            return np.asarray(np.where(generator.random(9) < 0.5, low, high))
+        case 1 if world.action_mode == "joint_positions":
+            return np.asarray(np.array(trifinger.REST) + generator.uniform(-0.8, 0.8, 9))
+        case _:
+            return np.asarray(generator.uniform(low, high))

@@ -24,10 +24,8 @@ POLAR_BOUNDS = Box((0.0, -math.pi), (0.24, math.pi))  # [m, rad]
 QUATERNION_BOUNDS = Rotations()
 LINEAR_VELOCITY_BOUNDS = Box(-10.0, 10.0)  # [m/s]
 ANGULAR_VELOCITY_BOUNDS = Box(-100.0, 100.0)  # [rad/s]
-JOINT_BOUNDS = Box(
-    (-1.57079632679, -1.57079632679, -3.14159265359) * 3,
-    (1.57079632679, 1.57079632679, 3.14159265359) * 3,
-)  # [rad]
+JOINT_BOUNDS = Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3)
+"""The stops at a quarter and half a turn, and 0.1 rad that a joint may press into them [rad]."""
 JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
 CONTROL_INDEX_BOUNDS = Integers(0, 10**9)
 TYPE_BOUNDS = Categories((1, 2, 10, 20, 21, 23))

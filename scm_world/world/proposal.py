@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.entities import CONTROL_INDEX
-from scm_world.errors import ConflictingTargets, InterventionError, raise_all
+from scm_world.errors import ConflictingTargets, InterventionError, OutOfBounds, raise_all
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.scene import PhysicalState
 from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Shift
@@ -62,13 +62,16 @@ class Proposal:
     asked: tuple[str, ...]
 
 
-def accept(model: SCM, request: Mapping[str, Any]) -> tuple[Requests, list[InterventionError]]:
+def accept(
+    world: World, instant: Instant, request: Mapping[str, Any]
+) -> tuple[Requests, list[InterventionError]]:
     """Check names, types and shapes; keep what is right and list what is wrong."""
+    model = world.model
     accepted: Requests = {}
     problems: list[InterventionError] = []
     for name, value in flatten(request).items():
         try:
-            act = model.accept(name, value)
+            act = _accept(world, instant, name, value)
             target = model.target(name)
             if target in accepted:
                 raise ConflictingTargets((accepted[target][0], name), target)
@@ -76,6 +79,18 @@ def accept(model: SCM, request: Mapping[str, Any]) -> tuple[Requests, list[Inter
         except InterventionError as problem:
             problems.append(problem)
     return accepted, problems
+
+
+def _accept(world: World, instant: Instant, name: str, value: Any) -> Intervention:
+    try:
+        return world.model.accept(name, value)
+    except OutOfBounds as problem:
+        # What physics did is possible: a state can always be put back to where it is.
+        if name in world.slices and np.array_equal(
+            problem.value, instant.state.vector[world.slices[name]]
+        ):
+            return Hard(problem.value)
+        raise
 
 
 def propose(
@@ -86,7 +101,7 @@ def propose(
     Raises:
         InterventionError: With every problem of the request.
     """
-    accepted, problems = accept(world.model, request)
+    accepted, problems = accept(world, instant, request)
     requests: Requests = {**instant.requests, **accepted}
     draft = _Draft(world, instant, requests)
     with np.errstate(all="ignore"):  # what is not finite is refused by name
@@ -171,14 +186,18 @@ class _Draft:
 
     def _set(self, target: str) -> list[InterventionError]:
         value = self._wish(target, *self._requests[target])
+        where = self._world.slices.get(target)
+        if where is not None and np.array_equal(value, self._instant.state.vector[where]):
+            self.state.vector[where] = value
+            return []
         try:
             check_bounds(self._world.model.declared(target), value, self.static)
         except InterventionError as problem:
             return [problem]
-        if target == CONTROL_INDEX:
+        if where is None:
             self.index = int(value)
         else:
-            self.state.vector[self._world.slices[target]] = self._exact(target, value)
+            self.state.vector[where] = self._exact(target, value)
         return []
 
     def _exact(self, target: str, value: Value) -> Value:

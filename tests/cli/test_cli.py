@@ -280,7 +280,7 @@ def test_help_is_fast_and_loads_no_engine() -> None:
 
 def test_the_module_is_the_command() -> None:
     """``python -m scm_world`` runs, is plain when piped, and errors have no traceback."""
-    done = subprocess.run(  # noqa: S603
+    done = subprocess.run(
         [sys.executable, "-m", "scm_world", "graph", "pushin"],
         capture_output=True,
         text=True,

@@ -183,7 +183,7 @@ def test_a_lambda_works_and_is_equal_to_itself_only() -> None:
     """Functions without a name are told apart by identity."""
     first, second = Function(lambda x: x), Function(lambda x: x)
     assert first.bind()(3.0) == 3.0
-    assert first == first  # noqa: PLR0124
+    assert first == first
     assert first != second
     assert not first.is_portable()
     assert Function(double).is_portable()

@@ -126,9 +126,7 @@ def test_episodes_have_the_published_lengths() -> None:
     ],
     ids=str,
 )
-def test_an_option_that_does_not_exist_is_refused(
-    options: dict[str, Any], suggestion: str
-) -> None:
+def test_an_option_that_does_not_exist_is_refused(options: dict[str, Any], suggestion: str) -> None:
     """The error lists the choices and suggests the nearest."""
     with pytest.raises(UnknownOption, match=suggestion) as caught:
         World(**{"backend": "fake", **options})
