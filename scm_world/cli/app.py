@@ -29,7 +29,7 @@ class Commands(TyperGroup):
         except BrokenPipeError:  # the reader has seen enough
             raise
         except OSError as error:
-            fail(f"{error.strerror}: {error.filename}")
+            fail(str(error))
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
             fail("interrupted before there was a result")

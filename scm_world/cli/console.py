@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-WIDTH = 160  # [characters] where there is no terminal to ask
+WIDTH, PAGE = 160, 200  # [characters] where there is no terminal to ask; for the widest tables
 RESULTS = Path("scm-world-results")
 
 

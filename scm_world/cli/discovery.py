@@ -63,11 +63,11 @@ def run(options: Options, *, out: Path | None, strict: bool) -> int:
             report = discover(world, probes=options.probes, seed=options.seed, progress=progress)
     finally:
         world.close()
+    terminal = console()
+    _print(terminal, report, tuple(world.model))
     with staged(folder) as draft:
         report.save(draft / "report.json")
         draw_graphs(report, draft / "graphs.png")
-    terminal = console()
-    _print(terminal, report, tuple(world.model))
     written(terminal, folder / "report.json", folder / "graphs.png")
     if report.probes < report.planned:
         return INTERRUPTED
@@ -130,8 +130,8 @@ def _causes(report: DiscoveryReport, names: Iterable[str], effect: str, lag: int
     edges = [(cause, effect, lag) for cause in names]
     kinds = (
         ("", "", [e for e in edges if e in found and e in declared]),
-        ("[+] ", EXTRA, [e for e in edges if e in found and e not in declared]),
-        ("[-] ", MISSING, [e for e in edges if e in declared and e not in found]),
+        ("[+]", EXTRA, [e for e in edges if e in found and e not in declared]),
+        ("[-]", MISSING, [e for e in edges if e in declared and e not in found]),
     )
     parts = [
         Text(symbol + short, style=style)

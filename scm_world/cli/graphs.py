@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.text import Text
 
-from scm_world.cli.console import check_writable, console, keep_whole, show, table, written
+from scm_world.cli.console import PAGE, check_writable, console, keep_whole, show, table, written
 from scm_world.discovery.names import braces, by_entity
 from scm_world.graph import SCM, to_dot, to_json
 from scm_world.variables import Affine, Box, Variable
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 KIND_STYLE = {"exogenous": "yellow", "derived": "green", "measured": "blue", "action": "magenta"}
 LONG = 80  # [characters] what is longer is written once
-PAGE = 200  # [characters] where there is no terminal to ask
 
 
 def run(task: str, format_: str, out: Path | None, action_mode: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any, final
 
 from scm_world._types import Floats, Value, Values
 from scm_world.cli.assignments import parse_assignments
-from scm_world.cli.console import RESULTS, check_writable, console
+from scm_world.cli.console import PAGE, RESULTS, check_writable, console
 from scm_world.discovery.paired import gap
 from scm_world.errors import UnknownOption
 from scm_world.scene import Scene
@@ -112,7 +112,7 @@ def run(assignments: Sequence[str], options: Options, *, show_all: bool, out: Pa
     check_writable(folder, folder=True)
     outcome = paired(request, options)
     save(outcome, folder)
-    report(console(), outcome, folder, show_all=show_all)
+    report(console(width=PAGE), outcome, folder, show_all=show_all)
     return int(bool(outcome.astray))
 
 

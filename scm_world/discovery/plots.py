@@ -153,8 +153,8 @@ def _spot(matrix: _Matrix, cause: str, effect: str, lag: int) -> tuple[float, fl
 
 def _grid(ax: Axes, matrix: _Matrix) -> None:
     """Label rows and columns, and set off the entities from one another."""
-    ax.set_xlim(-0.5, len(matrix.causes) - 0.5)
-    ax.set_ylim(len(matrix.effects) - 0.5, -0.5)
+    ax.set_xlim(-0.5, max(len(matrix.causes), 1) - 0.5)
+    ax.set_ylim(max(len(matrix.effects), 1) - 0.5, -0.5)
     size = max(5.0, min(10.0, 260.0 / max(len(matrix.effects), len(matrix.causes), 1)))
     ax.set_xticks(range(len(matrix.causes)), matrix.causes, rotation=90, fontsize=size)
     ax.set_yticks(range(len(matrix.effects)), matrix.effects, fontsize=size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 from scm_world.discovery.models import paired_effects
@@ -81,17 +82,17 @@ def _experiments(
     world: World, probes: int, seed: int, progress: Callable[[int, int], None] | None
 ) -> tuple[Effects, int]:
     paired = Paired(world, seed)
-    done = 0
+    done, finished = 0, paired.effects
     try:
         for number, probe in enumerate(probe_states(world, probes, seed)):
             paired.run(number, probe)
-            done = number + 1
+            done, finished = number + 1, deepcopy(paired.effects)
             if progress is not None:
                 progress(done, probes)
     except KeyboardInterrupt:
         if done == 0:
             raise
-    return paired.effects, done
+    return finished, done
 
 
 def _report(

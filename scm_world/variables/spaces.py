@@ -7,7 +7,7 @@ that lies on the floor is half its size). They are evaluated when asked, never s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -60,7 +60,15 @@ def _parents(*bounds: Bounds) -> Iterator[str]:
                 yield part.parent
 
 
+@lru_cache(maxsize=1024)
+def _constant(bound: float | tuple[float, ...], shape: tuple[int, ...]) -> Floats:
+    numbers = np.asarray(bound, dtype=np.float64)
+    return np.broadcast_to(numbers.reshape(shape) if numbers.ndim else numbers, shape)
+
+
 def _evaluate(bound: Bounds, shape: tuple[int, ...], values: Values) -> Floats:
+    if not any(_parents(bound)):
+        return _constant(bound, shape)  # type: ignore[arg-type] # no part of it is Affine
     if not isinstance(bound, tuple):
         number = bound.evaluate(values) if isinstance(bound, Affine) else np.float64(bound)
         return np.broadcast_to(

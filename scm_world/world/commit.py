@@ -40,13 +40,19 @@ def difference(world: World, proposal: Proposal) -> Difference:
     return Difference(None, changed, None if same else proposal.state)
 
 
-def _moves_surfaces(change: Difference) -> bool:
-    return change.state is not None or any(what in _MOVES for _, what in change.parameters)
+def _moves_surfaces(world: World, change: Difference) -> bool:
+    if any(what in _MOVES for _, what in change.parameters):
+        return True
+    if change.state is None:
+        return False
+    now, then = world.current()[1], change.state
+    joints = np.array_equal(now.joint_positions, then.joint_positions)
+    return not (joints and np.array_equal(now.blocks[:, :7], then.blocks[:, :7]))
 
 
 def _new_overlaps(world: World, instant: Instant, proposal: Proposal) -> list[Overlap]:
     """List overlaps deeper than what physics left; taking something back is always possible."""
-    if not _moves_surfaces(difference(world, proposal)):
+    if not _moves_surfaces(world, difference(world, proposal)):
         return []
     found = overlaps(world.describe(proposal.static, proposal.state), tolerance=TOLERANCE)
     if not found:

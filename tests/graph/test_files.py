@@ -175,7 +175,8 @@ def test_a_lambda_cannot_be_written() -> None:
         '{"format": "scm_world/model/1", "variables": [], '
         '"interventions": {"x": {"kind": "hard", "value": 1}}}',
         '{"format": "scm_world/model/1", "variables": [{"kind": "derived", "name": "x", '
-        '"parents": [{"name": "y", "bogus": 1}], "mechanism": {"kind": "linear", "weights": [1]}}]}',
+        '"parents": [{"name": "y", "bogus": 1}], '
+        '"mechanism": {"kind": "linear", "weights": [1]}}]}',
     ],
 )
 def test_what_is_no_model_is_refused(text: str) -> None:

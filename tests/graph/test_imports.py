@@ -20,7 +20,7 @@ def imported(module: str) -> tuple[set[str], str]:
     program = (
         f"import {module}, sys\nprint('#'.join({{name.partition('.')[0] for name in sys.modules}}))"
     )
-    run = subprocess.run(
+    run = subprocess.run(  # noqa: S603 our own interpreter
         [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=True
     )
     *printed, last = run.stdout.splitlines()

@@ -33,7 +33,7 @@ def place(world: World, offset: tuple[float, float, float], yaw: float = 0.0) ->
     world.do({"tool_block": tool})
 
 
-# --- the numbers themselves -----------------------------------------------------------------------
+# --- the numbers themselves ----------------------------------------------------------------------
 
 
 def test_distances() -> None:
@@ -108,7 +108,7 @@ def test_distances_to_three_goals() -> None:
     assert kernels.reach_progress(half, np.zeros(9), *goals) == pytest.approx(np.sqrt(285.0) / 2)
 
 
-# --- in the world ------------------------------------------------------------------------------------
+# --- in the world --------------------------------------------------------------------------------
 
 
 def test_pushing_rewards_what_one_step_changed() -> None:
@@ -118,7 +118,7 @@ def test_pushing_rewards_what_one_step_changed() -> None:
     world.do({"tool_block": {"cartesian_position": position, "linear_velocity": [0.0, 0.2, 0.0]}})
     tips = forward(np.array(trifinger.RAISED), 0.34).reshape(3, 3)
     world.step(trifinger.RAISED)
-    moved = position + [0.0, 0.2 * 0.04, 0.0]
+    moved = position + np.array([0.0, 0.2 * 0.04, 0.0])
     values = world.values()
     before, after = (np.linalg.norm(tips - p) for p in (position, moved))
     assert values["reward.block_to_goal"] == pytest.approx(0.008)
@@ -224,7 +224,7 @@ def test_velocities_that_change_cost_smoothness() -> None:
     world.close()
 
 
-# --- the registry ------------------------------------------------------------------------------------
+# --- the registry --------------------------------------------------------------------------------
 
 
 def test_conventions_are_chosen_by_name() -> None:

@@ -15,42 +15,60 @@ needs_bullet = pytest.mark.skipif(
 
 
 class Pushing(TaskConformance):
+    """Pushing, on one of the engines."""
+
     backend: ClassVar[str]
 
     def make(self) -> World:
+        """Create a world."""
         return World("pushing", backend=self.backend)
 
 
 class Reaching(TaskConformance):
+    """Reaching, on one of the engines."""
+
     backend: ClassVar[str]
 
     def make(self) -> World:
+        """Create a world."""
         return World("reaching", backend=self.backend)
 
 
 class TestPushingFake(Pushing):
+    """Pushing without physics."""
+
     backend = "fake"
 
 
 class TestPushingMujoco(Pushing):
+    """Pushing on MuJoCo."""
+
     backend = "mujoco"
 
 
 @needs_bullet
 class TestPushingBullet(Pushing):
+    """Pushing on Bullet."""
+
     backend = "bullet"
 
 
 class TestReachingFake(Reaching):
+    """Reaching without physics."""
+
     backend = "fake"
 
 
 class TestReachingMujoco(Reaching):
+    """Reaching on MuJoCo."""
+
     backend = "mujoco"
 
 
 @needs_bullet
 class TestReachingBullet(Reaching):
+    """Reaching on Bullet."""
+
     backend = "bullet"
 
 

@@ -38,7 +38,7 @@ def test_chunks_do_not_matter(n: int, chunks: list[int], first: int) -> None:
 
 def test_another_process_draws_the_same() -> None:
     """Noise depends on its key only, not on hash seeds or on the process."""
-    run = subprocess.run(
+    run = subprocess.run(  # noqa: S603 our own interpreter
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
     )
     here = Noise(11).uniforms("tool_block.mass", n=5, episode=3, step=7, count=4)

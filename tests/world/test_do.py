@@ -158,7 +158,7 @@ def test_the_error_names_the_target_that_is_in_the_way() -> None:
     assert "'tool_block' lies" in caught.value.problems[0]
 
 
-# --- what a do reports ------------------------------------------------------------------------------
+# --- what a do reports ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("backend", "task"), PARAMS)

@@ -43,7 +43,9 @@ print(json.dumps(digests))
 def elsewhere(program: str, data: Any) -> list[str]:
     """Run a program in a fresh process."""
     command = [sys.executable, "-c", program, str(HERE), json.dumps(data)]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    run = subprocess.run(  # noqa: S603 our own interpreter
+        command, capture_output=True, text=True, check=True
+    )
     answer: list[str] = json.loads(run.stdout.splitlines()[-1])
     return answer
 
@@ -261,7 +263,7 @@ def test_a_snapshot_of_another_world_is_refused(options: dict[str, Any]) -> None
     world.close()
 
 
-# --- worlds side by side ---------------------------------------------------------------------------
+# --- worlds side by side -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("backend", "task"), PARAMS)

@@ -32,7 +32,7 @@ from scm_world.scene import trifinger
 from scm_world.variables import Affine, Box, Draw, Scale, Shift
 from scm_world.world import World
 
-# --- what is moved, and what is not --------------------------------------------------------------------
+# --- what is moved, and what is not --------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("backend", "task"), PUSHING)
@@ -131,7 +131,7 @@ def test_appearances_and_goals_have_no_effect(backend: str, task: str) -> None:
         np.testing.assert_array_equal(moved, future, err_msg=name)
 
 
-# --- interventions as values ----------------------------------------------------------------------------
+# --- interventions as values ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("backend", "task"), PUSHING)
@@ -150,7 +150,9 @@ def test_shift_and_scale_change_parameters_and_states(backend: str, task: str) -
     assert world["tool_block.mass"] == pytest.approx(0.04)
     assert world["floor_friction"] == pytest.approx(0.4)
     np.testing.assert_allclose(world["joint_velocities"], 0.5 * velocity)
-    np.testing.assert_allclose(world["tool_block.cartesian_position"], place + [0, 0, 0.1])
+    np.testing.assert_allclose(
+        world["tool_block.cartesian_position"], place + np.array([0.0, 0.0, 0.1])
+    )
 
 
 def test_a_shift_goes_on_following_its_parent() -> None:
@@ -246,7 +248,7 @@ def test_the_asked_space_is_checked() -> None:
             world.do({name: value}, space="A")
 
 
-# --- time ---------------------------------------------------------------------------------------------------
+# --- time ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("backend", "task"), PARAMS)
@@ -298,7 +300,7 @@ def test_the_clock_can_be_set() -> None:
     assert world["time_left_for_task"] == pytest.approx(10.0)
 
 
-# --- actions --------------------------------------------------------------------------------------------------
+# --- actions -------------------------------------------------------------------------------------
 
 
 def test_an_intervention_on_the_action_replaces_the_policy() -> None:
@@ -329,7 +331,7 @@ def test_an_empty_do_does_nothing() -> None:
     world = begin("fake", "pushing")
     values = world.values()
     audit = world.do({})
-    assert not (audit.targets or audit.followed or audit.engine)
+    assert (audit.targets, audit.followed, audit.engine) == ({}, {}, {})
     assert same(world.values(), values)
 
 

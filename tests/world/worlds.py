@@ -82,33 +82,33 @@ def differing(first: dict[str, Any], second: dict[str, Any]) -> set[str]:
     return {name for name in first if not np.array_equal(first[name], second[name])}
 
 
+_MOVES = {
+    "size": 0.004,
+    "cartesian_position": np.array([0.003, 0.004, 0.02]),
+    "cylindrical_position": np.array([0.003, 0.004, 0.02]),
+    "linear_velocity": 0.3,
+    "angular_velocity": 0.3,
+    "joint_velocities": 0.3,
+    "joint_positions": np.tile([0.0, -0.02, 0.01], 3),
+    "gravity": np.array([0.5, -0.3, 1.0]),
+    "robot_height": 0.01,
+    "control_index": 4,
+}
+_PLACES = {
+    "orientation": np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)]),
+    "euler_orientation": np.array([0.0, 0.0, 0.2]),
+    **dict.fromkeys(("color", "floor_color", "stage_color"), np.array([0.2, 0.7, 0.4])),
+}
+
+
 def other(world: World, name: str) -> np.ndarray:
     """Give another value of a variable, not far from the present one."""
     quantity = name.rpartition(".")[2]
-    value = world[name]
-    match quantity:
-        case "size":
-            return value + 0.004
-        case "cartesian_position" | "cylindrical_position":
-            return value + np.array([0.003, 0.004, 0.02])
-        case "orientation":
-            return np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
-        case "euler_orientation":
-            return np.array([0.0, 0.0, 0.2])
-        case "linear_velocity" | "angular_velocity" | "joint_velocities":
-            return value + 0.3
-        case "joint_positions":
-            return value + np.tile([0.0, -0.02, 0.01], 3)
-        case "gravity":
-            return value + np.array([0.5, -0.3, 1.0])
-        case "robot_height":
-            return value + 0.01
-        case "control_index":
-            return value + 4
-        case "color" | "floor_color" | "stage_color":
-            return np.array([0.2, 0.7, 0.4])
-        case _:
-            return value * 0.8
+    if quantity in _PLACES:
+        return _PLACES[quantity]
+    if quantity in _MOVES:
+        return world[name] + _MOVES[quantity]
+    return 0.8 * world[name]
 
 
 def settable(world: World) -> list[str]:
