@@ -50,9 +50,11 @@ def _moves_surfaces(world: World, change: Difference) -> bool:
     return not (joints and np.array_equal(now.blocks[:, :7], then.blocks[:, :7]))
 
 
-def _new_overlaps(world: World, instant: Instant, proposal: Proposal) -> list[Overlap]:
+def _new_overlaps(
+    world: World, instant: Instant, proposal: Proposal, change: Difference
+) -> list[Overlap]:
     """List overlaps deeper than what physics left; taking something back is always possible."""
-    if not _moves_surfaces(world, difference(world, proposal)):
+    if not _moves_surfaces(world, change):
         return []
     found = overlaps(world.describe(proposal.static, proposal.state), tolerance=TOLERANCE)
     if not found:
@@ -64,7 +66,11 @@ def _new_overlaps(world: World, instant: Instant, proposal: Proposal) -> list[Ov
 
 
 def refuse_overlaps(
-    world: World, instant: Instant, proposal: Proposal, request: Mapping[str, Any]
+    world: World,
+    instant: Instant,
+    proposal: Proposal,
+    change: Difference,
+    request: Mapping[str, Any],
 ) -> None:
     """Refuse an intervention that puts two bodies in one place.
 
@@ -73,7 +79,7 @@ def refuse_overlaps(
     Raises:
         Infeasible: With the bodies, the depths, and the nearest value that is feasible.
     """
-    problems = _new_overlaps(world, instant, proposal)
+    problems = _new_overlaps(world, instant, proposal, change)
     if problems:
         flat = flatten(request)
         bodies = {body for problem in problems for body in problem.bodies}
@@ -90,7 +96,7 @@ def _culprit(world: World, names: Iterable[str], bodies: Iterable[str]) -> str:
 
     def blame(name: str) -> tuple[bool, bool]:
         target = world.model.target(name)
-        moved = {target, *world.static_descendants([target])} & surfaces
+        moved = {target, *world.static_order([target])} & surfaces
         return bool({part.partition(".")[0] for part in moved} & {*bodies}), bool(moved)
 
     return max(names, key=blame)
@@ -123,7 +129,8 @@ def nearest_feasible(
         middle = 0.5 * (low + high)
         try:
             halfway = propose(world, instant, between(middle), None)
-            blocked = bool(_new_overlaps(world, instant, halfway))
+            change = difference(world, halfway)
+            blocked = bool(_new_overlaps(world, instant, halfway, change))
         except InterventionError:  # outside the bounds on the way
             blocked = True
         low, high = (low, middle) if blocked else (middle, high)
@@ -131,14 +138,17 @@ def nearest_feasible(
 
 
 def commit(
-    world: World, instant: Instant, proposal: Proposal, request: Mapping[str, Any]
+    world: World,
+    instant: Instant,
+    proposal: Proposal,
+    change: Difference,
+    request: Mapping[str, Any],
 ) -> tuple[Audit, Instant]:
     """Apply a proposal, read it back, and report; or put everything back and raise.
 
     Raises:
         EngineFailure: The engine does not report what it was given. The world is as before.
     """
-    change = difference(world, proposal)
     before = dict(world.current()[0])
     moved_before = {}
     if change.state is not None:

@@ -135,17 +135,18 @@ class _Draft:
         if not acts:
             return
         self.model = self._instant.model.with_interventions(dict(acts.values()))
-        targets = [target for target in acts if target in self.static]
-        follow = self._world.static_descendants(targets)
+        targets = tuple(target for target in acts if target in self.static)
         draws = [t for t in targets if isinstance(acts[t][1], Draw)]
-        order: Iterable[str] = self._world.static_names
-        known = {name: v for name, v in self.static.items() if name not in targets}
+        order: Iterable[str] = self._world.static_order(targets)
+        known = dict(self.static)
+        for target in targets:
+            del known[target]
         if draws:  # what they are drawn from may follow other variables, states among them
-            order = self.model.structure.order
+            follow = frozenset(order)
+            order = [name for name in self.model.structure.order if name in follow]
             known |= self._world.states(self._instant.state)
-        order = [n for n in order if n in self.static and (n in follow or n in targets)]
         solved = self.model.solve(known, moment=self._moment, only=order)
-        self.static = {name: solved[name] for name in self.static}
+        self.static.update({name: solved[name] for name in order})
         if draws:
             held = {target: Hard(self.static[target].tolist()) for target in draws}
             self.model = self.model.with_interventions(held)
@@ -242,10 +243,10 @@ class _Draft:
 
     def check(self, accepted: Requests, space: SpaceName | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
-        context: Values = {**self.static, **self._world.states(self.state)}
-        problems = self._check_parameters(context)
+        problems = self._check_parameters()
         if space is None:
             return problems
+        context = self._context()
         for target, (name, act) in accepted.items():
             requested = self._world.model.declared(name)
             value = self._held_action(act) if target == "action" else None
@@ -257,14 +258,19 @@ class _Draft:
                 problems.append(problem)
         return problems
 
-    def _check_parameters(self, context: Values) -> list[InterventionError]:
+    def _context(self) -> Values:
+        return {**self.static, **self._world.states(self.state)}
+
+    def _check_parameters(self) -> list[InterventionError]:
         """Check the bounds of everything that changes: targets and what follows them."""
         problems: list[InterventionError] = []
         for name, value in self.static.items():
             if value is self._instant.static[name]:
                 continue
+            variable = self._world.model.declared(name)
+            follows = variable.bounds is not None and variable.bounds.parents()
             try:
-                check_bounds(self._world.model.declared(name), value, context)
+                check_bounds(variable, value, self._context() if follows else {})
             except InterventionError as problem:
                 problems.append(problem)
         return problems

@@ -29,7 +29,7 @@ from scm_world.tasks import Task, conventions, make_task
 from scm_world.variables import Measured, Noise
 from scm_world.variables.kinds import SpaceName
 from scm_world.world.audit import Audit
-from scm_world.world.commit import commit, refuse_overlaps
+from scm_world.world.commit import commit, difference, refuse_overlaps
 from scm_world.world.proposal import Instant, propose
 from scm_world.world.readouts import Readouts, static_order
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
@@ -122,7 +122,7 @@ class World:
         self._before: dict[str, Value] = {}
         self._readouts = Readouts(self.model, self._now, self._before)
         self.static_names = static_order(self.model, self._readouts.order)
-        self._follow: dict[tuple[str, ...], frozenset[str]] = {}
+        self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._instant: Instant | None = None
         self._command = np.zeros(9)
         self._reached = np.zeros(3, dtype=np.bool_)
@@ -152,11 +152,12 @@ class World:
         """The bodies that the engine has to build."""
         return Structure(blocks=self.composition.blocks, preset=self._preset)
 
-    def static_descendants(self, targets: Iterable[str]) -> frozenset[str]:
-        """Name what follows some variables at once, without physics."""
+    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
+        """Name some variables and what follows them at once, without physics, causes first."""
         key = tuple(targets)
         if key not in self._follow:
-            self._follow[key] = frozenset(self.model.structure.instant_descendants(key))
+            follow = {*key, *self.model.structure.instant_descendants(key)}
+            self._follow[key] = tuple(name for name in self.static_names if name in follow)
         return self._follow[key]
 
     def states(self, state: PhysicalState) -> dict[str, Value]:
@@ -333,8 +334,9 @@ class World:
         self._require_episode()
         instant = self._instant or self._present()
         proposal = propose(self, instant, request, space)
-        refuse_overlaps(self, instant, proposal, request)
-        audit, self._instant = commit(self, instant, proposal, request)
+        change = difference(self, proposal)
+        refuse_overlaps(self, instant, proposal, change, request)
+        audit, self._instant = commit(self, instant, proposal, change, request)
         if instant.at_start:
             self._readouts.forget()
         return audit
