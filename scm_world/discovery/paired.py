@@ -22,7 +22,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.discovery.probes import Probe
 from scm_world.discovery.scores import EdgeKey
 from scm_world.errors import InterventionError
-from scm_world.variables import Box, Derived, Integers, Measured, Noise, Rotations, Variable
+from scm_world.variables import Box, Integers, Measured, Noise, Rotations, Variable
 from scm_world.world import World
 
 STEPS = (0.05, -0.05, 0.02, -0.02, 0.005, -0.005, 0.001, -0.001)
@@ -81,11 +81,7 @@ class Paired:
             for v in model.variables
             if v.settable and v.role != "action" and model.target(v.name) == v.name
         )
-        self._aliases = frozenset(
-            v.name for v in model.variables if isinstance(v, Derived) and v.inverse is not None
-        )
         self._computed = world.computed
-        self._static = frozenset(world.static_names)
         reported = tuple(
             v.name
             for v in model.variables
@@ -157,7 +153,7 @@ class Paired:
         world = self._world
         reached = world.values()
         moved = [n for n in reached if n != target and gap(reached[n], self._at_once[n]) > 0.0]
-        held = [n for n in moved if n not in self._aliases and n not in self._computed]
+        held = [n for n in moved if n not in self._computed]
         try:
             self._see_settable(target, value, held)
             self._hold(target, value, held)
@@ -165,9 +161,6 @@ class Paired:
             return False
         alone = world.values()
         self._see_computed(target, [n for n in moved if n in self._computed], alone)
-        for name in moved:
-            if name in self._aliases and name in self._static:
-                self._see_alias(target, name, alone)
         self._see_later(target)
         self._undo(target, value)
         return True
@@ -192,9 +185,6 @@ class Paired:
         for name in moved:
             size = gap(self._evaluate(name, known, self._earlier), self._at_once[name])
             self.effects.see(cause, name, 0, size)
-
-    def _see_alias(self, target: str, name: str, alone: Values) -> None:
-        self.effects.see(target, name, 0, gap(alone[name], self._at_once[name]))
 
     def _evaluate(self, name: str, known: Values, previous: Values) -> Value:
         return self._world.model.solve(known, previous=previous, only=(name,))[name]

@@ -173,6 +173,7 @@ def lowest_point(size: Floats, orientation: Floats) -> float:
         size: Edge lengths, shape (3,) [m].
         orientation: Quaternion (x, y, z, w).
     """
-    x, y, z, w = orientation
+    x, y, z, w = orientation.tolist()
+    length, width, height = size.tolist()
     row = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
-    return 0.5 * float(abs(row[0]) * size[0] + abs(row[1]) * size[1] + abs(row[2]) * size[2])
+    return 0.5 * float(abs(row[0]) * length + abs(row[1]) * width + abs(row[2]) * height)

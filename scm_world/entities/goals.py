@@ -29,8 +29,11 @@ def on_the_floor(polar: Floats, size: Floats) -> Floats:
         The center, shape (..., 3) [m].
     """
     radius, angle = polar[..., 0], polar[..., 1]
-    height = np.broadcast_to(size[..., 2] / 2.0, np.shape(radius))
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
+    center = np.empty((*np.broadcast_shapes(polar.shape[:-1], size.shape[:-1]), 3))
+    center[..., 0] = radius * np.cos(angle)
+    center[..., 1] = radius * np.sin(angle)
+    center[..., 2] = size[..., 2] / 2.0
+    return center
 
 
 def _orientation(name: str) -> Exogenous:

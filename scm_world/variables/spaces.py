@@ -68,7 +68,7 @@ def _constant(bound: float | tuple[float, ...], shape: tuple[int, ...]) -> Float
 
 def _evaluate(bound: Bounds, shape: tuple[int, ...], values: Values) -> Floats:
     if not any(_parents(bound)):
-        return _constant(bound, shape)  # type: ignore[arg-type] # no part of it is Affine
+        return _constant(bound, shape)
     if not isinstance(bound, tuple):
         number = bound.evaluate(values) if isinstance(bound, Affine) else np.float64(bound)
         return np.broadcast_to(
@@ -108,9 +108,13 @@ class Box(_Space):
     def __init__(self, low: Any, high: Any, **fields: Any) -> None:
         super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
 
+    @cached_property
+    def _followed(self) -> frozenset[str]:
+        return frozenset(_parents(self.low, self.high))
+
     def parents(self) -> frozenset[str]:
         """Name the variables that the bounds depend on."""
-        return frozenset(_parents(self.low, self.high))
+        return self._followed
 
     def bounds(self, shape: tuple[int, ...], values: Values) -> tuple[Floats, Floats]:
         """Evaluate both corners, each of shape ``(..., *shape)``."""

@@ -16,6 +16,7 @@ from scm_world.scene.feasibility import Overlap, overlaps
 from scm_world.variables import Hard
 from scm_world.variables.checks import coerce
 from scm_world.world.audit import Applied, Audit
+from scm_world.world.compare import same
 from scm_world.world.proposal import Instant, Proposal, propose
 
 if TYPE_CHECKING:
@@ -33,11 +34,10 @@ def difference(world: World, proposal: Proposal) -> Difference:
     changed = {
         key: np.asarray(proposal.static[name])
         for name, key in world.parameter_keys.items()
-        if proposal.static[name] is not now[name]
-        and not np.array_equal(proposal.static[name], now[name])
+        if not same(proposal.static[name], now[name])
     }
-    same = state.coincides(proposal.state)
-    return Difference(None, changed, None if same else proposal.state)
+    unmoved = state.coincides(proposal.state)
+    return Difference(None, changed, None if unmoved else proposal.state)
 
 
 def _moves_surfaces(world: World, change: Difference) -> bool:
@@ -46,8 +46,8 @@ def _moves_surfaces(world: World, change: Difference) -> bool:
     if change.state is None:
         return False
     now, then = world.current()[1], change.state
-    joints = np.array_equal(now.joint_positions, then.joint_positions)
-    return not (joints and np.array_equal(now.blocks[:, :7], then.blocks[:, :7]))
+    joints = same(now.joint_positions, then.joint_positions)
+    return not (joints and same(now.blocks[:, :7], then.blocks[:, :7]))
 
 
 def _new_overlaps(
@@ -209,6 +209,8 @@ def _not_taken(world: World, change: Difference, proposal: Proposal) -> list[str
 
 
 def _close(given: Floats, reported: Floats) -> bool:
+    if same(given, reported):
+        return True
     return bool(np.all(np.abs(given - reported) <= READ_BACK * np.maximum(1.0, np.abs(given))))
 
 
@@ -247,18 +249,18 @@ def _report(
     for name in proposal.asked:
         applied, back = _outcome(world, proposal, world.model.target(name))
         if name != world.model.target(name):
+            exact = back is not None and same(back, applied)
             applied = world.in_coordinates(name, applied)
-            back = None if back is None else world.in_coordinates(name, back)
+            if back is not None:
+                back = applied if exact else world.in_coordinates(name, back)
         entries[name] = Applied(name, flat[name], applied, back)
     followed = {
         name: (before[name], proposal.static[name])
         for name in proposal.static
-        if name not in entries
-        and proposal.static[name] is not before[name]
-        and not np.array_equal(before[name], proposal.static[name])
+        if name not in entries and not same(proposal.static[name], before[name])
     }
     for name, old in moved_before.items():
-        if name not in entries and not np.array_equal(old, now[name]):
+        if name not in entries and not same(old, now[name]):
             followed[name] = (old, np.array(now[name]))
     engine = {
         body: (old, world.backend.inertia(body.removesuffix(".inertia")))

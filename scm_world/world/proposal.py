@@ -13,9 +13,10 @@ from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import ConflictingTargets, InterventionError, OutOfBounds, raise_all
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.scene import PhysicalState
-from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Shift
+from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Rotations, Shift
 from scm_world.variables.checks import check_bounds, check_space
 from scm_world.variables.kinds import SpaceName
+from scm_world.world.compare import same
 
 if TYPE_CHECKING:
     from scm_world.world.world import World
@@ -188,7 +189,7 @@ class _Draft:
     def _set(self, target: str) -> list[InterventionError]:
         value = self._wish(target, *self._requests[target])
         where = self._world.slices.get(target)
-        if where is not None and np.array_equal(value, self._instant.state.vector[where]):
+        if where is not None and same(value, self._instant.state.vector[where]):
             self.state.vector[where] = value
             return []
         try:
@@ -202,8 +203,9 @@ class _Draft:
         return []
 
     def _exact(self, target: str, value: Value) -> Value:
+        """Make a quaternion one of norm 1; other values are as exact as they were given."""
         bounds = self._world.model.declared(target).bounds
-        return value if bounds is None else bounds.nearest(value, self.static)
+        return bounds.nearest(value) if isinstance(bounds, Rotations) else value
 
     def _wish(self, target: str, name: str, act: Intervention) -> Value:
         requested: Any = self._world.model.declared(name)
@@ -224,7 +226,7 @@ class _Draft:
         parents = variable.set_parents()
         old = [self._before(parent) for parent in parents]
         new = [self._value(parent) for parent in parents]
-        if all(np.array_equal(a, b) for a, b in zip(old, new, strict=True)):
+        if all(same(a, b) for a, b in zip(old, new, strict=True)):
             return
         where = self._world.slices[variable.name]
         self.state.vector[where] = self._moved(variable, where, old, new)

@@ -33,6 +33,8 @@ class Readouts:
         self._fresh = False
         moving = {v.name for v in model.variables if isinstance(v, Measured)}
         follow = set(model.structure.instant_descendants(moving))
+        # Other coordinates of a quantity have no effects: computing them can wait until asked.
+        follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
         self.order = tuple(
             name
             for name in model.structure.order

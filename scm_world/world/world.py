@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import Any, final
 
@@ -122,6 +122,7 @@ class World:
         self._before: dict[str, Value] = {}
         self._readouts = Readouts(self.model, self._now, self._before)
         self.static_names = static_order(self.model, self._readouts.order)
+        self._coordinates: dict[str, Callable[..., Any]] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._instant: Instant | None = None
         self._command = np.zeros(9)
@@ -166,8 +167,11 @@ class World:
 
     def in_coordinates(self, name: str, value: Value) -> Value:
         """Give a value of a quantity in other coordinates of it."""
-        variable: Any = self.model.declared(name)
-        return np.asarray(variable.mechanism.bind()(value))
+        function = self._coordinates.get(name)
+        if function is None:
+            variable: Any = self.model.declared(name)
+            function = self._coordinates[name] = variable.mechanism.bind()
+        return np.asarray(function(value))
 
     def __getitem__(self, name: str) -> Value:
         """Give the present value of one variable.
