@@ -190,7 +190,6 @@ def test_an_audit_says_what_followed(backend: str, task: str) -> None:
         "tool_block.size",
         "goal_block.size",
         "goal_block.cartesian_position",
-        "goal_block.cylindrical_position",
         "tool_block.cartesian_position",
     }
     for name, (old, new) in audit.followed.items():
