@@ -13,7 +13,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.tasks import Observed, Task
 from scm_world.tasks.base import HEAD
-from scm_world.tasks.kernels import scale_into
+from scm_world.tasks.kernels import affine_into, scale_into
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import Audit, World
 
@@ -128,10 +128,11 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        given = np.asarray(action, dtype=np.float64)
+        given = np.array(action, dtype=np.float64)
         if given.shape != (9,):
             raise ActionError(f"an action has shape (9,), got {given.shape}", action)
-        self.world.step(self._middle + self._half * given)
+        affine_into(given, self._middle, self._half, given)
+        self.world.step(given)
         now = self.world.evaluate(self._needed)
         reward = self._scale * float(now["reward"])
         truncated = self.world.index >= self._limit

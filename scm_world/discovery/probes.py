@@ -198,6 +198,10 @@ _WITHOUT_BLOCKS: tuple[Callable[[World, Dice], Setting], ...] = (
 )
 
 
+_AT_ONCE = frozenset(scenario.__name__ for scenario in (solved, block_at_wall, block_in_air))
+"""Settings whose moment passes: a block hits the wall once, a goal is fulfilled until one moves."""
+
+
 def probes(world: World, n: int, seed: int) -> Iterator[Probe]:
     """Prepare probe states one after another.
 
@@ -230,7 +234,8 @@ def _prepare(
 
 def _settle(world: World, kind: str, drive: Floats, dice: Dice) -> Probe:
     action = _command(world, drive, dice)
-    for _ in range(round(dice.between(0.0, 2.0))):
+    steps = round(dice.between(0.0, 2.0))
+    for _ in range(0 if kind in _AT_ONCE else steps):
         world.step(action)
     return Probe(kind, world.snapshot(), _command(world, drive, dice))
 

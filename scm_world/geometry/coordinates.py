@@ -20,11 +20,14 @@ def to_cylindrical(position: ArrayLike) -> Floats:
         >>> to_cylindrical([0.0, 2.0, 1.0])
         array([2.        , 1.57079633, 1.        ])
     """
-    x, y, z = np.moveaxis(np.asarray(position, dtype=np.float64), -1, 0)
-    radius = np.hypot(x, y)
+    point = np.asarray(position, dtype=np.float64)
+    x, y = point[..., 0], point[..., 1]
+    cylindrical = point.copy()
+    radius = cylindrical[..., 0] = np.hypot(x, y)
     azimuth = np.arctan2(y, x)
-    azimuth = np.where(azimuth == -np.pi, np.pi, np.where(radius == 0.0, 0.0, azimuth))
-    return np.stack((radius, azimuth, z), axis=-1)
+    turned = np.where(azimuth == -np.pi, np.pi, azimuth)
+    cylindrical[..., 1] = np.where(radius == 0.0, 0.0, turned)
+    return cylindrical
 
 
 def from_cylindrical(cylindrical: ArrayLike) -> Floats:
@@ -40,5 +43,9 @@ def from_cylindrical(cylindrical: ArrayLike) -> Floats:
         >>> from_cylindrical([2.0, 0.0, 1.0])
         array([2., 0., 1.])
     """
-    radius, azimuth, z = np.moveaxis(np.asarray(cylindrical, dtype=np.float64), -1, 0)
-    return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=-1)
+    given = np.asarray(cylindrical, dtype=np.float64)
+    radius, azimuth = given[..., 0], given[..., 1]
+    position = given.copy()
+    position[..., 0] = radius * np.cos(azimuth)
+    position[..., 1] = radius * np.sin(azimuth)
+    return position

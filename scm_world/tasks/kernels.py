@@ -112,3 +112,10 @@ def scale_into(
     for i in range(raw.size):
         held = min(max(raw[i], low[i]), high[i])
         out[i] = gain[i] * held + offset[i]
+
+
+@njit(cache=True)
+def affine_into(values: Floats, offset: Floats, gain: Floats, out: Floats) -> None:
+    """Scale numbers: ``out = offset + gain * values``."""
+    for i in range(values.size):
+        out[i] = offset[i] + gain[i] * values[i]
