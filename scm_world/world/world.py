@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
+from collections.abc import Mapping
 from typing import Any, final
 
 import numpy as np
@@ -12,32 +11,27 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend, make_backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.entities import ACTIONS, CONTROL_INDEX, Clock, Composition, Robot, Stage
-from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
+from scm_world.entities import CONTROL_INDEX
+from scm_world.errors import ActionError, NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
 from scm_world.scene import (
-    TIMESTEP,
-    ControlMode,
     PhysicalState,
     Scene,
-    Structure,
-    default_parameters,
-    preset,
 )
 from scm_world.scene.kinematics import clip_kernel, inverse_kernel
-from scm_world.tasks import Task, conventions, make_task
-from scm_world.variables import Measured, Noise
+from scm_world.tasks import Task
+from scm_world.variables import Noise
 from scm_world.variables.kinds import SpaceName
 from scm_world.world.audit import Audit
 from scm_world.world.commit import commit, difference, refuse_overlaps
+from scm_world.world.declaration import Declaration
 from scm_world.world.proposal import Instant, propose
-from scm_world.world.readouts import Readouts, static_order
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
 from scm_world.world.start import beginning, whole_number
 
 
 @final
-class World:
+class World(Declaration):
     """A task as a causal model, with an engine that moves it.
 
     Args:
@@ -75,42 +69,16 @@ class World:
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
     ) -> None:
-        self.task = make_task(task) if isinstance(task, str) else task
-        self.frame_skip = whole_number("frame_skip", frame_skip, least=1)
-        self.control_period = TIMESTEP * self.frame_skip  # [s]
-        self.given_length = max_episode_length
-        if max_episode_length is not None:
-            whole_number("max_episode_length", max_episode_length, least=1)
-        self.max_episode_length = max_episode_length or round(
-            self.task.seconds / self.control_period
-        )
-        if action_mode not in ACTIONS:
-            raise UnknownOption("action_mode", action_mode, ACTIONS)
-        self.action_mode = action_mode
-        self.conventions = _conventions(conventions)
-        self._preset = _preset(preset)
-        self._substeps = round(self.control_period / self._preset.timestep)
-        self._mode = (
-            ControlMode.JOINT_TORQUES
-            if action_mode == "joint_torques"
-            else ControlMode.JOINT_POSITIONS
+        super().__init__(
+            task,
+            preset_name=preset,
+            action_mode=action_mode,
+            frame_skip=frame_skip,
+            max_episode_length=max_episode_length,
+            conventions_name=conventions,
         )
         self.backend = make_backend(backend) if isinstance(backend, str) else backend
-        self._declare()
         self._started = False
-
-    def _declare(self) -> None:
-        clock = Clock(self.max_episode_length, self.control_period)
-        self.composition = Composition(
-            (Robot(self.action_mode), Stage(), clock, *self.task.entities()),
-            tuple(self.task.shared()),
-        )
-        self.model = SCM([*self.composition.variables(), *self.task.readouts(self.conventions)])
-        self.slices = self.composition.slices()
-        self.parameter_keys = self.composition.parameters()
-        self.carried = tuple(
-            v for v in self.model.variables if isinstance(v, Measured) and v.set_parents()
-        )
         self.noise = Noise(0)
         self.episode = 0
         self.version = 0  # counts changes of anything but what physics moves
@@ -118,18 +86,9 @@ class World:
         self._action_is_held = False
         self._index = 0
         self._clock = np.zeros((), dtype=np.int64)
-        self._now: dict[str, Value] = {}
-        self._before: dict[str, Value] = {}
-        self._readouts = Readouts(self.model, self._now, self._before)
-        self.static_names = static_order(self.model, self._readouts.order)
-        self._coordinates: dict[str, Callable[..., Any]] = {}
-        self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._instant: Instant | None = None
         self._command = np.zeros(9)
         self._reached = np.zeros(3, dtype=np.bool_)
-        bounds: Any = self.model.declared("action").bounds
-        low, high = bounds.bounds((9,), {})
-        self.action_low, self.action_high = np.array(low), np.array(high)
 
     # --- looking ------------------------------------------------------------------------------
 
@@ -142,36 +101,6 @@ class World:
     def index(self) -> int:
         """How many control steps of the episode are over."""
         return self._index
-
-    @property
-    def computed(self) -> tuple[str, ...]:
-        """Variables that are computed from what moves, causes before effects."""
-        return self._readouts.order
-
-    @cached_property
-    def structure(self) -> Structure:
-        """The bodies that the engine has to build."""
-        return Structure(blocks=self.composition.blocks, preset=self._preset)
-
-    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
-        """Name some variables and what follows them at once, without physics, causes first."""
-        key = tuple(targets)
-        if key not in self._follow:
-            follow = {*key, *self.model.structure.instant_descendants(key)}
-            self._follow[key] = tuple(name for name in self.static_names if name in follow)
-        return self._follow[key]
-
-    def states(self, state: PhysicalState) -> dict[str, Value]:
-        """Give the states by name, as views of a vector."""
-        return {name: state.vector[where] for name, where in self.slices.items()}
-
-    def in_coordinates(self, name: str, value: Value) -> Value:
-        """Give a value of a quantity in other coordinates of it."""
-        function = self._coordinates.get(name)
-        if function is None:
-            variable: Any = self.model.declared(name)
-            function = self._coordinates[name] = variable.mechanism.bind()
-        return np.asarray(function(value))
 
     def __getitem__(self, name: str) -> Value:
         """Give the present value of one variable.
@@ -208,14 +137,6 @@ class World:
         """Describe the present for a picture, or for another engine."""
         self._require_episode()
         return self.describe(self._now, self._state.copy())
-
-    def describe(self, values: Values, state: PhysicalState) -> Scene:
-        """Describe the scene that some values stand for."""
-        parameters = dict(self._constants)
-        for name, key in self.parameter_keys.items():
-            parameters[key] = values[name]
-        goals = self.composition.goals(values)
-        return Scene(self.structure, parameters, state, goals)
 
     # --- running ------------------------------------------------------------------------------
 
@@ -258,7 +179,6 @@ class World:
     def _build(self) -> None:
         blocks = len(self.structure.blocks)
         static, self._state = beginning(self.model, self.static_names, self.slices, blocks)
-        self._constants = default_parameters(self.structure)
         self._now.update(static)
         self._now.update(self.states(self._state))
         self._now[CONTROL_INDEX] = self._clock
@@ -390,7 +310,7 @@ class World:
             index=self._index,
             seed=self.noise.seed,
             episode=self.episode,
-            world=self._identity,
+            world=self.identity,
             instant=None if self._instant is None else SavedInstant.of(self._instant),
         )
 
@@ -400,7 +320,7 @@ class World:
         Raises:
             SnapshotMismatch: It is one of another task or engine.
         """
-        if snapshot.world != self._identity:
+        if snapshot.world != self.identity:
             raise SnapshotMismatch("the snapshot is one of another task, or of other options")
         if not self._started:
             self._begin()
@@ -415,13 +335,6 @@ class World:
         saved = snapshot.instant
         self._instant = None if saved is None else saved.instant(self.model)
 
-    @cached_property
-    def _identity(self) -> tuple[Any, ...]:
-        """What two worlds have in common if one can take up a snapshot of the other."""
-        options = (self._preset.name, self.action_mode, self.conventions.name)
-        numbers = (self.frame_skip, self.max_episode_length)
-        return (self.task.name, *options, *numbers, *self.model)
-
     def close(self) -> None:
         """Free the engine."""
         self.backend.close()
@@ -429,7 +342,3 @@ class World:
     def _require_episode(self) -> None:
         if not self._started:
             raise NotReset
-
-
-_conventions = conventions
-_preset = preset
