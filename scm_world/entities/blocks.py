@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -111,13 +111,7 @@ class ToolBlock(Entity):
 
     def variables(self) -> Iterable[Variable]:
         """Declare type, size, mass, friction, color and the other coordinates of the pose."""
-        yield Fixed(
-            name=self._v("type"),
-            dtype="categorical",
-            bounds=numbers.TYPE_BOUNDS,
-            value=CUBOID,
-            doc="Published id of the kind of object.",
-        )
+        yield object_type(self._v("type"), CUBOID)
         yield block_size(self._v("size"), self._size_from)
         yield Exogenous(
             name=self._v("mass"),
@@ -210,27 +204,28 @@ def same(parent: Floats) -> Floats:
 
 def block_size(name: str, size_from: str | None) -> Variable:
     """Declare the size of a block: a root, or the copy of a shared cause."""
+    common: dict[str, Any] = {
+        "name": name,
+        "unit": "m",
+        "shape": (3,),
+        "bounds": numbers.SIZE_BOUNDS,
+        "a": numbers.SIZE_A,
+        "b": numbers.SIZE_B,
+        "doc": "Full edge lengths.",
+    }
     if size_from is None:
-        return Exogenous(
-            name=name,
-            unit="m",
-            shape=(3,),
-            bounds=numbers.SIZE_BOUNDS,
-            a=numbers.SIZE_A,
-            b=numbers.SIZE_B,
-            default=numbers.BLOCK_SIZE,
-            doc="Full edge lengths.",
-        )
-    return Derived(
+        return Exogenous(default=numbers.BLOCK_SIZE, **common)
+    return Derived(parents=(Parent(size_from),), mechanism=Function(same), **common)
+
+
+def object_type(name: str, value: int) -> Fixed:
+    """Declare the published id of the kind of object, which cannot change."""
+    return Fixed(
         name=name,
-        unit="m",
-        shape=(3,),
-        bounds=numbers.SIZE_BOUNDS,
-        a=numbers.SIZE_A,
-        b=numbers.SIZE_B,
-        parents=(Parent(size_from),),
-        mechanism=same,
-        doc="Full edge lengths.",
+        dtype="categorical",
+        bounds=numbers.TYPE_BOUNDS,
+        value=value,
+        doc="Published id of the kind of object.",
     )
 
 

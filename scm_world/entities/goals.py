@@ -9,9 +9,9 @@ import numpy as np
 
 from scm_world._types import Floats, Values
 from scm_world.entities.base import Entity
-from scm_world.entities.blocks import block_size, color, coordinates
+from scm_world.entities.blocks import block_size, color, coordinates, object_type
 from scm_world.scene import Goal
-from scm_world.variables import Box, Derived, Exogenous, Fixed, Variable
+from scm_world.variables import Box, Derived, Exogenous, Variable
 from scm_world.variables import catalogue as numbers
 
 SILHOUETTE_CUBOID = 20
@@ -43,16 +43,6 @@ def _orientation(name: str) -> Exogenous:
         bounds=numbers.QUATERNION_BOUNDS,
         default=numbers.IDENTITY,
         doc="Orientation as a unit quaternion (x, y, z, w).",
-    )
-
-
-def _kind(name: str, value: int) -> Fixed:
-    return Fixed(
-        name=name,
-        dtype="categorical",
-        bounds=numbers.TYPE_BOUNDS,
-        value=value,
-        doc="Published id of the kind of object.",
     )
 
 
@@ -104,7 +94,7 @@ class GoalBlock(_Goal):
 
     def variables(self) -> Iterable[Variable]:
         """Declare place, orientation, size and color."""
-        yield _kind(self._v("type"), SILHOUETTE_CUBOID)
+        yield object_type(self._v("type"), SILHOUETTE_CUBOID)
         yield block_size(self._v("size"), self._size_from)
         yield Exogenous(
             name=self._v("polar"),
@@ -158,7 +148,7 @@ class GoalSphere(_Goal):
 
     def variables(self) -> Iterable[Variable]:
         """Declare place, size and color."""
-        yield _kind(self._v("type"), SILHOUETTE_SPHERE)
+        yield object_type(self._v("type"), SILHOUETTE_SPHERE)
         yield Exogenous(
             name=self._v("size"),
             unit="m",

@@ -105,33 +105,12 @@ class Reaching(Task):
 
     def readouts(self, conventions: Conventions) -> Iterable[Variable]:
         """Declare reward terms and success."""
-        tips, goals = "end_effector_positions", _positions()
-        yield term(
-            "reward.tips_to_goals",
-            kernels.reach_progress,
-            (tips, Parent(tips, 1), *goals),
-            "How much nearer the tips came to their goals [m].",
-        )
-        yield term(
-            "reward.distance",
-            minus_distance,
-            (tips, *goals),
-            "Minus the distance to the goals [m].",
-        )
-        yield term(
-            "reward.torque", minus_norm, ("joint_torques",), "Minus the norm of the torques."
-        )
-        yield term(
-            "reward.smoothness",
-            minus_change,
-            ("joint_velocities", Parent("joint_velocities", 1)),
-            "Minus the change of the joint velocities [rad/s].",
-        )
+        yield from self._terms()
         yield Measured(
             name="reach_error",
             unit="m",
-            parents=(tips, *goals),
-            mechanism=kernels.reach_error,
+            parents=("end_effector_positions", *_positions()),
+            mechanism=Function(kernels.reach_error),
             doc="Mean absolute error of the nine tip coordinates.",
         )
         yield Measured(
@@ -153,6 +132,21 @@ class Reaching(Task):
         if conventions.distance_as_reward:
             weights["reach_error"] = weights.pop("fractional_success")
         yield reward(weights)
+
+    def _terms(self) -> Iterable[Variable]:
+        tips, goals, speeds = "end_effector_positions", _positions(), "joint_velocities"
+        yield term(
+            "reward.tips_to_goals",
+            kernels.reach_progress,
+            (tips, Parent(tips, 1), *goals),
+            "How much nearer the tips came to their goals [m].",
+        )
+        far = "Minus the distance of the tips from their goals [m]."
+        yield term("reward.distance", minus_distance, (tips, *goals), far)
+        torque = "Minus the norm of the joint torques [N m]."
+        yield term("reward.torque", minus_norm, ("joint_torques",), torque)
+        change = "Minus the change of the joint velocities [rad/s]."
+        yield term("reward.smoothness", minus_change, (speeds, Parent(speeds, 1)), change)
 
     def observed(self) -> Iterable[Observed]:
         """Observe the three goals."""

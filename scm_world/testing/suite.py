@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import ClassVar
@@ -20,7 +21,7 @@ from scm_world.scene.scene import (
 from scm_world.testing.scenes import LONG, busy_scene, other_value, play
 
 
-class Suite:
+class Suite(ABC):
     """What the parts of the conformance suite share.
 
     Attributes:
@@ -31,9 +32,9 @@ class Suite:
     preset: ClassVar[Preset] = FAST
     long: ClassVar[int] = LONG
 
+    @abstractmethod
     def make(self) -> Backend:
         """Create a backend without a scene."""
-        raise NotImplementedError
 
     @pytest.fixture
     def scene(self) -> Scene:

@@ -3,13 +3,15 @@
 Subclass it in a test file, say how to make a world of the task, and pytest runs the rest::
 
     class TestMyTask(TaskConformance):
-        def make(self) -> World:
+        @abstractmethod
+    def make(self) -> World:
             return World(MyTask(), backend="fake")
 """
 
 from __future__ import annotations
 
 import re
+from abc import ABC
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -30,7 +32,7 @@ _SPACES: tuple[SpaceName, ...] = ("A", "B")
 _SEED = 20_26
 
 
-class TaskConformance:
+class TaskConformance(ABC):
     """Every promise that a task makes, as a test.
 
     Attributes:
@@ -45,7 +47,6 @@ class TaskConformance:
 
     def make(self) -> World:
         """Create a world of the task."""
-        raise NotImplementedError
 
     @pytest.fixture
     def world(self) -> Iterator[World]:
