@@ -13,8 +13,20 @@ from scm_world.tasks import TASKS
 
 def main(seeds: int = 5) -> None:
     """Print a table in Markdown."""
-    print("| task | engine | preset | seed | edges | SHD | recall | undeclared | floor | rollouts |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    columns = [
+        "task",
+        "engine",
+        "preset",
+        "seed",
+        "edges",
+        "SHD",
+        "recall",
+        "undeclared",
+        "floor",
+        "rollouts",
+    ]
+    print(f"| {' | '.join(columns)} |")
+    print("|---" * len(columns) + "|")
     for task in TASKS:
         for backend in ("mujoco", "bullet"):
             for preset in ("fast", "precise"):

@@ -4,6 +4,7 @@ Subclass it in a test file, say how to make a world of the task, and pytest runs
 
     class TestMyTask(TaskConformance):
         @abstractmethod
+    @abstractmethod
     def make(self) -> World:
             return World(MyTask(), backend="fake")
 """
