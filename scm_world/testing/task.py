@@ -12,7 +12,7 @@ Subclass it in a test file, say how to make a world of the task, and pytest runs
 from __future__ import annotations
 
 import re
-from abc import ABC
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
