@@ -3,9 +3,7 @@
 Subclass it in a test file, say how to make a world of the task, and pytest runs the rest::
 
     class TestMyTask(TaskConformance):
-        @abstractmethod
-    @abstractmethod
-    def make(self) -> World:
+        def make(self) -> World:
             return World(MyTask(), backend="fake")
 """
 
@@ -46,6 +44,7 @@ class TaskConformance(ABC):
     episodes: ClassVar[int] = 3
     steps: ClassVar[int] = 40
 
+    @abstractmethod
     def make(self) -> World:
         """Create a world of the task."""
 
