@@ -12,7 +12,7 @@ from scm_world.graph.files import (
 )
 from scm_world.graph.scm import SCM, flatten
 from scm_world.graph.structure import Edge, Structure
-from scm_world.graph.views import contemporaneous, d_separated, summary, two_slice
+from scm_world.graph.views import contemporaneous, d_separated, summary, two_slice, unrolled
 
 __all__ = [
     "SCM",
@@ -31,4 +31,5 @@ __all__ = [
     "to_json",
     "to_networkx",
     "two_slice",
+    "unrolled",
 ]

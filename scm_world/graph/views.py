@@ -44,8 +44,8 @@ def contemporaneous(model: SCM) -> nx.DiGraph:
     return graph
 
 
-def two_slice(model: SCM) -> nx.DiGraph:
-    """Draw two control steps, with nodes ``(name, -1)`` and ``(name, 0)``.
+def unrolled(model: SCM, steps: int) -> nx.DiGraph:
+    """Draw some control steps, with nodes ``(name, -steps + 1)`` to ``(name, 0)``.
 
     A parameter keeps its value from one step to the next; this is an edge with
     ``persists=True``.
@@ -54,19 +54,24 @@ def two_slice(model: SCM) -> nx.DiGraph:
         A directed acyclic graph.
     """
     graph = nx.DiGraph()
-    for slice_ in (-1, 0):
-        for name in model:
-            graph.add_node((name, slice_), variable=name, slice=slice_)
+    persistent = [n for n in model if model[n].role == "parameter" and not model.parents(n)]
+    for slice_ in range(1 - steps, 1):
+        graph.add_nodes_from(
+            ((name, slice_), {"variable": name, "slice": slice_}) for name in model
+        )
         for edge in model.edges:
-            if edge.lag == 0:
-                graph.add_edge((edge.cause, slice_), (edge.effect, slice_), lag=0)
-    for edge in model.edges:
-        if edge.lag == 1:
-            graph.add_edge((edge.cause, -1), (edge.effect, 0), lag=1)
-    for name in model:
-        if model[name].role == "parameter" and not model.parents(name):
-            graph.add_edge((name, -1), (name, 0), lag=1, persists=True)
+            if edge.lag == 0 or slice_ > 1 - steps:
+                cause = (edge.cause, slice_ - edge.lag)
+                graph.add_edge(cause, (edge.effect, slice_), lag=edge.lag)
+        if slice_ > 1 - steps:
+            for name in persistent:
+                graph.add_edge((name, slice_ - 1), (name, slice_), lag=1, persists=True)
     return graph
+
+
+def two_slice(model: SCM) -> nx.DiGraph:
+    """Draw two control steps, with nodes ``(name, -1)`` and ``(name, 0)``; see ``unrolled``."""
+    return unrolled(model, 2)
 
 
 def d_separated(
@@ -75,7 +80,8 @@ def d_separated(
     """Tell whether ``given`` blocks every path between ``x`` and ``y``.
 
     In a model with lagged edges a plain name means the present slice and ``(name, -1)`` the one
-    before.
+    before. As many earlier slices as the model has variables are
+    looked at too, so that what a common past connects is seen to be connected.
 
     Raises:
         UnknownVariable: A node is not in the model.
@@ -94,13 +100,14 @@ def d_separated(
         (False, True)
     """
     temporal = any(edge.lag for edge in model.edges)
-    graph = two_slice(model) if temporal else contemporaneous(model)
+    graph = unrolled(model, len(model) + 2) if temporal else contemporaneous(model)
 
     def nodes(chosen: Iterable[Node]) -> set[Any]:
         found: set[Any] = set()
         for node in (chosen,) if isinstance(chosen, str) else chosen:
             full = (node, 0) if temporal and isinstance(node, str) else node
-            if full not in graph:
+            slice_ = 0 if isinstance(full, str) else full[1]
+            if full not in graph or slice_ < -1:
                 raise UnknownVariable(str(node), list(model))
             found.add(full)
         return found

@@ -37,8 +37,8 @@ class Audit:
 
     Attributes:
         targets: One entry for each target, by name.
-        followed: Variables that changed because a target did: values before and after. Other
-            coordinates of them are not listed.
+        followed: Parameters and states that changed at once because a target did: values before
+            and after. Other coordinates of them, and readouts, are not listed.
         engine: Quantities that the engine derives: the principal moments of inertia of each body
             whose mass or size changed [kg m²], before and after.
     """

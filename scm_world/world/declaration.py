@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.entities import ACTIONS, Clock, Composition, Robot, Stage
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.scene import (
     TIMESTEP,
@@ -23,7 +23,7 @@ from scm_world.scene import (
     preset,
 )
 from scm_world.tasks import Task, conventions, make_task
-from scm_world.variables import Measured
+from scm_world.variables import Derived, Exogenous, Measured
 from scm_world.world.readouts import Readouts, static_order
 from scm_world.world.start import whole_number
 
@@ -87,6 +87,7 @@ class Declaration:
             tuple(self.task.shared()),
         )
         self.model = SCM([*self.composition.variables(), *self.task.readouts(self.conventions)])
+        _refuse_draws(self.model)
         self.slices = self.composition.slices()
         self.parameter_keys = self.composition.parameters()
         self.carried = tuple(
@@ -150,3 +151,19 @@ class Declaration:
         options = (self._preset.name, self.action_mode, self.conventions.name)
         numbers = (self.frame_skip, self.max_episode_length)
         return (self.task.name, *options, *numbers, *self.model)
+
+
+def _refuse_draws(model: SCM) -> None:
+    """Refuse what would be ignored: an episode begins at defaults and draws when asked to.
+
+    Raises:
+        ModelError: A variable of the world has a distribution or noise of its own.
+    """
+    problems = [
+        f"{v.name!r} is random by declaration, but an episode begins at defaults; leave that out "
+        f"and draw it with reset(do={{{v.name!r}: Draw(…)}})"
+        for v in model.variables
+        if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
+    ]
+    if problems:
+        raise ModelError(problems)

@@ -6,8 +6,8 @@ import networkx as nx
 import pytest
 
 from scm_world.errors import UnknownVariable
-from scm_world.graph import SCM, contemporaneous, d_separated, summary, two_slice
-from scm_world.variables import Derived, Exogenous, Linear, Measured, Parent
+from scm_world.graph import SCM, contemporaneous, d_separated, summary, two_slice, unrolled
+from scm_world.variables import Derived, Exogenous, Linear, Measured, Normal, Parent
 
 
 def graph(*edges: str) -> SCM:
@@ -132,3 +132,22 @@ def test_the_graph_of_an_instant_has_no_lagged_edges() -> None:
 def test_views_of_a_mutilated_model_are_mutilated() -> None:
     """What do has cut is not drawn."""
     assert ("size", "half") not in summary(conditional().do({"half": 0.1})).edges
+
+
+def test_a_common_past_connects_the_previous_slice() -> None:
+    """Two variables of the slice before, driven by one cause long ago, are not independent."""
+    model = SCM(
+        [
+            Derived(
+                name="a",
+                parents=(Parent("a", 1),),
+                mechanism=Linear(weights=(0.5,)),
+                noise=Normal(),
+            ),
+            Derived(name="b", parents=(Parent("a", 1),), mechanism=Linear(weights=(1.0,))),
+            Derived(name="c", parents=(Parent("a", 1),), mechanism=Linear(weights=(1.0,))),
+        ]
+    )
+    assert not d_separated(model, [("b", -1)], [("c", -1)])
+    assert d_separated(model, ["b"], ["c"], given=[("a", -1)])
+    assert {slice_ for _, slice_ in unrolled(model, 3)} == {-2, -1, 0}
