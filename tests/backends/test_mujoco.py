@@ -78,7 +78,7 @@ def test_mixed_installations_are_refused(
     distributions: dict[str, str], libraries: list[str]
 ) -> None:
     """Two versions in one folder are an error that names them and the repair."""
-    with pytest.raises(MixedInstallation, match="force-reinstall") as caught:
+    with pytest.raises(MixedInstallation, match="pip uninstall -y mujoco mujoco-core") as caught:
         judge(distributions, libraries)
     assert set(distributions) <= set(caught.value.versions)
 

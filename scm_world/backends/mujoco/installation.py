@@ -17,10 +17,7 @@ from scm_world.errors import MissingEngine, MixedInstallation
 
 OLDEST = (3, 17)
 REQUIREMENT = "mujoco>=3.17,<5"
-REPAIR = (
-    "pip uninstall -y mujoco mujoco-core mujoco-studio && "
-    f"pip install --force-reinstall --no-deps '{REQUIREMENT}' mujoco-core mujoco-studio"
-)
+REPAIR = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install '{REQUIREMENT}'"
 DISTRIBUTIONS = ("mujoco", "mujoco-core", "mujoco-studio")
 
 
