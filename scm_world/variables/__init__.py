@@ -1,5 +1,6 @@
 """Typed variables, their spaces, their noise, and what can be done to them."""
 
+from scm_world.variables.distributions import Distribution, Normal
 from scm_world.variables.interventions import SOFT, Draw, Hard, Intervention, Scale, Shift
 from scm_world.variables.kinds import (
     Action,
@@ -18,10 +19,8 @@ from scm_world.variables.spaces import (
     Affine,
     Box,
     Categories,
-    Distribution,
     Either,
     Integers,
-    Normal,
     Rotations,
     Space,
 )

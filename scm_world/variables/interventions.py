@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import Field
 
+from scm_world.variables.distributions import Distribution
 from scm_world.variables.kinds import SpaceName
-from scm_world.variables.spaces import Distribution, Frozen
+from scm_world.variables.spaces import Frozen
 
 Number = float | tuple[float, ...]
 

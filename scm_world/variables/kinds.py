@@ -9,11 +9,11 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from scm_world._types import Value, Values
+from scm_world.variables.distributions import Distribution
 from scm_world.variables.mechanisms import Function, Linear, Mechanism
 from scm_world.variables.spaces import (
     Box,
     Categories,
-    Distribution,
     Either,
     Frozen,
     Integers,

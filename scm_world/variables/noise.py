@@ -17,7 +17,7 @@ from typing import final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.variables.spaces import Distribution
+from scm_world.variables.distributions import Distribution
 
 _WORDS = 4  # 64-bit words that one increment of the Philox counter yields
 
