@@ -34,7 +34,7 @@ def difference(world: World, proposal: Proposal) -> Difference:
     changed = {
         key: np.asarray(proposal.static[name])
         for name, key in world.parameter_keys.items()
-        if not same(proposal.static[name], now[name])
+        if proposal.static[name] is not now[name] and not same(proposal.static[name], now[name])
     }
     unmoved = state.coincides(proposal.state)
     return Difference(None, changed, None if unmoved else proposal.state)
@@ -255,9 +255,9 @@ def _report(
                 back = applied if exact else world.in_coordinates(name, back)
         entries[name] = Applied(name, flat[name], applied, back)
     followed = {
-        name: (before[name], proposal.static[name])
-        for name in proposal.static
-        if name not in entries and not same(proposal.static[name], before[name])
+        name: (before[name], value)
+        for name, value in proposal.static.items()
+        if value is not before[name] and name not in entries and not same(value, before[name])
     }
     for name, old in moved_before.items():
         if name not in entries and not same(old, now[name]):

@@ -83,6 +83,7 @@ class World(Declaration):
         self.episode = 0
         self.version = 0  # counts changes of anything but what physics moves
         self._held = self.model
+        self._static: Values = {}
         self._action_is_held = False
         self._index = 0
         self._clock = np.zeros((), dtype=np.int64)
@@ -266,8 +267,8 @@ class World(Declaration):
         return audit
 
     def _present(self, *, at_start: bool = False) -> Instant:
-        static = {name: self._now[name] for name in self.static_names}
-        return Instant(self._held, static, self._state.copy(), self._index, at_start=at_start)
+        state = self._state.copy()
+        return Instant(self._held, self._static, state, self._index, at_start=at_start)
 
     def adopt(
         self, model: SCM, static: Values, index: int, state: PhysicalState | None = None
@@ -280,7 +281,7 @@ class World(Declaration):
             index: The control step.
             state: Where everything is; what the engine reports if None.
         """
-        self._held = model
+        self._held, self._static = model, static
         self._action_is_held = "action" in model.interventions
         self._now.update(static)
         self.version += 1
@@ -303,7 +304,7 @@ class World(Declaration):
         self._require_episode()
         return WorldSnapshot(
             engine=self.backend.snapshot(),
-            static={name: self._now[name] for name in self.static_names},
+            static=self._static,
             interventions=self._held.interventions,
             previous=self.previous(),
             action=np.array(self._now["action"]),
