@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -260,8 +259,8 @@ def test_version() -> None:
     assert call("--version").stdout == f"scm-world {__version__}\n"
 
 
-def test_help_is_fast_and_loads_no_engine() -> None:
-    """Help comes within a second; neither engines nor matplotlib are loaded for it."""
+def test_help_loads_no_engine() -> None:
+    """Neither engines nor matplotlib nor networkx are loaded to show the help."""
     code = (
         "import sys; from scm_world.cli import app\n"
         "try: app(['--help'])\n"
@@ -269,13 +268,11 @@ def test_help_is_fast_and_loads_no_engine() -> None:
         "bad = {'mujoco', 'pybullet', 'matplotlib', 'numba', 'networkx'} & set(sys.modules)\n"
         "sys.exit(','.join(bad) or 0)"
     )
-    started = time.perf_counter()
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
 
     assert done.returncode == 0, done.stderr
-    assert time.perf_counter() - started < 2.0  # one second, and as much for a busy machine
 
 
 def test_the_module_is_the_command() -> None:
