@@ -24,7 +24,7 @@ _FRAME = {"upper": 1, "middle": 2, "lower": 3, "tip": 4}
 _FLAGS = {
     "upper": 0,
     "middle": OTHERS | FLOOR,
-    "lower": OTHERS | FLOOR | WALL,
+    "lower": OTHERS | FLOOR,
     "tip": OTHERS | FLOOR | WALL,
 }
 
@@ -67,9 +67,9 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
     Compared are blocks with everything; the middle and lower links of different fingers with one
-    another; both with the floor; lower links with the ring. A block whose center is outside the
-    arena lies in the stage (beyond the ring, at any height) or in the floor (below it). Links of
-    the same finger, and the upper links, cannot collide with anything but blocks.
+    another; both with the floor; the tips with the ring, as in the engines. A block whose center
+    is outside the arena lies in the stage (beyond the ring, at any height) or in the floor (below
+    it). Links of the same finger, and the upper links, cannot collide with anything but blocks.
 
     Args:
         scene: With complete parameters.

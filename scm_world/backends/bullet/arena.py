@@ -41,14 +41,15 @@ def groups(finger: int, part: str) -> tuple[int, int]:
     """Give the group and the mask of a link of the robot.
 
     A link never meets its own finger. Upper links meet blocks only; the middle ones also the
-    floor and the other fingers; the lower ones and the tips also the wall.
+    floor and the other fingers; the tips, which are the outermost points, also the wall.
     """
     others = sum(MIDDLE[k] | LOWER[k] for k in range(3) if k != finger)
     if part == "upper":
         return UPPER, BLOCK
     if part == "middle":
         return MIDDLE[finger], BLOCK | FLOOR | others
-    return LOWER[finger], BLOCK | FLOOR | WALL | others
+    wall = WALL if part == "tip" else 0
+    return LOWER[finger], BLOCK | FLOOR | wall | others
 
 
 LINK_GROUPS = tuple(
