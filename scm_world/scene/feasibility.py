@@ -1,4 +1,4 @@
-"""Which bodies of a scene are in one place, and how a block comes out of the floor."""
+"""Which bodies of a scene are in one place."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.geometry.arrays import compact, rows
-from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, sweep
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
@@ -105,26 +104,3 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     names = (*blocks, *trifinger.LINK_NAMES, "floor", "stage")
     pairs = zip(found.pairs.tolist(), found.depths.tolist(), strict=True)
     return tuple(Overlap((names[i], names[j]), depth) for (i, j), depth in pairs)
-
-
-def feasible_lift(scene: Scene, block_index: int) -> float:
-    """Find how high a block has to be to clear the floor.
-
-    Args:
-        scene: With complete parameters.
-        block_index: Which block, in the order of ``scene.structure.blocks``.
-
-    Returns:
-        The least z of the center [m], no lower than it is now, with all corners at z >= 0. Where
-        other bodies are plays no part.
-
-    Example:
-        >>> from scm_world.scene import Structure, default_scene
-        >>> scene = default_scene(Structure(blocks=("tool_block",)))
-        >>> scene.state.positions[0, 2] = -1.0
-        >>> feasible_lift(scene, 0)
-        0.0325
-    """
-    size = scene.parameters[scene.structure.blocks[block_index], "size"]
-    upward = np.abs(rotation_matrix(scene.state.orientations[block_index])[2])
-    return max(float(scene.state.positions[block_index, 2]), 0.5 * float(upward @ size))

@@ -29,7 +29,11 @@ _MOVES = ("size", "height")
 
 
 def difference(world: World, proposal: Proposal) -> Difference:
-    """Give what the engine has to change, from its present state."""
+    """Give what the engine has to change, from its present state.
+
+    The same as ``scene.diff`` of the two scenes, without describing them: that would make every
+    ``do`` about 25 µs dearer. A test holds the two against each other.
+    """
     now, state = world.current()
     changed = {
         key: np.asarray(proposal.static[name])

@@ -8,7 +8,7 @@ import pytest
 from scm_world._types import ArrayLike
 from scm_world.geometry import from_rotation_vector
 from scm_world.scene import Scene, Structure, default_scene, trifinger
-from scm_world.scene.feasibility import feasible_lift, overlaps
+from scm_world.scene.feasibility import overlaps
 from scm_world.scene.kinematics import inverse, link_frames
 from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS
 
@@ -186,17 +186,3 @@ def test_looking_changes_nothing() -> None:
     overlaps(scene, tolerance=TOLERANCE)
     assert scene.state == state
     assert all(np.array_equal(scene.parameters[k], v) for k, v in parameters.items())
-
-
-def test_the_feasible_lift_is_the_least() -> None:
-    """A block at its lift stands on the floor with its lowest corner, in any orientation."""
-    rng, scene = np.random.default_rng(5), _scene((0, 0, 0), (0, 0, 0.5))
-    for turn in rng.uniform(-3.0, 3.0, (50, 3)):
-        scene.state.positions[0] = (0.0, 0.0, -0.1)
-        scene.state.orientations[0] = from_rotation_vector(turn)
-        lift = feasible_lift(scene, 0)
-        scene.state.positions[0, 2] = lift - 1e-6
-        (overlap,) = overlaps(scene, tolerance=1e-9)
-        assert overlap.bodies == ("a", "floor")
-        assert overlap.depth == pytest.approx(1e-6)
-    assert feasible_lift(scene, 1) == 0.5

@@ -30,7 +30,10 @@ from scm_world.errors import (
     WrongShape,
     WrongType,
 )
+from scm_world.scene import diff
 from scm_world.variables import Draw, Normal, Scale, Shift
+from scm_world.world.commit import difference
+from scm_world.world.proposal import propose
 
 NAN = float("nan")
 HUGE = 1e308
@@ -214,3 +217,17 @@ def test_an_audit_in_other_coordinates_speaks_them() -> None:
     np.testing.assert_allclose(entry.applied, [0.02, 1.0, 0.1])
     np.testing.assert_allclose(entry.read_back, [0.02, 1.0, 0.1])
     assert audit.followed.keys() == {"tool_block.cartesian_position"}
+
+
+@pytest.mark.parametrize(("backend", "task"), PARAMS)
+def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str) -> None:
+    """What a do gives to the engine is the difference of the scenes before and after it."""
+    for name in settable(shared(backend, task)):
+        world = begin(backend, task)
+        request = {name: other(world, name)}
+        proposal = propose(world, world._present(), request, None)
+        told = difference(world, proposal)
+        expected = diff(world.scene(), world.describe(proposal.static, proposal.state))
+        assert told.parameters.keys() == expected.parameters.keys()
+        assert all(np.array_equal(told.parameters[k], v) for k, v in expected.parameters.items())
+        assert told.state == expected.state
