@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from scm_world._types import Floats
+from scm_world.geometry.hulls import Hull
 from scm_world.scene import trifinger
 from scm_world.scene.controller import ControllerSpec
 from scm_world.scene.presets import FAST, Preset
@@ -38,12 +39,33 @@ class Structure:
     Attributes:
         blocks: Names of the movable blocks, in the order of the state.
         preset: Numerical settings.
-        controller: The joint controller.
+        obstacles: Names of boxes that never move by themselves. Blocks, middle and lower links
+            and fingertips collide with them.
+        hulls: The movable blocks that are no boxes, each with its convex shape.
     """
 
     blocks: tuple[str, ...] = ()
     preset: Preset = FAST
-    controller: ControllerSpec = field(default_factory=ControllerSpec)
+    obstacles: tuple[str, ...] = ()
+    hulls: tuple[tuple[str, Hull], ...] = ()
+
+    def hull(self, block: str) -> Hull | None:
+        """Give the shape of a block that is no box; None for a box."""
+        return next((hull for name, hull in self.hulls if name == block), None)
+
+
+@final
+@dataclass(frozen=True)
+class Light:
+    """How a picture is lit.
+
+    Attributes:
+        direction: Towards the light, of any length, shape (3,).
+        ambient: How bright surfaces are that the light does not reach, in [0, 1].
+    """
+
+    direction: tuple[float, float, float] = (0.25, -0.5, 0.83)
+    ambient: float = 0.45
 
 
 @final
@@ -53,11 +75,12 @@ class Goal:
 
     Attributes:
         name: Of the entity.
-        shape: ``"box"`` or ``"sphere"``.
+        shape: ``"box"``, ``"sphere"`` or ``"hull"``.
         size: Full edge lengths, or three times the diameter, shape (3,) [m].
         position: Center, shape (3,) [m].
         orientation: Quaternion (x, y, z, w).
         color: Red, green, blue in [0, 1].
+        hull: The shape where it is a ``"hull"``.
     """
 
     name: str
@@ -66,6 +89,7 @@ class Goal:
     position: Floats
     orientation: Floats
     color: Floats
+    hull: Hull | None = None
 
 
 @final
@@ -78,16 +102,22 @@ class Scene:
         parameters: Their properties, complete (see ``parameter_keys``).
         state: Where everything is and how it moves.
         goals: Silhouettes, for pictures and rewards.
+        light: Of pictures; no engine knows it.
     """
 
     structure: Structure
     parameters: Parameters
     state: PhysicalState
     goals: tuple[Goal, ...] = ()
+    light: Light = field(default_factory=Light)
 
     def with_(self, **changes: object) -> Scene:
         """Copy the scene with some fields replaced."""
         return replace(self, **changes)  # type: ignore[arg-type]
+
+
+SURFACE = ("size", "friction", "color")
+"""What every obstacle has besides its pose, and every block that is a box besides its mass."""
 
 
 def parameter_keys(structure: Structure) -> Iterator[ParameterKey]:
@@ -96,18 +126,25 @@ def parameter_keys(structure: Structure) -> Iterator[ParameterKey]:
     ======================  ==========================================
     body                    properties
     ======================  ==========================================
-    ``world``               ``gravity`` (3,) [m/s²]
-    ``robot``               ``height`` [m], ``friction``
+    ``world``               ``gravity`` (3,) [m/s²], ``restitution``, ``spinning_friction``
+    ``robot``               ``height`` [m], ``friction``, ``joint_damping`` [N m s/rad]
+    ``controller``          ``position_gains`` (3,) [N m/rad], ``velocity_gains`` (3,)
+                            [N m s/rad], ``safety_damping`` (3,) [N m s/rad],
+                            ``torque_limit`` [N m]; see ``ControllerSpec``
     ``robot_finger_F_link_i``  ``mass`` [kg], ``color`` (3,)
     ``floor``, ``stage``    ``friction``, ``color`` (3,)
-    every block             ``mass`` [kg], ``size`` (3,) [m], ``friction``, ``color`` (3,)
+    every block             ``mass`` [kg], ``size`` (3,) [m], ``friction``, ``color`` (3,);
+                            one that is a hull has no ``size``
+    every obstacle          ``size`` (3,) [m], ``friction``, ``color`` (3,), ``position`` (3,)
+                            [m], ``orientation`` (4,)
     ======================  ==========================================
 
-    The friction of a contact is the product of the frictions of its two bodies.
+    The friction of a contact is the product of the frictions of its two bodies; restitution and
+    spinning friction are the same for every contact.
     """
-    yield ("world", "gravity")
-    yield ("robot", "height")
-    yield ("robot", "friction")
+    yield from (("world", name) for name in ("gravity", "restitution", "spinning_friction"))
+    yield from (("robot", name) for name in ("height", "friction", "joint_damping"))
+    yield from (("controller", name) for name in CONTROLLER)
     for link in trifinger.LINK_NAMES:
         yield (link, "mass")
         yield (link, "color")
@@ -115,17 +152,40 @@ def parameter_keys(structure: Structure) -> Iterator[ParameterKey]:
         yield (surface, "friction")
         yield (surface, "color")
     for block in structure.blocks:
-        for name in ("mass", "size", "friction", "color"):
-            yield (block, name)
+        yield (block, "mass")
+        yield from (
+            (block, name) for name in SURFACE if name != "size" or not structure.hull(block)
+        )
+    for obstacle in structure.obstacles:
+        yield from ((obstacle, name) for name in (*SURFACE, "position", "orientation"))
+
+
+CONTROLLER = ("position_gains", "velocity_gains", "safety_damping", "torque_limit")
+"""The parameters of the joint controller, in the order of the fields of ``ControllerSpec``."""
+
+
+def controller(parameters: Parameters) -> ControllerSpec:
+    """Read the joint controller from the parameters of a scene."""
+    numbers = [parameters["controller", name].tolist() for name in CONTROLLER]
+    kp, kd, safety, limit = (tuple(n) if isinstance(n, list) else n for n in numbers)
+    return ControllerSpec(kp, kd, safety, limit)
 
 
 def default_parameters(structure: Structure) -> dict[ParameterKey, Floats]:
     """Give the published default of every parameter."""
     surface = {"floor": (0.31, 0.27, 0.25), "stage": (0.95, 0.95, 0.95)}
+    spec = ControllerSpec()
     values: dict[ParameterKey, object] = {
         ("world", "gravity"): (0.0, 0.0, -9.81),
+        ("world", "restitution"): 0.0,
+        ("world", "spinning_friction"): SPINNING_FRICTION,
         ("robot", "height"): trifinger.NOMINAL_HEIGHT,
         ("robot", "friction"): 0.5,
+        ("robot", "joint_damping"): 0.0,
+        ("controller", "position_gains"): spec.kp,
+        ("controller", "velocity_gains"): spec.kd,
+        ("controller", "safety_damping"): spec.safety,
+        ("controller", "torque_limit"): spec.limit,
     }
     for finger in trifinger.FINGERS:
         for index, mass in enumerate(trifinger.LINK_MASS):
@@ -139,14 +199,31 @@ def default_parameters(structure: Structure) -> dict[ParameterKey, Floats]:
         values[block, "size"] = (0.065, 0.065, 0.065)
         values[block, "friction"] = 1.0
         values[block, "color"] = (1.0, 0.0, 0.0)
+    for index, obstacle in enumerate(structure.obstacles):
+        values[obstacle, "size"] = (0.01, 0.01, 0.01)
+        values[obstacle, "friction"] = 0.5
+        values[obstacle, "color"] = (0.0, 0.0, 0.0)
+        values[obstacle, "position"] = (0.02 * index - 0.1, 0.15, 0.005)
+        values[obstacle, "orientation"] = (0.0, 0.0, 0.0, 1.0)
     return {key: np.asarray(values[key], dtype=np.float64) for key in parameter_keys(structure)}
 
 
+COLUMNS, ROWS = 3, 2
+SPACING = 0.1  # [m] between the centers of blocks that stand side by side
+LAYER = 0.07  # [m] between the centers of blocks that stand on one another
+
+
 def default_scene(structure: Structure) -> Scene:
-    """Stand the blocks in a row on the table, with the robot in its rest pose."""
-    state = PhysicalState(len(structure.blocks))
+    """Stand the blocks on the table, in rows and then in layers, with the robot at rest.
+
+    Fingers and blocks keep clear of each other up to twelve blocks.
+    """
+    n = len(structure.blocks)
+    state = PhysicalState(n)
     state.joint_positions[:] = trifinger.REST
-    state.positions[:, 2] = 0.0325
-    places = np.arange(len(structure.blocks)) - (len(structure.blocks) - 1) / 2
-    state.positions[:, 0] = 0.1 * places
+    layer, place = np.divmod(np.arange(n), COLUMNS * ROWS)
+    row, column = np.divmod(place, COLUMNS)
+    state.positions[:, 0] = SPACING * (column - (min(n, COLUMNS) - 1) / 2)
+    state.positions[:, 1] = 0.09 * row
+    state.positions[:, 2] = 0.0325 + LAYER * layer
     return Scene(structure, default_parameters(structure), state)
