@@ -164,7 +164,7 @@ CONTROLLER = ("position_gains", "velocity_gains", "safety_damping", "torque_limi
 """The parameters of the joint controller, in the order of the fields of ``ControllerSpec``."""
 
 
-def controller(parameters: Parameters) -> ControllerSpec:
+def controller_spec(parameters: Parameters) -> ControllerSpec:
     """Read the joint controller from the parameters of a scene."""
     numbers = [parameters["controller", name].tolist() for name in CONTROLLER]
     kp, kd, safety, limit = (tuple(n) if isinstance(n, list) else n for n in numbers)
