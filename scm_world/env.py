@@ -11,15 +11,12 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.tasks import Observed, Task
-from scm_world.tasks.base import HEAD
+from scm_world.tasks import HEAD, TIME, Observed, Task
 from scm_world.tasks.kernels import affine_into, scale_into
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import Audit, World
 
 Observation = NDArray[np.float32]
-
-TIME = "time_left_for_task"
 
 
 class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):

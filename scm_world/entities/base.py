@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import final
 
 from scm_world._types import Floats, Values
-from scm_world.scene import Goal, ParameterKey
+from scm_world.geometry.hulls import Hull
+from scm_world.scene import Goal, Light, ParameterKey
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.variables import Function, Measured, Parent, Space, Variable
 
@@ -29,9 +30,11 @@ class State:
         doc: One sentence.
         always: Causes that act at every control step; all other physical quantities of the
             world act while there is contact.
-        on_set: Parameters and states of the same entity that move it when they are set.
+        on_set: Parameters and states that move it when they are set.
         start: Its value at the start, a function of ``on_set``.
-        carry: Its value after one of ``on_set`` was set.
+        carry: Its value after one of ``on_set`` was set: a function of the present value, of
+            ``on_set`` before and of ``on_set`` after.
+        restart: Those of ``on_set`` that, when set, put it where it would be at the start.
         settable: False for what the engine reports only.
         a: Space A.
         b: Space B.
@@ -47,14 +50,20 @@ class State:
     on_set: tuple[str, ...] = ()
     start: Function | None = None
     carry: Function | None = None
+    restart: tuple[str, ...] = ()
     settable: bool = True
     a: Space | None = None
     b: Space | None = None
 
-    def declare(self, inputs: Iterable[str]) -> Measured:
-        """Write the declaration, given all quantities of the world that physics knows."""
+    def declare(self, inputs: Iterable[Parent]) -> Measured:
+        """Write the declaration.
+
+        Args:
+            inputs: All quantities of the world that physics knows, as causes that act where
+                there is contact.
+        """
         always = tuple(Parent(name, 1) for name in self.always)
-        contact = tuple(Parent(name, 1, "contact") for name in inputs if name not in self.always)
+        contact = tuple(parent for parent in inputs if parent.name not in self.always)
         on_set = tuple(Parent(name, 0, "set") for name in self.on_set)
         return Measured(
             name=self.name,
@@ -68,6 +77,7 @@ class State:
             parents=always + contact + on_set,
             start=self.start,
             carry=self.carry,
+            restart=self.restart,
             settable_state=self.settable,
         )
 
@@ -110,8 +120,22 @@ class Entity(ABC):  # every hook has a sensible empty default
         """Whether it is a movable block."""
         return False
 
+    @property
+    def is_obstacle(self) -> bool:
+        """Whether it is a box that nothing moves."""
+        return False
+
+    @property
+    def hull(self) -> Hull | None:
+        """The shape of a block that is no box."""
+        return None
+
     def goal(self, values: Values) -> Goal | None:
         """Describe the goal that this entity is, if it is one."""
+        return None
+
+    def light(self, values: Values) -> Light | None:
+        """Describe the light that this entity is, if it is one."""
         return None
 
 
@@ -134,14 +158,23 @@ class Composition:
     entities: tuple[Entity, ...]
     shared: tuple[Variable, ...] = ()
     blocks: tuple[str, ...] = field(init=False)
+    obstacles: tuple[str, ...] = field(init=False)
+    hulls: tuple[tuple[str, Hull], ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        names = tuple(entity.name for entity in self.entities if entity.is_block)
-        object.__setattr__(self, "blocks", names)
+        blocks = [entity for entity in self.entities if entity.is_block]
+        found = {
+            "blocks": tuple(entity.name for entity in blocks),
+            "obstacles": tuple(entity.name for entity in self.entities if entity.is_obstacle),
+            "hulls": tuple((e.name, e.hull) for e in blocks if e.hull is not None),
+        }
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
-        inputs = tuple(name for entity in self.entities for name in entity.inputs())
+        names = (name for entity in self.entities for name in entity.inputs())
+        inputs = tuple(Parent(name, 1, "contact") for name in names)
         declared: list[Variable] = list(self.shared)
         for entity in self.entities:
             declared.extend(entity.variables())
@@ -164,6 +197,11 @@ class Composition:
         """Describe all goals."""
         goals = (entity.goal(values) for entity in self.entities)
         return tuple(goal for goal in goals if goal is not None)
+
+    def light(self, values: Values) -> Light:
+        """Describe the light of pictures."""
+        lights = (entity.light(values) for entity in self.entities)
+        return next((light for light in lights if light is not None), Light())
 
 
 def lowest_point(size: Floats, orientation: Floats) -> float:

@@ -10,12 +10,14 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.entities.base import Entity, State, block_slice, lowest_point
 from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
+from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, to_rotation_vector
 from scm_world.scene import ParameterKey
 from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Parent, Variable
 from scm_world.variables import catalogue as numbers
 
-CUBOID = 1  # the published type id
+CUBOID = 1  # the published type ids
+MESH = 2
 
 
 def standing(size: Floats, orientation: Floats, *, place: Floats) -> Floats:
@@ -44,9 +46,17 @@ def keep_lowest_point(
 
 
 def coordinates(
-    entity: str, *, a: Box | None, b: Box | None, orientation: bool = True
+    entity: str, *, a: Box | None, b: Box | None, orientation: bool = True, yaw: bool = True
 ) -> Iterable[Variable]:
-    """Declare the other coordinates of a pose: cylindrical position and rotation vector."""
+    """Declare the other coordinates of a pose: cylindrical position and rotation vector.
+
+    Args:
+        entity: Prefix.
+        a: Space A of the cylindrical position.
+        b: Space B of it.
+        orientation: Whether there is an orientation.
+        yaw: Whether A and B of the rotation vector are the turns about z, or there are none.
+    """
     yield Derived(
         name=f"{entity}.cylindrical_position",
         unit="m, rad, m",
@@ -63,8 +73,8 @@ def coordinates(
             name=f"{entity}.euler_orientation",
             unit="rad",
             shape=(3,),
-            a=numbers.YAW,
-            b=numbers.YAW,
+            a=numbers.YAW if yaw else None,
+            b=numbers.YAW if yaw else None,
             parents=(f"{entity}.orientation",),
             mechanism=to_rotation_vector,
             inverse=from_rotation_vector,
@@ -74,54 +84,64 @@ def coordinates(
 
 @final
 class ToolBlock(Entity):
-    """A cuboid that the robot may move.
+    """A block that the robot may move.
 
     Args:
         name: Prefix of its variables.
-        size_from: Variable that its size copies, or None for a size of its own.
-        mass: Default [kg].
+        size: The declaration of ``<name>.size``; see ``block_size``.
+        mass: Of ``<name>.mass``; see ``block_mass``.
         place: x, y of the center at the start and height of its lowest point [m].
+        spawn: Instead of ``place``: how it stands at the start as a function of its size, its
+            orientation and of what ``spawn_from`` names. Setting one of those puts it there
+            again.
+        spawn_from: Further causes of the place at the start.
+        spawn_again: Whether a size that is set does so too; else the block then keeps its lowest
+            point.
         a: Space A of the cylindrical position.
         b: Space B of it.
+        hull: Its shape, if it is no box. The size is then a constant.
     """
 
     def __init__(
         self,
         name: str,
         *,
-        size_from: str | None,
-        mass: float,
-        place: tuple[float, float, float],
-        a: Box,
-        b: Box,
+        size: Variable,
+        mass: Variable,
+        place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        spawn: Function | None = None,
+        spawn_from: tuple[str, ...] = (),
+        spawn_again: bool = False,
+        a: Box | None = None,
+        b: Box | None = None,
+        hull: Hull | None = None,
     ) -> None:
         self.name = name
-        self._size_from = size_from
-        self._mass = mass
-        self._place = place
+        self._size, self._mass = size, mass
+        self._spawn = spawn or Function(standing, constants={"place": place})
+        self._spawn_from = spawn_from
+        self._restart = (*spawn_from, self._v("size")) if spawn_again else spawn_from
         self._a, self._b = a, b
+        self._hull = hull
 
     @property
     def is_block(self) -> bool:
         """A block it is."""
         return True
 
+    @property
+    def hull(self) -> Hull | None:
+        """The shape of a block that is no box."""
+        return self._hull
+
     def _v(self, quantity: str) -> str:
         return f"{self.name}.{quantity}"
 
     def variables(self) -> Iterable[Variable]:
         """Declare type, size, mass, friction, color and the other coordinates of the pose."""
-        yield object_type(self._v("type"), CUBOID)
-        yield block_size(self._v("size"), self._size_from)
-        yield Exogenous(
-            name=self._v("mass"),
-            unit="kg",
-            bounds=numbers.BLOCK_MASS_BOUNDS,
-            a=numbers.MASS_A,
-            b=numbers.MASS_B,
-            default=self._mass,
-            doc="Mass; the inertia of a solid box follows from it.",
-        )
+        yield object_type(self._v("type"), CUBOID if self._hull is None else MESH)
+        yield self._size
+        yield self._mass
         yield Exogenous(
             name=self._v("friction"),
             bounds=numbers.FRICTION_BOUNDS,
@@ -135,6 +155,7 @@ class ToolBlock(Entity):
         """Declare pose and velocities."""
         position, orientation = self._v("cartesian_position"), self._v("orientation")
         linear, angular = self._v("linear_velocity"), self._v("angular_velocity")
+        always = "gravity", numbers.PRESET
         yield State(
             position,
             "m",
@@ -142,10 +163,11 @@ class ToolBlock(Entity):
             numbers.POSITION_BOUNDS,
             (0.0, 0.0, 0.0),
             "Position of the center.",
-            always=(position, linear, "gravity"),
-            on_set=(self._v("size"), orientation),
-            start=Function(standing, constants={"place": self._place}),
+            always=(position, linear, *always),
+            on_set=(self._v("size"), orientation, *self._spawn_from),
+            start=self._spawn,
             carry=Function(keep_lowest_point),
+            restart=self._restart,
         )
         yield State(
             orientation,
@@ -154,7 +176,7 @@ class ToolBlock(Entity):
             numbers.QUATERNION_BOUNDS,
             numbers.IDENTITY,
             "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
-            always=(orientation, angular),
+            always=(orientation, angular, numbers.PRESET),
         )
         yield State(
             linear,
@@ -163,7 +185,7 @@ class ToolBlock(Entity):
             numbers.LINEAR_VELOCITY_BOUNDS,
             (0.0, 0.0, 0.0),
             "Velocity of the center.",
-            always=(linear, "gravity"),
+            always=(linear, *always),
         )
         yield State(
             angular,
@@ -172,20 +194,20 @@ class ToolBlock(Entity):
             numbers.ANGULAR_VELOCITY_BOUNDS,
             (0.0, 0.0, 0.0),
             "Angular velocity in the world frame.",
-            always=(angular,),
+            always=(angular, numbers.PRESET),
         )
 
     def inputs(self) -> Iterable[str]:
         """Pose, velocities, mass, size and friction matter to physics; the color does not."""
         yield from (state.name for state in self.states())
-        yield from (self._v("mass"), self._v("size"), self._v("friction"))
+        yield from (self._v("mass"), self._v("friction"))
+        if self._hull is None:
+            yield self._v("size")
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
-        return {
-            self._v(quantity): (self.name, quantity)
-            for quantity in ("mass", "size", "friction", "color")
-        }
+        own = ("mass", "friction", "color") if self._hull else ("mass", "size", "friction", "color")
+        return {self._v(quantity): (self.name, quantity) for quantity in own}
 
     def slices(self, block: int) -> Mapping[str, slice]:
         """Say where its states stand in the state vector."""
@@ -202,20 +224,67 @@ def same(parent: Floats) -> Floats:
     return parent
 
 
-def block_size(name: str, size_from: str | None) -> Variable:
-    """Declare the size of a block: a root, or the copy of a shared cause."""
+def block_size(
+    name: str,
+    size_from: str | None = None,
+    *,
+    default: tuple[float, float, float] = numbers.BLOCK_SIZE,
+    spaces: bool = True,
+) -> Variable:
+    """Declare the size of a block: a root, or the copy of a shared cause.
+
+    Args:
+        name: Of the variable.
+        size_from: The variable that it copies.
+        default: Full edge lengths of a root [m].
+        spaces: Whether it has the spaces A and B of a block.
+    """
     common: dict[str, Any] = {
         "name": name,
         "unit": "m",
         "shape": (3,),
         "bounds": numbers.SIZE_BOUNDS,
-        "a": numbers.SIZE_A,
-        "b": numbers.SIZE_B,
+        "a": numbers.SIZE_A if spaces else None,
+        "b": numbers.SIZE_B if spaces else None,
         "doc": "Full edge lengths.",
     }
     if size_from is None:
-        return Exogenous(default=numbers.BLOCK_SIZE, **common)
+        return Exogenous(default=default, **common)
     return Derived(parents=(Parent(size_from),), mechanism=Function(same), **common)
+
+
+def block_mass(
+    name: str, mass_from: str | None = None, *, default: float = numbers.BLOCK_MASS
+) -> Variable:
+    """Declare the mass of a block: a root, or the copy of a shared cause.
+
+    Args:
+        name: Of the variable.
+        mass_from: The variable that it copies.
+        default: Of a root [kg].
+    """
+    common: dict[str, Any] = {
+        "name": name,
+        "unit": "kg",
+        "bounds": numbers.BLOCK_MASS_BOUNDS,
+        "a": numbers.MASS_A,
+        "b": numbers.MASS_B,
+        "doc": "Mass; the inertia of the solid follows from it.",
+    }
+    if mass_from is None:
+        return Exogenous(default=default, **common)
+    return Derived(parents=(Parent(mass_from),), mechanism=Function(same), **common)
+
+
+def hull_size(name: str, size: tuple[float, float, float]) -> Fixed:
+    """Declare the edge lengths of the box around a hull, which cannot change [m]."""
+    return Fixed(
+        name=name,
+        unit="m",
+        shape=(3,),
+        value=size,
+        doc="Edge lengths of the box around the shape, in its own frame.",
+    )
 
 
 def object_type(name: str, value: int) -> Fixed:
@@ -229,20 +298,14 @@ def object_type(name: str, value: int) -> Fixed:
     )
 
 
-def color(
-    name: str,
-    default: tuple[float, float, float],
-    *,
-    a: Box = numbers.BRIGHT,
-    b: Box = numbers.DARK,
-) -> Exogenous:
-    """Declare a color."""
+def color(name: str, default: tuple[float, float, float]) -> Exogenous:
+    """Declare a color. Space A is dark and B is bright, as in the paper."""
     return Exogenous(
         name=name,
         shape=(3,),
         bounds=numbers.COLOR_BOUNDS,
-        a=a,
-        b=b,
+        a=numbers.DARK,
+        b=numbers.BRIGHT,
         default=default,
         doc="Red, green and blue; nothing physical depends on it.",
     )

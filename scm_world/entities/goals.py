@@ -9,13 +9,15 @@ import numpy as np
 
 from scm_world._types import Floats, Values
 from scm_world.entities.base import Entity
-from scm_world.entities.blocks import block_size, color, coordinates, object_type
+from scm_world.entities.blocks import color, coordinates, object_type, same
+from scm_world.geometry.hulls import Hull
 from scm_world.scene import Goal
-from scm_world.variables import Box, Derived, Exogenous, Variable
+from scm_world.variables import Box, Derived, Exogenous, Function, Variable
 from scm_world.variables import catalogue as numbers
 
 SILHOUETTE_CUBOID = 20
 SILHOUETTE_SPHERE = 21
+SILHOUETTE_MESH = 23
 
 
 def on_the_floor(polar: Floats, size: Floats) -> Floats:
@@ -36,88 +38,132 @@ def on_the_floor(polar: Floats, size: Floats) -> Floats:
     return center
 
 
-def _orientation(name: str) -> Exogenous:
-    return Exogenous(
-        name=name,
+def goal_position(
+    name: str,
+    *,
+    parents: tuple[str, ...] = (),
+    mechanism: Function | None = None,
+    default: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Variable:
+    """Declare the center of a goal: a root, or where a mechanism puts it [m]."""
+    quantity, doc = f"{name}.cartesian_position", "Position of the center."
+    if mechanism is None:
+        return Exogenous(
+            name=quantity,
+            unit="m",
+            shape=(3,),
+            bounds=numbers.POSITION_BOUNDS,
+            default=default,
+            doc=doc,
+        )
+    return Derived(
+        name=quantity,
+        unit="m",
+        shape=(3,),
+        bounds=numbers.POSITION_BOUNDS,
+        parents=parents,
+        mechanism=mechanism,
+        doc=doc,
+    )
+
+
+def goal_orientation(
+    name: str,
+    *,
+    parents: tuple[str, ...] = (),
+    mechanism: Function | None = None,
+    default: tuple[float, float, float, float] = numbers.IDENTITY,
+) -> Variable:
+    """Declare the orientation of a goal: a root, or what a mechanism makes it."""
+    quantity, doc = f"{name}.orientation", "Orientation as a unit quaternion (x, y, z, w)."
+    bounds = numbers.QUATERNION_BOUNDS
+    if not parents:
+        return Exogenous(name=quantity, shape=(4,), bounds=bounds, default=default, doc=doc)
+    return Derived(
+        name=quantity,
         shape=(4,),
-        bounds=numbers.QUATERNION_BOUNDS,
-        default=numbers.IDENTITY,
-        doc="Orientation as a unit quaternion (x, y, z, w).",
+        bounds=bounds,
+        parents=parents,
+        mechanism=mechanism or Function(same),
+        doc=doc,
+    )
+
+
+def polar(name: str, default: tuple[float, float], *, a: Box, b: Box) -> Exogenous:
+    """Declare radius and angle of something that stands on the floor [m, rad]."""
+    return Exogenous(
+        name=f"{name}.polar",
+        unit="m, rad",
+        shape=(2,),
+        bounds=numbers.POLAR_BOUNDS,
+        a=a,
+        b=b,
+        default=default,
+        doc="Radius and angle of its center; the height follows from the size.",
     )
 
 
 class _Goal(Entity):
-    """What boxes and spheres have in common.
-
-    Attributes:
-        shape: ``"box"`` or ``"sphere"``.
-    """
-
-    shape: str
+    """What boxes, hulls and spheres have in common."""
 
     def _v(self, quantity: str) -> str:
         return f"{self.name}.{quantity}"
 
-    def goal(self, values: Values) -> Goal:
-        """Describe the silhouette."""
+    def _silhouette(self, shape: str, values: Values, hull: Hull | None = None) -> Goal:
         return Goal(
             name=self.name,
-            shape=self.shape,
+            shape=shape,
             size=values[self._v("size")],
             position=values[self._v("cartesian_position")],
             orientation=values[self._v("orientation")],
             color=values[self._v("color")],
+            hull=hull,
         )
 
 
 @final
 class GoalBlock(_Goal):
-    """A box on the floor that a block should fill.
+    """A place that a block should fill.
 
     Args:
         name: Prefix of its variables.
-        size_from: Variable that its size copies.
-        polar: Default radius [m] and angle [rad] of its center.
+        size: The declaration of ``<name>.size`` [m].
+        pose: Those of ``<name>.cartesian_position`` and ``<name>.orientation``, and of causes
+            that belong to this goal alone.
         a: Space A of the cylindrical position.
         b: Space B of it.
+        yaw: Whether turns about z are in the spaces of the rotation vector.
+        hull: Its shape, if it is no box.
     """
 
-    shape = "box"
-
     def __init__(
-        self, name: str, *, size_from: str, polar: tuple[float, float], a: Box, b: Box
+        self,
+        name: str,
+        *,
+        size: Variable,
+        pose: Iterable[Variable],
+        a: Box | None = None,
+        b: Box | None = None,
+        yaw: bool = True,
+        hull: Hull | None = None,
     ) -> None:
         self.name = name
-        self._size_from = size_from
-        self._polar = polar
-        self._a, self._b = a, b
+        self._size, self._pose = size, tuple(pose)
+        self._a, self._b, self._yaw = a, b, yaw
+        self._shape = hull
 
     def variables(self) -> Iterable[Variable]:
         """Declare place, orientation, size and color."""
-        yield object_type(self._v("type"), SILHOUETTE_CUBOID)
-        yield block_size(self._v("size"), self._size_from)
-        yield Exogenous(
-            name=self._v("polar"),
-            unit="m, rad",
-            shape=(2,),
-            bounds=numbers.POLAR_BOUNDS,
-            a=numbers.POLAR_A,
-            b=numbers.POLAR_B,
-            default=self._polar,
-            doc="Radius and angle of its center; the height follows from the size.",
-        )
-        yield Derived(
-            name=self._v("cartesian_position"),
-            unit="m",
-            shape=(3,),
-            bounds=numbers.POSITION_BOUNDS,
-            parents=(self._v("polar"), self._v("size")),
-            mechanism=on_the_floor,
-            doc="Position of the center.",
-        )
-        yield _orientation(self._v("orientation"))
+        kind = SILHOUETTE_CUBOID if self._shape is None else SILHOUETTE_MESH
+        yield object_type(self._v("type"), kind)
+        yield self._size
+        yield from self._pose
         yield color(self._v("color"), numbers.GOAL_COLOR)
-        yield from coordinates(self.name, a=self._a, b=self._b)
+        yield from coordinates(self.name, a=self._a, b=self._b, yaw=self._yaw)
+
+    def goal(self, values: Values) -> Goal:
+        """Describe the silhouette."""
+        return self._silhouette("box" if self._shape is None else "hull", values, self._shape)
 
 
 @final
@@ -130,8 +176,6 @@ class GoalSphere(_Goal):
         radius: Default radius [m].
         tint: Default color.
     """
-
-    shape = "sphere"
 
     def __init__(
         self,
@@ -157,15 +201,8 @@ class GoalSphere(_Goal):
             default=(2.0 * self._radius,) * 3,
             doc="Diameter, three times; only pictures and the lowest height of A and B use it.",
         )
-        yield Exogenous(
-            name=self._v("cartesian_position"),
-            unit="m",
-            shape=(3,),
-            bounds=numbers.POSITION_BOUNDS,
-            default=self._position,
-            doc="Position of the center.",
-        )
-        yield _orientation(self._v("orientation"))
+        yield goal_position(self.name, default=self._position)
+        yield goal_orientation(self.name)
         yield color(self._v("color"), self._tint)
         low = numbers.half_height(self._v("size"))
         yield from coordinates(
@@ -173,3 +210,7 @@ class GoalSphere(_Goal):
             a=numbers.cylindrical(numbers.RADIUS_A, low, numbers.HEIGHT_A),
             b=numbers.cylindrical(numbers.RADIUS_B, low, numbers.HEIGHT_B),
         )
+
+    def goal(self, values: Values) -> Goal:
+        """Describe the silhouette."""
+        return self._silhouette("sphere", values)

@@ -10,7 +10,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.entities.base import Entity, State
 from scm_world.entities.blocks import color
-from scm_world.scene import ParameterKey, trifinger
+from scm_world.scene import ControllerSpec, ParameterKey, trifinger
 from scm_world.scene.kinematics import forward_kernel
 from scm_world.variables import Action, Box, Exogenous, Measured, Variable
 from scm_world.variables import catalogue as numbers
@@ -23,6 +23,47 @@ ACTIONS = {
     "end_effector_positions": ("m", END_EFFECTORS),
 }
 """Unit and range of each way to command the robot."""
+
+
+_SPEC = ControllerSpec()
+
+CONTROLLER = (
+    (
+        "position_gains",
+        "N m/rad",
+        numbers.POSITION_GAIN_BOUNDS,
+        (numbers.POSITION_GAINS_A, numbers.POSITION_GAINS_B),
+        _SPEC.kp,
+        "Proportional gain of the three joints of a finger.",
+    ),
+    (
+        "velocity_gains",
+        "N m s/rad",
+        numbers.DAMPING_BOUNDS,
+        (numbers.VELOCITY_GAINS_A, numbers.VELOCITY_GAINS_B),
+        _SPEC.kd,
+        "Derivative gain of the three joints of a finger.",
+    ),
+    (
+        "safety_damping",
+        "N m s/rad",
+        numbers.DAMPING_BOUNDS,
+        (numbers.SAFETY_DAMPING_A, numbers.SAFETY_DAMPING_B),
+        _SPEC.safety,
+        "Damping of the safety filter, for the three joints of a finger.",
+    ),
+    (
+        "torque_limit",
+        "N m",
+        numbers.TORQUE_BOUNDS,
+        (numbers.TORQUE_A, numbers.TORQUE_B),
+        _SPEC.limit,
+        "Largest torque of a joint.",
+    ),
+)
+"""The joint controller: name, unit, bounds, spaces A and B, default, sentence."""
+
+ACTUATOR_NOISE = "actuator_noise"
 
 
 def tips(joint_positions: Floats, robot_height: Floats) -> Floats:
@@ -66,6 +107,7 @@ class Robot(Entity):
         )
         for finger in trifinger.FINGERS:
             yield from self._links(finger)
+        yield from self._hidden()
         yield Measured(
             name="end_effector_positions",
             unit="m",
@@ -89,13 +131,52 @@ class Robot(Entity):
                 default=mass,
                 doc=f"Mass of the link; its inertia scales with it.{still}",
             )
-            tint = trifinger.LINK_COLORS[finger]
-            yield color(f"{link}.color", tint, a=numbers.DARK, b=numbers.BRIGHT)
+            yield color(f"{link}.color", trifinger.LINK_COLORS[finger])
+
+    def _hidden(self) -> Iterable[Variable]:
+        """Declare what the predecessor keeps to itself: friction, damping, control and noise."""
+        yield Exogenous(
+            name="finger_friction",
+            bounds=numbers.FRICTION_BOUNDS,
+            a=numbers.FRICTION_A,
+            b=numbers.FRICTION_B,
+            default=numbers.FINGER_FRICTION,
+            doc="Friction of all links; a contact has the product of two frictions.",
+        )
+        yield Exogenous(
+            name="joint_damping",
+            unit="N m s/rad",
+            bounds=numbers.DAMPING_BOUNDS,
+            a=numbers.JOINT_DAMPING_A,
+            b=numbers.JOINT_DAMPING_B,
+            default=0.0,
+            doc="Passive damping of every joint.",
+        )
+        for name, unit, bounds, (a, b), default, doc in CONTROLLER:
+            shape = (3,) if isinstance(default, tuple) else ()
+            yield Exogenous(
+                name=name,
+                unit=unit,
+                shape=shape,
+                bounds=bounds,
+                a=a,
+                b=b,
+                default=default,
+                doc=doc,
+            )
+        yield Exogenous(
+            name=ACTUATOR_NOISE,
+            bounds=numbers.NOISE_BOUNDS,
+            a=numbers.NOISE_A,
+            b=numbers.NOISE_B,
+            default=0.0,
+            doc="Standard deviation of a command, as a fraction of half the range of an action.",
+        )
 
     def states(self) -> Iterable[State]:
         """Declare joint positions, velocities and the torques the engine reports."""
-        moving = tuple(name for name in self.inputs() if name != "robot_height")
-        always = (*moving, "gravity")
+        moving = (n for n in self.inputs() if n not in ("robot_height", "finger_friction"))
+        always = (*moving, "gravity", numbers.PRESET)
         yield State(
             "joint_positions",
             "rad",
@@ -120,7 +201,7 @@ class Robot(Entity):
             "joint_torques",
             "N m",
             (9,),
-            Box(-0.36, 0.36),
+            Box(-1.0, 1.0),
             (0.0,) * 9,
             "Torques of the last physics step.",
             always=always,
@@ -130,6 +211,10 @@ class Robot(Entity):
     def inputs(self) -> Iterable[str]:
         """Everything but colors, the fixed finger bases and what is only read out."""
         yield from ("joint_positions", "joint_velocities", "action", "robot_height")
+        yield from ("finger_friction", "joint_damping", "safety_damping", "torque_limit")
+        if self.action_mode != "joint_torques":
+            yield from ("position_gains", "velocity_gains")
+        yield ACTUATOR_NOISE
         for finger in trifinger.FINGERS:
             yield from (f"{trifinger.link_name(finger, index)}.mass" for index in (1, 2, 3))
 
@@ -140,7 +225,13 @@ class Robot(Entity):
             for link in trifinger.LINK_NAMES
             for quantity in ("mass", "color")
         }
-        return {"robot_height": ("robot", "height"), **links}
+        control = {name: ("controller", name) for name, *_ in CONTROLLER}
+        own = {
+            "robot_height": ("robot", "height"),
+            "finger_friction": ("robot", "friction"),
+            "joint_damping": ("robot", "joint_damping"),
+        }
+        return {**own, **control, **links}
 
     def slices(self, block: int) -> Mapping[str, slice]:
         """Say where its states stand in the state vector."""

@@ -8,18 +8,28 @@ from typing import final
 from scm_world._types import Value
 from scm_world.entities.base import Entity
 from scm_world.entities.blocks import color
-from scm_world.scene import ParameterKey
-from scm_world.variables import Box, Exogenous, Function, Measured, Parent, Variable
+from scm_world.scene import PRESETS, ParameterKey
+from scm_world.variables import Box, Categories, Exogenous, Function, Measured, Parent, Variable
 from scm_world.variables import catalogue as numbers
 
 CONTROL_INDEX = "control_index"
+SENSOR_NOISE = "sensor_noise"
+PRESET_NAMES = tuple(PRESETS)
+"""What the categories of ``timestep_preset`` stand for."""
 
 
 @final
 class Stage(Entity):
-    """What the robot and the blocks stand in."""
+    """What the robot and the blocks stand in.
+
+    Args:
+        preset: Numerical settings at the start: ``"fast"`` or ``"precise"``.
+    """
 
     name = "stage"
+
+    def __init__(self, preset: str = "fast") -> None:
+        self._preset = preset
 
     def variables(self) -> Iterable[Variable]:
         """Declare gravity, frictions and colors."""
@@ -43,11 +53,50 @@ class Stage(Entity):
                 doc=f"Friction of {what}; a contact has the product of two frictions.",
             )
         yield color("floor_color", numbers.FLOOR_COLOR)
-        yield color("stage_color", numbers.STAGE_COLOR, a=numbers.DARK, b=numbers.BRIGHT)
+        yield color("stage_color", numbers.STAGE_COLOR)
+        yield from self._hidden()
+
+    def _hidden(self) -> Iterable[Variable]:
+        """Declare what the predecessor keeps to itself."""
+        yield Exogenous(
+            name="restitution",
+            bounds=numbers.RESTITUTION_BOUNDS,
+            a=numbers.RESTITUTION_A,
+            b=numbers.RESTITUTION_B,
+            default=0.0,
+            doc="Speed after a head-on impact over speed before it, for every contact.",
+        )
+        yield Exogenous(
+            name="spinning_friction",
+            unit="m",
+            bounds=numbers.SPINNING_BOUNDS,
+            a=numbers.SPINNING_A,
+            b=numbers.SPINNING_B,
+            default=numbers.SPINNING_FRICTION,
+            doc="Friction of every contact against turning about its normal.",
+        )
+        yield Exogenous(
+            name=numbers.PRESET,
+            dtype="categorical",
+            bounds=numbers.PRESET_BOUNDS,
+            a=Categories((0,)),
+            b=Categories((1,)),
+            default=PRESET_NAMES.index(self._preset),
+            doc="How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
+        )
+        yield Exogenous(
+            name=SENSOR_NOISE,
+            bounds=numbers.NOISE_BOUNDS,
+            a=numbers.NOISE_A,
+            b=numbers.NOISE_B,
+            default=0.0,
+            doc="Standard deviation of every observed number, as a fraction of half its range.",
+        )
 
     def inputs(self) -> Iterable[str]:
-        """Gravity and the two frictions."""
-        return ("gravity", "floor_friction", "stage_friction")
+        """Gravity, frictions, restitution and the time step."""
+        yield from ("gravity", "floor_friction", "stage_friction")
+        yield from ("restitution", "spinning_friction", numbers.PRESET)
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Say which variable sets which physical parameter."""
@@ -57,6 +106,8 @@ class Stage(Entity):
             "stage_friction": ("stage", "friction"),
             "floor_color": ("floor", "color"),
             "stage_color": ("stage", "color"),
+            "restitution": ("world", "restitution"),
+            "spinning_friction": ("world", "spinning_friction"),
         }
 
 

@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import final
+from functools import lru_cache
+from itertools import pairwise, permutations, product
+from os import PathLike
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import ArrayLike, Floats, Integers
+from scm_world.errors import MissingEngine, ModelError, UnknownOption
+from scm_world.geometry.arrays import compact
+from scm_world.geometry.hull_kernels import Solid, hull_overlap_kernel
 
 Vector = tuple[float, float, float]
+
+MOST_VERTICES = 256
+FORMATS = ("obj", "stl")
+INSTALL = "pip install 'scm-world[mesh]'"
+THINNEST = 1e-6  # of the greatest extent: what is thinner has no volume
+SAME_NORMAL = 1e-5  # [rad] sides that differ by less are one side
+SAME_OFFSET = 1e-6  # of the greatest extent
+SAME_MOMENT = 1e-6  # of the greatest second moment: axes of equal ones can be chosen freely
 
 
 @final
@@ -27,3 +47,289 @@ class Hull:
     planes: tuple[tuple[float, float, float, float], ...]
     volume: float
     moments: Vector
+
+
+def hull_of(points: ArrayLike) -> Hull:
+    """Wrap points in a convex polyhedron of uniform density.
+
+    The result is expressed in the frame of its center of mass and its principal axes. Order and
+    signs of the axes are those that turn the points least; where moments are equal, and axes
+    can be chosen, too. A shape whose axes are principal axes is not turned at all.
+
+    Args:
+        points: Corners, and any number of points among them, shape (n, 3) [m].
+
+    Raises:
+        ModelError: The points are not finite, lie in one plane, or have too many corners.
+        MissingEngine: The extra ``mesh`` is not installed.
+
+    Example:
+        >>> from itertools import product
+        >>> plate = hull_of([(x, y, z) for x in (0, 2) for y in (0, 4) for z in (0, 1)])
+        >>> round(plate.volume, 9), len(plate.vertices), len(plate.planes)
+        (8.0, 8, 6)
+        >>> extents(plate).round(9).tolist()
+        [2.0, 4.0, 1.0]
+    """
+    cloud = np.asarray(points, dtype=np.float64)
+    if cloud.ndim != 2 or cloud.shape[1] != 3 or not np.isfinite(cloud).all():
+        raise ModelError(
+            [f"the points of a hull must be finite numbers of shape (n, 3), got {cloud.shape}"]
+        )
+    vertices, faces, planes = _polyhedron(cloud)
+    center, spread, volume = _second_moments(vertices, faces)
+    axes = _principal_axes(spread)
+    local = (vertices - center) @ axes
+    offsets = planes[:, 3] - planes[:, :3] @ center
+    along = np.einsum("ki,kl,li->i", axes, spread, axes)
+    return Hull(
+        tuple(map(tuple, local.tolist())),
+        tuple(map(tuple, faces.tolist())),
+        tuple(map(tuple, np.column_stack([planes[:, :3] @ axes, offsets]).tolist())),
+        volume,
+        tuple((along.sum() - along).tolist()),
+    )
+
+
+def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
+    """Read a mesh and wrap it in a convex polyhedron; see ``hull_of``.
+
+    Args:
+        path: An ``.obj`` or ``.stl`` file.
+        scale: The length of its unit [m].
+
+    Raises:
+        ModelError: The file has no volume, too many corners, or cannot be read.
+        UnknownOption: The file has another format.
+        MissingEngine: The extra ``mesh`` is not installed.
+    """
+    file = Path(path)
+    kind = file.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise UnknownOption("mesh format", kind, FORMATS)
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise ModelError([f"the scale of {file} must be positive and finite, got {scale}"])
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingEngine("trimesh", INSTALL) from error
+    try:
+        with file.open("rb") as stream:
+            mesh: Any = trimesh.load(stream, file_type=kind, force="mesh", process=False)
+    except (OSError, ValueError, IndexError, KeyError) as error:
+        raise ModelError([f"{file} cannot be read as a mesh: {error}"]) from error
+    try:
+        return hull_of(scale * np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))
+    except ModelError as error:
+        raise ModelError([f"{file}: {problem}" for problem in error.problems]) from error
+
+
+def box_hull(size: ArrayLike) -> Hull:
+    """Give a box as a polyhedron.
+
+    Args:
+        size: Full edge lengths, shape (3,) [m].
+
+    Example:
+        >>> box_hull([1.0, 2.0, 3.0]).volume
+        6.0
+    """
+    edges = compact(size)
+    half = 0.5 * edges
+    signs = np.array(list(product((-1.0, 1.0), repeat=3)))  # corner 4 i + 2 j + k
+    planes = np.vstack([np.column_stack([s * np.eye(3), half]) for s in (1.0, -1.0)])
+    faces = []
+    for axis, step in enumerate((4, 2, 1)):
+        along, across = ((2, 1), (1, 4), (4, 2))[axis]
+        low = (0, across, along + across, along)
+        high = (step, step + along, step + along + across, step + across)
+        faces += [(p, q, r) for p, *fan in (low, high) for q, r in pairwise(fan)]
+    squares = edges**2
+    return Hull(
+        tuple(map(tuple, (signs * half).tolist())),
+        tuple(faces),
+        tuple(map(tuple, planes.tolist())),
+        float(np.prod(edges)),
+        tuple(((squares.sum() - squares) / 12.0).tolist()),
+    )
+
+
+def extents(hull: Hull) -> Floats:
+    """Measure the box around a polyhedron in its own frame, shape (3,) [m]."""
+    size: Floats = np.ptp(np.array(hull.vertices), axis=0)
+    return size
+
+
+@lru_cache(maxsize=128)
+def solid(hull: Hull) -> Solid:
+    """Give a polyhedron as arrays, for kernels. They are shared: leave them as they are."""
+    faces = np.array(hull.faces, dtype=np.int64)
+    return Solid(compact(hull.vertices), faces, compact(hull.planes), hull.volume)
+
+
+def hull_overlap(
+    hull_a: Hull,
+    position_a: ArrayLike,
+    orientation_a: ArrayLike,
+    hull_b: Hull,
+    position_b: ArrayLike,
+    orientation_b: ArrayLike,
+) -> float:
+    """Compute the volume that two convex polyhedra share, exact to rounding.
+
+    Args:
+        hull_a: The first one.
+        position_a: Its center of mass, shape (3,) [m].
+        orientation_a: Its quaternion (x, y, z, w), of any length.
+        hull_b: As ``hull_a``, of the second one.
+        position_b: As ``position_a``.
+        orientation_b: As ``orientation_a``.
+
+    Returns:
+        The volume [m³], at least zero and at most that of the smaller one.
+
+    Example:
+        >>> cube, upright = box_hull([1.0, 1.0, 1.0]), [0.0, 0.0, 0.0, 1.0]
+        >>> hull_overlap(cube, [0.0, 0.0, 0.0], upright, cube, [0.5, 0.0, 0.0], upright)
+        0.5
+    """
+    pose_a = compact(position_a), compact(orientation_a)
+    pose_b = compact(position_b), compact(orientation_b)
+    return float(hull_overlap_kernel(solid(hull_a), *pose_a, solid(hull_b), *pose_b))
+
+
+def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:
+    """Find corners (v, 3), triangles (f, 3) and planes (p, 4) of the hull of points."""
+    extent = float(np.ptp(cloud, axis=0).max()) if len(cloud) else 0.0
+    middle = cloud.mean(axis=0) if len(cloud) else np.zeros(3)
+    if len(cloud) < 4 or extent == 0.0:
+        raise ModelError([f"{len(cloud)} points have no volume; give four or more"])
+    wrapped = _wrap((cloud - middle) / extent)
+    if len(wrapped.vertices) > MOST_VERTICES:
+        raise ModelError(
+            [
+                f"the convex hull has {len(wrapped.vertices)} corners, more than {MOST_VERTICES}; "
+                "simplify the mesh, for example with trimesh's simplify_quadric_decimation"
+            ]
+        )
+    sides = _sides(wrapped.points, wrapped.simplices, wrapped.equations)
+    return _assemble(sides, wrapped.points, middle, extent)
+
+
+def _wrap(cloud: Floats) -> Any:
+    """Let Qhull find the hull of points whose extent is one."""
+    try:
+        from scipy.spatial import ConvexHull, QhullError
+    except ImportError as error:
+        raise MissingEngine("scipy", INSTALL) from error
+    thickness = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
+    if thickness[2] <= THINNEST * thickness[0]:
+        raise ModelError(["the points lie in one plane and have no volume"])
+    try:
+        return ConvexHull(cloud)
+    except QhullError as error:
+        raise ModelError([f"the points have no convex hull: {error}"]) from error
+
+
+def _sides(points: Floats, triangles: Integers, planes: Floats) -> list[tuple[Floats, list[int]]]:
+    """Join triangles in one plane: normal and corners of each flat side, counterclockwise."""
+    groups: list[list[int]] = []
+    for t, plane in enumerate(planes):
+        for group in groups:
+            first = planes[group[0]]
+            near = np.linalg.norm(plane[:3] - first[:3]) <= SAME_NORMAL
+            if near and abs(plane[3] - first[3]) <= SAME_OFFSET:
+                group.append(t)
+                break
+        else:
+            groups.append([t])
+    members = [np.unique(triangles[group]) for group in groups]
+    count = np.bincount(np.concatenate(members), minlength=len(points))
+    sides = []
+    for group, corners in zip(groups, members, strict=True):
+        normal = planes[group[0], :3]
+        kept = corners[count[corners] >= 3]  # others lie inside an edge or a side
+        sides.append((normal, _counterclockwise(points, kept, normal)))
+    return sides
+
+
+def _counterclockwise(points: Floats, corners: Integers, normal: Floats) -> list[int]:
+    """Order the corners of a flat side as they are seen from outside."""
+    spokes = points[corners] - points[corners].mean(axis=0)
+    right = spokes[np.argmax(np.linalg.norm(spokes, axis=1))]
+    angles = np.arctan2(spokes @ np.cross(normal, right), spokes @ right)
+    order: list[int] = corners[np.argsort(angles, kind="stable")].tolist()
+    start = order.index(min(order))
+    return order[start:] + order[:start]
+
+
+def _assemble(
+    sides: Iterable[tuple[Floats, list[int]]], points: Floats, middle: Floats, extent: float
+) -> tuple[Floats, Integers, Floats]:
+    """Number the corners anew, cut sides into triangles, and give them back their size."""
+    sides = list(sides)
+    used = sorted({corner for _, corners in sides for corner in corners})
+    number = {corner: n for n, corner in enumerate(used)}
+    vertices = middle + extent * points[used]
+    faces, planes = [], []
+    for normal, corners in sides:
+        first, *fan = (number[corner] for corner in corners)
+        faces += [(first, q, r) for q, r in pairwise(fan)]
+        planes.append([*normal, float(np.max(vertices[[first, *fan]] @ normal))])
+    _check_closed(faces)
+    return vertices, np.array(faces, dtype=np.int64), np.array(planes)
+
+
+def _check_closed(faces: list[tuple[int, int, int]]) -> None:
+    """Refuse a surface with a hole: some sides were too thin to be told apart."""
+    edges = {(f[k], f[(k + 1) % 3]) for f in faces for k in range(3)}
+    if len(edges) != 3 * len(faces) or any((q, p) not in edges for p, q in edges):
+        raise ModelError(
+            ["corners of the mesh nearly coincide, so that it has no clean surface; merge them"]
+        )
+
+
+def _second_moments(vertices: Floats, faces: Integers) -> tuple[Floats, Floats, float]:
+    """Integrate over a solid: center (3,) [m], covariance (3, 3) [m²], and volume [m³].
+
+    Source:
+        Blow and Binstock, "How to find the inertia tensor of a 3D solid body", 2004.
+    """
+    origin = vertices.mean(axis=0)
+    corners = (vertices - origin)[faces]  # (f, 3 corners, 3)
+    sixfold = np.linalg.det(corners)  # of the volume of each pyramid
+    total = corners.sum(axis=1)
+    volume = float(sixfold.sum()) / 6.0
+    center = np.einsum("f,fi->i", sixfold, total) / (24.0 * volume)
+    square = np.einsum("f,fi,fj->ij", sixfold, total, total)
+    square += np.einsum("f,fki,fkj->ij", sixfold, corners, corners)
+    return origin + center, square / (120.0 * volume) - np.outer(center, center), volume
+
+
+def _principal_axes(spread: Floats) -> Floats:
+    """Choose the principal axes that are nearest to the axes given, right-handed, as columns."""
+    values, vectors = np.linalg.eigh(spread)
+    best, found = -np.inf, np.eye(3)
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            axes = vectors[:, order] * signs
+            if np.linalg.det(axes) < 0.0:
+                continue
+            axes = _relax(axes, values[list(order)])
+            if np.trace(axes) > best + 1e-9:  # ties are decided by the order, not by rounding
+                best, found = float(np.trace(axes)), axes
+    return np.eye(3) if np.allclose(found, np.eye(3), rtol=0.0, atol=1e-9) else found
+
+
+def _relax(axes: Floats, values: Floats) -> Floats:
+    """Turn axes of equal moments among themselves until they are nearest to the axes given."""
+    same = [abs(values[i] - values[(i + 1) % 3]) <= SAME_MOMENT * values.max() for i in range(3)]
+    if all(same):
+        return np.eye(3)
+    relaxed = axes.copy()
+    for i in np.flatnonzero(same):
+        j = (i + 1) % 3
+        angle = np.arctan2(axes[i, j] - axes[j, i], axes[i, i] + axes[j, j])
+        relaxed[:, i] = np.cos(angle) * axes[:, i] + np.sin(angle) * axes[:, j]
+        relaxed[:, j] = np.cos(angle) * axes[:, j] - np.sin(angle) * axes[:, i]
+    return relaxed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
@@ -36,12 +36,23 @@ class Moment:
         episode: The first episode.
         step: The control step.
         count: For how many episodes in a row; None for a single one without a batch axis.
+        origin: The control step at which variables got their own noise, if that was another one:
+            what nature drew at the start of an episode stays, however late one intervenes.
     """
 
     noise: Noise
     episode: int = 0
     step: int = 0
     count: int | None = None
+    origin: int | None = None
+
+    def nature(
+        self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
+    ) -> Value:
+        """Draw what a variable has by itself, without intervention."""
+        at_once = self.origin is None or self.origin == self.step
+        moment = self if at_once else replace(self, step=self.origin, origin=None)
+        return moment.draw(source, name, shape, values)
 
     def draw(
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
@@ -142,7 +153,7 @@ class Evaluator:
                     return values[variable.name]
                 if moment is None or variable.distribution is None:
                     return variable.array(variable.default)
-                return moment.draw(variable.distribution, variable.name, variable.shape, values)
+                return moment.nature(variable.distribution, variable.name, variable.shape, values)
             case Fixed():
                 return variable.array(variable.value)
             case Derived():
@@ -165,7 +176,7 @@ class Evaluator:
             return np.asarray(self._bound(variable)(*arguments))
         noise: Value = np.zeros(variable.shape)
         if moment is not None:
-            noise = moment.draw(variable.noise, variable.name, variable.shape, values)
+            noise = moment.nature(variable.noise, variable.name, variable.shape, values)
         return np.asarray(self._bound(variable)(*arguments, noise=noise))
 
     def _arguments(self, variable: Variable, values: Values, previous: Values) -> list[Value]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -11,7 +11,7 @@ from typing import final
 import networkx as nx
 
 from scm_world.errors import ModelError, nearest
-from scm_world.variables import Derived, Space, Variable
+from scm_world.variables import Derived, Parent, Space, Variable
 
 
 @final
@@ -49,22 +49,25 @@ class Structure:
     """
 
     def __init__(self, variables: Mapping[str, Variable]) -> None:
-        self.edges = tuple(
-            Edge(parent.name, name, parent.lag, parent.when)
-            for name, variable in variables.items()
-            for parent in variable.all_parents
-        )
+        self._parents = {name: variable.all_parents for name, variable in variables.items()}
         self._names = tuple(variables)
-        self.order = _topological(self._names, self.edges)
+        self.order = _topological(self._names, _edges(self._parents, lag=0))
+
+    @cached_property
+    def edges(self) -> tuple[Edge, ...]:
+        """All edges; where many bodies can touch there are very many."""
+        return tuple(_edges(self._parents))
 
     @cached_property
     def _adjacency(self) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-        parents: dict[str, list[str]] = {name: [] for name in self._names}
+        parents = {
+            name: list(dict.fromkeys(parent.name for parent in self._parents[name]))
+            for name in self._names
+        }
         children: dict[str, list[str]] = {name: [] for name in self._names}
-        for edge in self.edges:
-            if edge.cause not in parents[edge.effect]:
-                parents[edge.effect].append(edge.cause)
-                children[edge.cause].append(edge.effect)
+        for name, causes in parents.items():
+            for cause in causes:
+                children[cause].append(name)
         return parents, children
 
     def parents(self, name: str) -> tuple[str, ...]:
@@ -87,8 +90,8 @@ class Structure:
     def instant_children(self) -> dict[str, tuple[str, ...]]:
         """For each variable, the ones that follow it within the same instant."""
         children: dict[str, list[str]] = {name: [] for name in self._names}
-        for edge in self.edges:
-            if edge.lag == 0 and edge.when != "set":
+        for edge in _edges(self._parents, lag=0):
+            if edge.when != "set":
                 children[edge.cause].append(edge.effect)
         return {name: tuple(found) for name, found in children.items()}
 
@@ -104,6 +107,15 @@ class Structure:
         return [name for name in self.order if name in found] if found else []
 
 
+def _edges(
+    parents: Mapping[str, Sequence[Parent]], *, lag: int | None = None
+) -> Iterator[Edge]:
+    for name, causes in parents.items():
+        for parent in causes:
+            if lag is None or parent.lag == lag:
+                yield Edge(parent.name, name, parent.lag, parent.when)
+
+
 def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
     found: set[str] = set()
     stack = list(step[name])
@@ -115,15 +127,15 @@ def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
     return frozenset(found)
 
 
-def _topological(names: Iterable[str], edges: Sequence[Edge]) -> tuple[str, ...]:
+def _topological(names: Iterable[str], instant: Iterable[Edge]) -> tuple[str, ...]:
     sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(names, ()))
+    edges = tuple(instant)
     for edge in edges:
-        if edge.lag == 0:
-            sorter.add(edge.effect, edge.cause)
+        sorter.add(edge.effect, edge.cause)
     try:
         return tuple(sorter.static_order())
     except CycleError:
-        graph = nx.DiGraph((edge.cause, edge.effect) for edge in edges if edge.lag == 0)
+        graph = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
         problems = [f"contemporaneous edges form a cycle: {cycle}" for cycle in _cycles(graph)]
         raise ModelError(problems) from None
 
@@ -189,7 +201,7 @@ def checked(variables: Iterable[Variable]) -> dict[str, Variable]:
         Edge(parent.name, variable.name, parent.lag)
         for variable in by_name.values()
         for parent in variable.all_parents
-        if parent.name in by_name
+        if parent.lag == 0 and parent.name in by_name
     ]
     try:
         _topological(by_name, known_edges)

@@ -5,9 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from scm_world.errors import UnknownOption
-from scm_world.tasks.base import CONVENTIONS, Conventions, Observed, Task, conventions
+from scm_world.tasks.base import Task
+from scm_world.tasks.building import Building
+from scm_world.tasks.conventions import CONVENTIONS, Conventions, conventions
+from scm_world.tasks.observed import HEAD, TIME, Observed
 from scm_world.tasks.pushing import Pushing
 from scm_world.tasks.reaching import Reaching
+from scm_world.tasks.rewards import Common, term
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Reaching, Pushing)}
 """Every registered task, by name."""
@@ -32,7 +36,11 @@ def make_task(name: str, **options: Any) -> Task:
 
 __all__ = [
     "CONVENTIONS",
+    "HEAD",
     "TASKS",
+    "TIME",
+    "Building",
+    "Common",
     "Conventions",
     "Observed",
     "Pushing",
@@ -40,4 +48,5 @@ __all__ = [
     "Task",
     "conventions",
     "make_task",
+    "term",
 ]

@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import final
+from collections.abc import Iterable
+from typing import Unpack, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value, Values
-from scm_world.entities import Entity, GoalBlock, ToolBlock
-from scm_world.entities.blocks import block_size
-from scm_world.geometry.overlap import aabb_overlap_fraction
+from scm_world.entities import Entity, GoalBlock, ToolBlock, block_mass, block_size
+from scm_world.entities.goals import goal_orientation, goal_position, on_the_floor, polar
 from scm_world.tasks import kernels
-from scm_world.tasks.base import (
-    SUCCESS,
-    UNIT,
-    Conventions,
-    Observed,
-    Task,
-    above,
-    observe_goal,
-    observe_tool,
-    reward,
-    term,
-)
-from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
+from scm_world.tasks.building import Building
+from scm_world.tasks.rewards import Common, term
+from scm_world.variables import Box, Function, Parent, Variable
 from scm_world.variables import catalogue as numbers
 
-WEIGHTS = {
-    "reward.tips_to_block": 750.0,
-    "reward.block_to_goal": 250.0,
-    "reward.orientation": 100.0,
-    "fractional_success": 1.0,
-}
+SIZE = "block.size"
 
 
 @final
-class Pushing(Task):
+class Pushing(Building):
     """One tool block and one goal block of the same size, both on the floor.
 
     The blocks share the parent ``block.size``. An intervention on it keeps them alike; one on
@@ -50,45 +33,74 @@ class Pushing(Task):
 
     Args:
         tool_block_mass: Default mass of the block [kg].
-        weights: Weights of reward terms that differ from the published ones.
+        tool_block_position: Where its center begins, x and y; it stands on the floor [m].
+        goal_polar: Default radius [m] and angle [rad] of the goal.
+        common: Options of every task; see ``Common``.
     """
 
     name = "pushing"
-    seconds = 10.0
+    default_weights = {  # noqa: RUF012 # a constant
+        "reward.tips_to_block": 750.0,
+        "reward.block_to_goal": 250.0,
+        "reward.orientation": 100.0,
+        "fractional_success": 1.0,
+    }
+    paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
+    goal_causes = ("goal_block.polar", "goal_block.euler_orientation")
 
     def __init__(
         self,
         *,
         tool_block_mass: float = numbers.BLOCK_MASS,
-        weights: Mapping[str, float] | None = None,
+        tool_block_position: tuple[float, float] = (0.0, -0.08),
+        goal_polar: tuple[float, float] = (0.08, np.pi / 2),
+        **common: Unpack[Common],
     ) -> None:
-        self.weights = {**WEIGHTS, **(weights or {})}
-        self._tool = ToolBlock(
-            "tool_block",
-            size_from="block.size",
-            mass=tool_block_mass,
-            place=(0.0, -0.08, 0.0),
-            a=_on_the_floor("tool_block.size", numbers.RADIUS_A),
-            b=_on_the_floor("tool_block.size", numbers.RADIUS_B),
-        )
-        self._goal = GoalBlock(
-            "goal_block",
-            size_from="block.size",
-            polar=(0.08, np.pi / 2),
-            a=_on_the_floor("goal_block.size", numbers.RADIUS_A),
-            b=_on_the_floor("goal_block.size", numbers.RADIUS_B),
-        )
+        super().__init__(**common)
+        self._mass = tool_block_mass
+        self._place = (*tool_block_position, 0.0)
+        self._polar = goal_polar
+
+    def tools(self) -> tuple[str, ...]:
+        """One block."""
+        return ("tool_block",)
+
+    def targets(self) -> dict[str, str]:
+        """One goal."""
+        return {"goal_block": "tool_block"}
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
-        return (self._tool, self._goal)
+        yield ToolBlock(
+            "tool_block",
+            size=block_size("tool_block.size", SIZE),
+            mass=block_mass("tool_block.mass", default=self._mass),
+            place=self._place,
+            a=floor_level("tool_block.size", numbers.RADIUS_A),
+            b=floor_level("tool_block.size", numbers.RADIUS_B),
+        )
+        yield GoalBlock(
+            "goal_block",
+            size=block_size("goal_block.size", SIZE),
+            pose=(
+                polar("goal_block", self._polar, a=numbers.POLAR_A, b=numbers.POLAR_B),
+                goal_position(
+                    "goal_block",
+                    parents=("goal_block.polar", "goal_block.size"),
+                    mechanism=Function(on_the_floor),
+                ),
+                goal_orientation("goal_block"),
+            ),
+            a=floor_level("goal_block.size", numbers.RADIUS_A),
+            b=floor_level("goal_block.size", numbers.RADIUS_B),
+        )
 
     def shared(self) -> Iterable[Variable]:
         """One size for both."""
-        yield block_size("block.size", None)
+        yield block_size(SIZE)
 
-    def readouts(self, conventions: Conventions) -> Iterable[Variable]:
-        """Declare reward terms and success."""
+    def dense(self) -> Iterable[Variable]:
+        """Declare how the fingers and the block come nearer."""
         tips, block = "end_effector_positions", "tool_block.cartesian_position"
         turn, goal = "tool_block.orientation", "goal_block.cartesian_position"
         yield term(
@@ -109,61 +121,14 @@ class Pushing(Task):
             (turn, Parent(turn, 1), "goal_block.orientation"),
             "By how much the angle between block and goal shrank [rad].",
         )
-        yield Measured(
-            name="fractional_success",
-            bounds=None if conventions.aligned_boxes else UNIT,
-            parents=tuple(
-                f"{entity}.{quantity}"
-                for entity in ("tool_block", "goal_block")
-                for quantity in ("size", "cartesian_position", "orientation")
-            ),
-            mechanism=aligned if conventions.aligned_boxes else kernels.filled,
-            doc="Fraction of the goal's volume that the block fills.",
-        )
-        yield Measured(
-            name="success",
-            dtype="integer",
-            bounds=Integers(0, 1),
-            parents=("fractional_success",),
-            mechanism=Function(above, constants={"threshold": SUCCESS}),
-            doc="1 where more than nine tenths of the goal are filled.",
-        )
-        yield reward(self.weights)
-
-    def observed(self) -> Iterable[Observed]:
-        """Observe the block, then the goal."""
-        yield from observe_tool("tool_block")
-        yield from observe_goal("goal_block")
-
-    def goals(self, values: Values) -> tuple[Floats, Floats]:
-        """Give position and quaternion of the block and of the goal, shape (7,) each."""
-        block = (values["tool_block.cartesian_position"], values["tool_block.orientation"])
-        goal = (values["goal_block.cartesian_position"], values["goal_block.orientation"])
-        return np.concatenate(block), np.concatenate(goal)
-
-    def solution(self, values: Values) -> dict[str, Value]:
-        """Put the block where the goal is."""
-        return {
-            f"tool_block.{quantity}": values[f"goal_block.{quantity}"]
-            for quantity in ("cartesian_position", "orientation")
-        }
 
 
-def _on_the_floor(size: str, radii: tuple[float, float]) -> Box:
-    """Give the cylindrical positions of a block that stands on the floor."""
+def floor_level(size: str, radii: tuple[float, float]) -> Box:
+    """Give the cylindrical positions of a block that stands on the floor.
+
+    Args:
+        size: Name of the variable that holds its edge lengths.
+        radii: Least and greatest distance from the middle [m].
+    """
     height = numbers.half_height(size)
     return numbers.cylindrical(radii, height, height)
-
-
-def aligned(
-    size: Floats,
-    position: Floats,
-    orientation: Floats,
-    goal_size: Floats,
-    goal_position: Floats,
-    goal_orientation: Floats,
-) -> float:
-    """Compute the predecessor's overlap: of the axis-aligned hulls, not capped."""
-    block = (size[None], position[None], orientation[None])
-    goal = (goal_size[None], goal_position[None], goal_orientation[None])
-    return aabb_overlap_fraction(*block, *goal)

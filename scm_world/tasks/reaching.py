@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import final
+from collections.abc import Iterable
+from typing import Any, Unpack, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.entities import Entity, GoalSphere
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
 from scm_world.tasks import kernels
-from scm_world.tasks.base import (
-    UNIT,
-    Conventions,
-    Observed,
-    Task,
-    observe_position,
-    reward,
-    term,
-)
-from scm_world.variables import Function, Integers, Measured, Parent, Variable
+from scm_world.tasks.base import Task
+from scm_world.tasks.observed import Observed, observe_obstacle, observe_position
+from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
+from scm_world.tasks.scattered import COUNT, obstacle_names, scattered, scattering
+from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
+from scm_world.variables import catalogue as numbers
+from scm_world.variables.kinds import SpaceName
 
 REACHED = 0.01  # [m] mean error of a coordinate that counts as success
 FAR = 0.03  # [m] mean error at which the fractional success is zero
-
-WEIGHTS = {
-    "reward.tips_to_goals": 100_000.0,
-    "reward.distance": 0.0,
-    "reward.torque": 0.0,
-    "reward.smoothness": 0.0,
-    "fractional_success": 1.0,
-}
 
 GOALS = tuple(f"goal_{finger}" for finger in trifinger.FINGERS)
 _TINTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -78,11 +67,21 @@ class Reaching(Task):
         default_goal_60: Default goal of the first finger [m].
         default_goal_120: Of the second.
         default_goal_300: Of the third.
-        weights: Weights of reward terms that differ from the published ones.
+        number_of_obstacles: How many small boxes are in the way.
+        common: Options of every task; see ``Common``.
     """
 
     name = "reaching"
-    seconds = 5.0
+    default_weights = {  # noqa: RUF012 # a constant
+        "reward.tips_to_goals": 100_000.0,
+        "reward.distance": 0.0,
+        "reward.torque": 0.0,
+        "reward.smoothness": 0.0,
+        FRACTION: 1.0,
+    }
+    paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
+    decided_by = (COUNT,)
+    goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)
 
     def __init__(
         self,
@@ -90,20 +89,36 @@ class Reaching(Task):
         default_goal_60: tuple[float, float, float] = (0.0, 0.0, 0.10),
         default_goal_120: tuple[float, float, float] = (0.0, 0.0, 0.13),
         default_goal_300: tuple[float, float, float] = (0.0, 0.0, 0.16),
-        weights: Mapping[str, float] | None = None,
+        number_of_obstacles: int = 0,
+        **common: Unpack[Common],
     ) -> None:
-        self.weights = {**WEIGHTS, **(weights or {})}
-        places = (default_goal_60, default_goal_120, default_goal_300)
-        self._goals = tuple(
-            GoalSphere(name, position=place, radius=0.015, tint=tint)
-            for name, place, tint in zip(GOALS, places, _TINTS, strict=True)
-        )
+        super().__init__(**common)
+        self._places = (default_goal_60, default_goal_120, default_goal_300)
+        self._count = number_of_obstacles
+
+    @property
+    def seconds(self) -> float:
+        """Five seconds [s]."""
+        return 5.0
+
+    def arrange(self, values: Values) -> int:
+        """Count the obstacles."""
+        return int(values[COUNT])
+
+    def shared(self) -> Iterable[Variable]:
+        """Obstacles."""
+        return scattering(self._count)
+
+    def _obstacles(self) -> int:
+        return self.plan if isinstance(self.plan, int) else self._count
 
     def entities(self) -> Iterable[Entity]:
-        """Three goals."""
-        return self._goals
+        """Three goals, and obstacles."""
+        for name, place, tint in zip(GOALS, self._places, _TINTS, strict=True):
+            yield GoalSphere(name, position=place, radius=0.015, tint=tint)
+        yield from scattered(self._obstacles())
 
-    def readouts(self, conventions: Conventions) -> Iterable[Variable]:
+    def readouts(self) -> Iterable[Variable]:
         """Declare reward terms and success."""
         yield from self._terms()
         yield Measured(
@@ -114,23 +129,24 @@ class Reaching(Task):
             doc="Mean absolute error of the nine tip coordinates.",
         )
         yield Measured(
-            name="fractional_success",
+            name=FRACTION,
             bounds=UNIT,
             parents=("reach_error",),
             mechanism=Function(nearness, constants={"reached": REACHED, "far": FAR}),
             doc="1 within a centimeter of the goals, 0 beyond three.",
         )
         yield Measured(
-            name="success",
+            name=SUCCESS,
             dtype="integer",
             bounds=Integers(0, 1),
             parents=("reach_error",),
             mechanism=Function(within, constants={"reached": REACHED}),
             doc="1 where the mean error is below a centimeter.",
         )
+        yield from self.terms
         weights = dict(self.weights)
-        if conventions.distance_as_reward:
-            weights["reach_error"] = weights.pop("fractional_success")
+        if self.conventions.distance_as_reward:
+            weights["reach_error"] = weights.pop(FRACTION)
         yield reward(weights)
 
     def _terms(self) -> Iterable[Variable]:
@@ -149,14 +165,25 @@ class Reaching(Task):
         yield term("reward.smoothness", minus_change, (speeds, Parent(speeds, 1)), change)
 
     def observed(self) -> Iterable[Observed]:
-        """Observe the three goals."""
+        """Observe the three goals and the obstacles."""
         for name in GOALS:
             yield from observe_position(name)
+        for name in obstacle_names(self._obstacles()):
+            yield from observe_obstacle(name)
 
     def goals(self, values: Values) -> tuple[Floats, Floats]:
         """Give the tips and their goals, shape (9,) each [m]."""
         desired = np.concatenate([values[name] for name in _positions()])
         return np.array(values["end_effector_positions"]), desired
+
+    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
+        """Compute how near tips are to their goals, shape (...)."""
+        error = np.abs(np.asarray(achieved) - np.asarray(desired)).mean(axis=-1)
+        return 1.0 - (np.clip(error, REACHED, FAR) - REACHED) / (FAR - REACHED)
+
+    def fulfilled(self, fraction: ArrayLike) -> Value:
+        """Tell whether all tips are there."""
+        return np.asarray(fraction) >= 1.0
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Put the joints where the tips are at their goals, as far as they reach."""
@@ -164,6 +191,19 @@ class Reaching(Task):
         height = float(values["robot_height"])
         found = inverse(desired, height, np.asarray(values["joint_positions"]))
         return {"joint_positions": found.joint_positions}
+
+    def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
+        """Draw each goal uniformly by volume."""
+        if space == "A|B":
+            return super().sample_goal(space)
+        radii = numbers.RADIUS_A if space == "A" else numbers.RADIUS_B
+        height = numbers.HEIGHT_A if space == "A" else numbers.HEIGHT_B
+        return {
+            f"{name}.cylindrical_position": Draw(
+                Cylinder(numbers.cylindrical(radii, numbers.half_height(f"{name}.size"), height))
+            )
+            for name in GOALS
+        }
 
 
 def _positions() -> tuple[str, ...]:

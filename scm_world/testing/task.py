@@ -234,7 +234,7 @@ def _declared(world: World) -> list[Variable]:
     """List the declarations as they were written down, duplicates included."""
     return [
         *world.composition.variables(),
-        *world.task.readouts(world.conventions),
+        *world.task.readouts(),
     ]
 
 

@@ -1,6 +1,6 @@
 """Typed variables, their spaces, their noise, and what can be done to them."""
 
-from scm_world.variables.distributions import Distribution, Normal
+from scm_world.variables.distributions import Cylinder, Distribution, Normal
 from scm_world.variables.interventions import SOFT, Draw, Hard, Intervention, Scale, Shift
 from scm_world.variables.kinds import (
     Action,
@@ -23,6 +23,7 @@ from scm_world.variables.spaces import (
     Integers,
     Rotations,
     Space,
+    Switch,
 )
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "AnyVariable",
     "Box",
     "Categories",
+    "Cylinder",
     "Derived",
     "Distribution",
     "Draw",
@@ -52,6 +54,7 @@ __all__ = [
     "Scale",
     "Shift",
     "Space",
+    "Switch",
     "Variable",
     "names",
 ]

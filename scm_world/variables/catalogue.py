@@ -11,6 +11,9 @@ import math
 
 from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations
 
+PRESET = "timestep_preset"
+"""The variable that says how finely time is cut; everything that moves depends on it."""
+
 # --- what is physically possible -----------------------------------------------------------------
 COLOR_BOUNDS = Box(0.0, 1.0)
 FRICTION_BOUNDS = Box(0.0, 2.0)
@@ -28,6 +31,15 @@ JOINT_BOUNDS = Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3)
 """The stops at a quarter and half a turn, and 0.1 rad that a joint may press into them [rad]."""
 JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
 CONTROL_INDEX_BOUNDS = Integers(0, 10**9)
+OBSTACLE_SIZE_BOUNDS = Box(0.005, 0.6)  # [m]
+RESTITUTION_BOUNDS = Box(0.0, 0.9)
+SPINNING_BOUNDS = Box(0.0, 0.1)
+DAMPING_BOUNDS = Box(0.0, 0.5)  # [N m s/rad]
+POSITION_GAIN_BOUNDS = Box(0.0, 50.0)  # [N m/rad]
+TORQUE_BOUNDS = Box(0.05, 1.0)  # [N m]
+NOISE_BOUNDS = Box(0.0, 1.0)
+PRESET_BOUNDS = Categories((0, 1))
+SIDE_BOUNDS = Categories((0, 1))
 TYPE_BOUNDS = Categories((1, 2, 10, 20, 21, 23))
 
 # --- training space A and held-out space B ---------------------------------
@@ -68,6 +80,24 @@ def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
     return Box((radii[0], -math.pi, low), (radii[1], math.pi, high))
 
 
+# --- spaces of what the predecessor hides: ours, around the defaults -----------------------------
+RESTITUTION_A = Box(0.0, 0.3)
+RESTITUTION_B = Box(0.3, 0.6)
+SPINNING_A = Box(0.0, 0.002)
+SPINNING_B = Box(0.002, 0.01)
+JOINT_DAMPING_A = Box(0.0, 0.01)  # [N m s/rad]
+JOINT_DAMPING_B = Box(0.01, 0.03)
+POSITION_GAINS_A = Box(8.0, 12.0)  # [N m/rad]
+POSITION_GAINS_B = Box(12.0, 15.0)
+VELOCITY_GAINS_A = Box((0.08, 0.24, 0.0), (0.12, 0.36, 0.002))  # [N m s/rad]
+VELOCITY_GAINS_B = Box((0.12, 0.36, 0.002), (0.2, 0.5, 0.005))
+SAFETY_DAMPING_A = Box((0.06, 0.06, 0.03), (0.1, 0.1, 0.05))  # [N m s/rad]
+SAFETY_DAMPING_B = Box((0.1, 0.1, 0.05), (0.15, 0.15, 0.08))
+TORQUE_A = Box(0.3, 0.4)  # [N m]
+TORQUE_B = Box(0.4, 0.5)
+NOISE_A = Box(0.0, 0.01)
+NOISE_B = Box(0.01, 0.05)
+
 # --- defaults ------------------------------------------------------------------------------
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]
 SURFACE_FRICTION = 0.5
@@ -78,4 +108,7 @@ FLOOR_COLOR = (0.31, 0.27, 0.25)
 STAGE_COLOR = (0.95, 0.95, 0.95)
 BLOCK_COLOR = (1.0, 0.0, 0.0)
 GOAL_COLOR = (0.0, 1.0, 0.0)
+OBSTACLE_SIZE = (0.01, 0.01, 0.01)  # [m]
+FINGER_FRICTION = 0.5
+SPINNING_FRICTION = 0.001
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)

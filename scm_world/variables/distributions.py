@@ -57,7 +57,54 @@ class Normal(Frozen):
         return f"N({self.mean:g}, {self.std:g}²)"
 
 
+@final
+class Cylinder(Frozen):
+    """Uniform over the volume of a box in cylindrical coordinates (radius, angle, …).
+
+    A box of cylindrical coordinates, drawn component by component, crowds its points near the
+    axis; here the radius is ``sqrt(U[r0², r1²])``.
+
+    Attributes:
+        box: The corners.
+
+    Example:
+        >>> Cylinder(Box((0.0, 0.0, 0.0), (2.0, 1.0, 1.0))).transform(
+        ...     np.array([0.25, 0.5, 0.5]), (3,), {})
+        array([1. , 0.5, 0.5])
+
+    Source:
+        CausalWorld 1.2, ``task_generators/base_task.py`` (the base goal sampler).
+    """
+
+    kind: Literal["cylinder"] = "cylinder"
+    box: Box
+
+    def __init__(self, box: Any, **fields: Any) -> None:
+        super().__init__(box=box, **fields)  # type: ignore[call-arg]
+
+    def parents(self) -> frozenset[str]:
+        """Name the variables that the corners depend on."""
+        return self.box.parents()
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes."""
+        return self.box.n_uniforms(shape)
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn uniform numbers into points, the radius first."""
+        low, high = self.box.bounds(shape, values)
+        points = np.array(self.box.transform(uniforms, shape, values))
+        inner, outer = low[..., 0] ** 2, high[..., 0] ** 2
+        points[..., 0] = np.sqrt(inner + (outer - inner) * uniforms[..., 0])
+        return points
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the distribution down."""
+        return f"uniform by volume over {self.box.describe(shape, values)}"
+
+
 Distribution = Annotated[
-    Box | Integers | Categories | Either | Rotations | Normal, Field(discriminator="kind")
+    Box | Integers | Categories | Either | Rotations | Normal | Cylinder,
+    Field(discriminator="kind"),
 ]
 """Anything one can draw from; a space stands for the uniform distribution over it."""

@@ -98,6 +98,7 @@ class Variable(Frozen):
         a: The training space, or None.
         b: The held-out space, or None. A point that lies in both belongs to A, unless the two are
             the same space: then nothing is held out.
+        a_or_b: What ``A|B`` means, where it is not the union of the two.
         doc: One sentence.
     """
 
@@ -108,6 +109,7 @@ class Variable(Frozen):
     bounds: Space | None = None
     a: Space | None = None
     b: Space | None = None
+    a_or_b: Space | None = None
     doc: str = ""
 
     @property
@@ -142,6 +144,8 @@ class Variable(Frozen):
             case "B":
                 return _without(self.b, self.a)
             case _:
+                if self.a_or_b is not None:
+                    return self.a_or_b
                 both = self.a is not None and self.b is not None and self.a != self.b
                 return Either(self.a, self.space("B")) if both else (self.a or self.b)
 
@@ -258,6 +262,7 @@ class Measured(Variable):
         start: The value at the start as a function of the parents with ``when="set"``.
         carry: How an intervention on a parent with ``when="set"`` moves a state at once:
             a function of (the present value, those parents before, those parents after).
+        restart: Those parents with ``when="set"`` that, when set, give it the value of ``start``.
     """
 
     kind: Literal["measured"] = "measured"
@@ -267,6 +272,7 @@ class Measured(Variable):
     default: AsNumber | None = None
     start: AsMechanism | None = None
     carry: AsMechanism | None = None
+    restart: tuple[str, ...] = ()
 
     @property
     def all_parents(self) -> tuple[Parent, ...]:

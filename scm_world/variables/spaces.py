@@ -49,14 +49,35 @@ class Affine(Frozen):
         return np.asarray(self.offset + self.scale * component)
 
 
-Bound = float | Affine
+@final
+class Switch(Frozen):
+    """A bound that is one of two numbers, as another variable decides.
+
+    Attributes:
+        parent: Name of the variable, a scalar.
+        below: The bound while the variable is less than ``at``.
+        above: The bound from there on.
+        at: Where it changes.
+    """
+
+    parent: str
+    below: float
+    above: float
+    at: float = 0.5
+
+    def evaluate(self, values: Values) -> Floats:
+        """Compute the bound from the values of the variables."""
+        return np.where(np.asarray(values[self.parent]) < self.at, self.below, self.above)
+
+
+Bound = float | Affine | Switch
 Bounds = Bound | tuple[Bound, ...]
 
 
 def _parents(*bounds: Bounds) -> Iterator[str]:
     for bound in bounds:
         for part in bound if isinstance(bound, tuple) else (bound,):
-            if isinstance(part, Affine):
+            if isinstance(part, Affine | Switch):
                 yield part.parent
 
 
@@ -70,11 +91,11 @@ def _evaluate(bound: Bounds, shape: tuple[int, ...], values: Values) -> Floats:
     if not any(_parents(bound)):
         return _constant(bound, shape)
     if not isinstance(bound, tuple):
-        number = bound.evaluate(values) if isinstance(bound, Affine) else np.float64(bound)
+        number = bound.evaluate(values) if isinstance(bound, Affine | Switch) else np.float64(bound)
         return np.broadcast_to(
             np.asarray(number)[(..., *(None,) * len(shape))], (*np.shape(number), *shape)
         )
-    parts = [p.evaluate(values) if isinstance(p, Affine) else np.float64(p) for p in bound]
+    parts = [p.evaluate(values) if isinstance(p, Affine | Switch) else np.float64(p) for p in bound]
     stacked: Floats = np.stack(np.broadcast_arrays(*parts), axis=-1)
     return stacked.reshape(*stacked.shape[:-1], *shape)
 

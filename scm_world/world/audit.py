@@ -41,11 +41,15 @@ class Audit:
             and after. Other coordinates of them, and readouts, are not listed.
         engine: Quantities that the engine derives: the principal moments of inertia of each body
             whose mass or size changed [kg m²], before and after.
+        came: Blocks and obstacles that were not there before.
+        went: Those that are not there any more.
     """
 
     targets: Mapping[str, Applied]
     followed: Mapping[str, tuple[Value, Value]]
     engine: Mapping[str, tuple[Value, Value]]
+    came: tuple[str, ...] = ()
+    went: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = []
@@ -55,6 +59,8 @@ class Audit:
         for title, changes in (("follows", self.followed), ("engine", self.engine)):
             for name, (before, after) in changes.items():
                 lines.append(f"  {title}: {name} {_show(before)} → {_show(after)}")
+        lines += [f"  new: {name}" for name in self.came]
+        lines += [f"  gone: {name}" for name in self.went]
         return "\n".join(lines)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,12 +12,13 @@ from scm_world._types import Floats, Value
 from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, Infeasible, InterventionError
 from scm_world.graph import flatten
-from scm_world.scene import Difference, PhysicalState
+from scm_world.scene import Difference, PhysicalState, Structure
 from scm_world.scene.feasibility import Overlap, overlaps
 from scm_world.variables import Hard
 from scm_world.variables.checks import coerce
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.compare import same
+from scm_world.world.declaration import Declaration
 from scm_world.world.proposal import Instant, Proposal, propose
 
 if TYPE_CHECKING:
@@ -35,6 +37,10 @@ def difference(world: World, proposal: Proposal) -> Difference:
     ``do`` about 25 µs dearer. A test holds the two against each other.
     """
     now, state = world.current()
+    structure = proposal.declaration.structure(proposal.static)
+    if structure is not world.structure:
+        then = proposal.declaration.describe(proposal.static, proposal.state)
+        return Difference(structure, then.parameters, proposal.state)
     changed = {
         key: np.asarray(proposal.static[name])
         for name, key in world.parameter_keys.items()
@@ -45,7 +51,7 @@ def difference(world: World, proposal: Proposal) -> Difference:
 
 
 def _moves_surfaces(world: World, change: Difference) -> bool:
-    if any(what in _MOVES for _, what in change.parameters):
+    if change.structure is not None or any(what in _MOVES for _, what in change.parameters):
         return True
     if change.state is None:
         return False
@@ -60,11 +66,11 @@ def _new_overlaps(
     """List overlaps deeper than what physics left; taking something back is always possible."""
     if not _moves_surfaces(world, change):
         return []
-    found = overlaps(world.describe(proposal.static, proposal.state), tolerance=TOLERANCE)
+    then = proposal.declaration.describe(proposal.static, proposal.state)
+    found = overlaps(then, tolerance=TOLERANCE)
     if not found:
         return []
-    values = {**world.current()[0], **instant.static}
-    present = overlaps(world.describe(values, instant.state), tolerance=0.0)
+    present = overlaps(instant.declaration.describe(instant.static, instant.state), tolerance=0.0)
     depth = {overlap.bodies: overlap.depth for overlap in present}
     return [o for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
 
@@ -87,13 +93,13 @@ def refuse_overlaps(
     if problems:
         flat = flatten(request)
         bodies = {body for problem in problems for body in problem.bodies}
-        name = _culprit(world, flat, bodies)
+        name = _culprit(proposal.declaration, flat, bodies)
         found = nearest_feasible(world, instant, request)
         nearest = None if found is None else found[name]
         raise Infeasible(name, flat[name], [str(p) for p in problems], nearest)
 
 
-def _culprit(world: World, names: Iterable[str], bodies: Iterable[str]) -> str:
+def _culprit(world: Declaration, names: Iterable[str], bodies: Iterable[str]) -> str:
     """Name the target that is most likely to have moved one of the bodies."""
     surfaces = {*world.slices}
     surfaces |= {name for name, key in world.parameter_keys.items() if key[1] in _MOVES}
@@ -117,6 +123,8 @@ def nearest_feasible(
     here: dict[str, Value] = {}
     there: dict[str, Value] = {}
     for name, value in flatten(request).items():
+        if name in world.family.head or name not in world.model:
+            return None  # bodies come and go: there is nothing between
         variable = world.model.declared(name)
         plain = value.value if isinstance(value, Hard) else value
         try:
@@ -157,27 +165,21 @@ def commit(
     moved_before = {}
     if change.state is not None:
         moved_before = {name: np.array(before[name]) for name in world.slices}
-    model, index, state = world.graph, world.index, world.current()[1].copy()
-    static = {name: before[name] for name in proposal.static}
+    declaration, index, state = world.declaration, world.index, world.current()[1].copy()
+    model, static = world.graph, {name: before[name] for name in declaration.static_names}
+    structure = world.structure
+    backwards = _back(world, change, before, state)
     try:
         inertia = _inertia(world, change)
         _apply(world, change, proposal)
-        world.adopt(proposal.model, proposal.static, proposal.index)
-        audit = _report(world, proposal, request, before, moved_before, inertia, change)
+        world.adopt(proposal.declaration, proposal.model, proposal.static, proposal.index)
+        audit = _report(world, proposal, request, before, moved_before, inertia, structure)
     except BaseException:
         if change:
-            world.backend.apply(_back(world, change, before, state))
-        world.adopt(model, static, index, state)
+            world.backend.apply(backwards)
+        world.adopt(declaration, model, static, index, state)
         raise
-    kept = Instant(
-        instant.model,
-        instant.static,
-        instant.state,
-        instant.index,
-        proposal.requests,
-        instant.at_start,
-    )
-    return audit, kept
+    return audit, replace(instant, requests=proposal.requests)
 
 
 def _apply(world: World, change: Difference, proposal: Proposal) -> None:
@@ -192,6 +194,9 @@ def _apply(world: World, change: Difference, proposal: Proposal) -> None:
 def _back(
     world: World, change: Difference, before: Mapping[str, Value], state: PhysicalState
 ) -> Difference:
+    if change.structure is not None:
+        now = world.describe(before, state)
+        return Difference(now.structure, now.parameters, state)
     keys = {key: name for name, key in world.parameter_keys.items()}
     old = {key: before[keys[key]] for key in change.parameters}
     return Difference(None, old, None if change.state is None else state)
@@ -219,7 +224,10 @@ def _close(given: Floats, reported: Floats) -> bool:
 
 
 def _inertia(world: World, change: Difference) -> dict[str, Value]:
+    if change.structure is not None:
+        return {}
     bodies = {body for body, what in change.parameters if what in ("mass", "size")}
+    bodies -= {*world.structure.obstacles}
     return {f"{body}.inertia": world.backend.inertia(body) for body in sorted(bodies)}
 
 
@@ -245,7 +253,7 @@ def _report(
     before: Mapping[str, Value],
     moved_before: Mapping[str, Value],
     inertia: Mapping[str, Value],
-    change: Difference,
+    structure: Structure,
 ) -> Audit:
     flat = flatten(request)
     now = world.current()[0]
@@ -261,13 +269,19 @@ def _report(
     followed = {
         name: (before[name], value)
         for name, value in proposal.static.items()
-        if value is not before[name] and name not in entries and not same(value, before[name])
+        if name in before and name not in entries and not _same(value, before[name])
     }
     for name, old in moved_before.items():
-        if name not in entries and not same(old, now[name]):
+        if name in now and name not in entries and not same(old, now[name]):
             followed[name] = (old, np.array(now[name]))
     engine = {
         body: (old, world.backend.inertia(body.removesuffix(".inertia")))
         for body, old in inertia.items()
     }
-    return Audit(entries, followed, engine)
+    bodies = [{*s.blocks, *s.obstacles} for s in (structure, world.structure)]
+    came, went = sorted(bodies[1] - bodies[0]), sorted(bodies[0] - bodies[1])
+    return Audit(entries, followed, engine, tuple(came), tuple(went))
+
+
+def _same(a: Value, b: Value) -> bool:
+    return a is b or (np.shape(a) == np.shape(b) and same(a, b))

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.entities import ACTIONS, Clock, Composition, Robot, Stage
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.entities import ACTIONS, PRESET_NAMES, Clock, Composition, Looks, Robot, Stage
+from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.scene import (
     TIMESTEP,
@@ -22,100 +23,138 @@ from scm_world.scene import (
     default_parameters,
     preset,
 )
-from scm_world.tasks import Task, conventions, make_task
+from scm_world.tasks import Conventions, Task, conventions
 from scm_world.variables import Derived, Exogenous, Measured
-from scm_world.world.readouts import Readouts, static_order
+from scm_world.variables import catalogue as numbers
+from scm_world.world.readouts import computed_order, static_order
 from scm_world.world.start import whole_number
 
 
-class Declaration:
-    """Everything about a world that stays the same, whatever happens in it.
-
-    Args:
-        task: A task.
-        preset_name: Numerical settings of the engine.
-        action_mode: How the robot is commanded.
-        frame_skip: Length of a control step in units of 4 ms.
-        max_episode_length: In control steps; the task's own length if None.
-        conventions_name: Ours or the predecessor's.
+@final
+@dataclass(frozen=True)
+class Options:
+    """What a world is made with besides its task.
 
     Attributes:
-        model: The causal model, without interventions.
-        composition: The entities.
-        slices: Where each state stands in the state vector.
-        parameter_keys: Which physical parameter each variable sets.
-        carried: States that follow others when these are set.
-        static_names: Everything that interventions alone decide, causes before effects.
+        preset: Numerical settings of the engine at the start of an episode.
+        action_mode: How the robot is commanded.
+        frame_skip: Length of a control step in units of 4 ms.
+        given_length: Length of an episode in control steps, if one was given.
+        conventions: Ours or the predecessor's.
     """
 
-    def __init__(
-        self,
-        task: Task | str,
+    preset: str
+    action_mode: str
+    frame_skip: int
+    given_length: int | None
+    conventions: Conventions
+
+    @classmethod
+    def checked(
+        cls,
         *,
         preset_name: str,
         action_mode: str,
         frame_skip: int,
         max_episode_length: int | None,
         conventions_name: str,
-    ) -> None:
-        self.task = make_task(task) if isinstance(task, str) else task
-        self.frame_skip = whole_number("frame_skip", frame_skip, least=1)
-        self.control_period = TIMESTEP * self.frame_skip  # [s]
-        self.given_length = max_episode_length
+    ) -> Options:
+        """Check what a user gave.
+
+        Raises:
+            UnknownOption: One of the names does not exist, or a number is none.
+        """
+        skip = whole_number("frame_skip", frame_skip, least=1)
         if max_episode_length is not None:
             whole_number("max_episode_length", max_episode_length, least=1)
-        self.max_episode_length = max_episode_length or round(
-            self.task.seconds / self.control_period
-        )
         if action_mode not in ACTIONS:
             raise UnknownOption("action_mode", action_mode, ACTIONS)
-        self.action_mode = action_mode
-        self.conventions = conventions(conventions_name)
-        self._preset = preset(preset_name)
-        self._substeps = round(self.control_period / self._preset.timestep)
-        self._mode = (
-            ControlMode.JOINT_TORQUES
-            if action_mode == "joint_torques"
-            else ControlMode.JOINT_POSITIONS
-        )
-        self._declare()
+        name = preset(preset_name).name
+        return cls(name, action_mode, skip, max_episode_length, conventions(conventions_name))
 
-    def _declare(self) -> None:
-        clock = Clock(self.max_episode_length, self.control_period)
-        self.composition = Composition(
-            (Robot(self.action_mode), Stage(), clock, *self.task.entities()),
-            tuple(self.task.shared()),
+    @property
+    def control_period(self) -> float:
+        """Length of a control step [s]."""
+        return TIMESTEP * self.frame_skip
+
+    @property
+    def mode(self) -> ControlMode:
+        """What the engine is told."""
+        torques = self.action_mode == "joint_torques"
+        return ControlMode.JOINT_TORQUES if torques else ControlMode.JOINT_POSITIONS
+
+
+class Declaration:
+    """Everything about a world that stays the same as long as its structure does.
+
+    Args:
+        task: With the plan and the conventions of this world.
+        options: Of the world.
+        steps: Length of an episode in control steps.
+
+    Attributes:
+        task: As it was given.
+        model: The causal model, without interventions.
+        composition: The entities.
+        slices: Where each state stands in the state vector.
+        parameter_keys: Which physical parameter each variable sets.
+        carried: States that follow others when these are set.
+        computed: Variables that are computed from what moves, causes before effects.
+        static_names: Everything that interventions alone decide, causes before effects.
+        random: Variables that are drawn when an episode begins.
+    """
+
+    def __init__(self, task: Task, options: Options, steps: int) -> None:
+        self.task = task
+        entities = (
+            Robot(options.action_mode, task.start),
+            Stage(options.preset),
+            Looks(),
+            Clock(steps, options.control_period),
+            *task.entities(),
         )
-        self.model = SCM([*self.composition.variables(), *self.task.readouts(self.conventions)])
-        _refuse_draws(self.model)
+        self.composition = Composition(entities, tuple(task.shared()))
+        variables = [*self.composition.variables(), *task.readouts()]
+        self.model = SCM(options.conventions.adapt(variables))
         self.slices = self.composition.slices()
         self.parameter_keys = self.composition.parameters()
         self.carried = tuple(
             v for v in self.model.variables if isinstance(v, Measured) and v.set_parents()
         )
-        self._now: dict[str, Value] = {}
-        self._before: dict[str, Value] = {}
-        self._readouts = Readouts(self.model, self._now, self._before)
-        self.static_names = static_order(self.model, self._readouts.order)
+        self.computed = computed_order(self.model)
+        self.static_names = static_order(self.model, self.computed)
+        self.random = tuple(
+            v.name
+            for v in self.model.variables
+            if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
+        )
         self._coordinates: dict[str, Callable[..., Any]] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
-        bounds: Any = self.model.declared("action").bounds
-        low, high = bounds.bounds((9,), {})
-        self.action_low, self.action_high = np.array(low), np.array(high)
+        self._structures: dict[str, Structure] = {}
+        self._constants: dict[str, dict[ParameterKey, Floats]] = {}
 
     @property
-    def computed(self) -> tuple[str, ...]:
-        """Variables that are computed from what moves, causes before effects."""
-        return self._readouts.order
+    def n_blocks(self) -> int:
+        """How many movable blocks there are."""
+        return len(self.composition.blocks)
 
     @cached_property
-    def _constants(self) -> dict[ParameterKey, Floats]:
-        return default_parameters(self.structure)
+    def action_bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper end of an action, shape (9,) each."""
+        bounds: Any = self.model.declared("action").bounds
+        low, high = bounds.bounds((9,), {})
+        return np.array(low), np.array(high)
 
-    @cached_property
-    def structure(self) -> Structure:
-        """The bodies that the engine has to build."""
-        return Structure(blocks=self.composition.blocks, preset=self._preset)
+    def structure(self, values: Values) -> Structure:
+        """Say which bodies the engine has to build, and how finely it cuts time."""
+        name = PRESET_NAMES[int(values[numbers.PRESET])]
+        if name not in self._structures:
+            made = self.composition
+            self._structures[name] = structure = Structure(
+                made.blocks, preset(name), made.obstacles, made.hulls
+            )
+            self._constants[name] = default_parameters(structure)
+        return self._structures[name]
 
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
         """Name some variables and what follows them at once, without physics, causes first."""
@@ -139,31 +178,9 @@ class Declaration:
 
     def describe(self, values: Values, state: PhysicalState) -> Scene:
         """Describe the scene that some values stand for."""
-        parameters = dict(self._constants)
+        structure = self.structure(values)
+        parameters = dict(self._constants[structure.preset.name])
         for name, key in self.parameter_keys.items():
             parameters[key] = values[name]
         goals = self.composition.goals(values)
-        return Scene(self.structure, parameters, state, goals)
-
-    @cached_property
-    def identity(self) -> tuple[Any, ...]:
-        """What two worlds have in common if one can take up a snapshot of the other."""
-        options = (self._preset.name, self.action_mode, self.conventions.name)
-        numbers = (self.frame_skip, self.max_episode_length)
-        return (self.task.name, *options, *numbers, *self.model)
-
-
-def _refuse_draws(model: SCM) -> None:
-    """Refuse what would be ignored: an episode begins at defaults and draws when asked to.
-
-    Raises:
-        ModelError: A variable of the world has a distribution or noise of its own.
-    """
-    problems = [
-        f"{v.name!r} is random by declaration, but an episode begins at defaults; leave that out "
-        f"and draw it with reset(do={{{v.name!r}: Draw(…)}})"
-        for v in model.variables
-        if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
-    ]
-    if problems:
-        raise ModelError(problems)
+        return Scene(structure, parameters, state, goals, self.composition.light(values))

@@ -17,8 +17,10 @@ from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Rotati
 from scm_world.variables.checks import check_bounds, check_space
 from scm_world.variables.kinds import SpaceName
 from scm_world.world.compare import same
+from scm_world.world.restructure import restructured
 
 if TYPE_CHECKING:
+    from scm_world.world.declaration import Declaration
     from scm_world.world.world import World
 
 Requests = dict[str, tuple[str, Intervention]]
@@ -34,20 +36,24 @@ class Instant:
     that taking one back leaves no trace, and the order does not matter.
 
     Attributes:
+        declaration: Of the structure that there is.
         model: With the interventions of earlier instants.
         static: Values of everything that physics does not move.
         state: Where everything is.
         index: The control step.
         requests: What has been asked for at this instant so far.
         at_start: Whether an episode is just beginning.
+        fresh: States of bodies that come into being.
     """
 
+    declaration: Declaration
     model: SCM
     static: Mapping[str, Value]
     state: PhysicalState
     index: int
     requests: Requests = field(default_factory=dict)
     at_start: bool = False
+    fresh: frozenset[str] = frozenset()
 
 
 @final
@@ -55,6 +61,7 @@ class Instant:
 class Proposal:
     """What the world would be after the intervention."""
 
+    declaration: Declaration
     model: SCM
     static: dict[str, Value]
     state: PhysicalState
@@ -64,15 +71,15 @@ class Proposal:
 
 
 def accept(
-    world: World, instant: Instant, request: Mapping[str, Any]
+    instant: Instant, request: Mapping[str, Any]
 ) -> tuple[Requests, list[InterventionError]]:
     """Check names, types and shapes; keep what is right and list what is wrong."""
-    model = world.model
+    model = instant.declaration.model
     accepted: Requests = {}
     problems: list[InterventionError] = []
     for name, value in flatten(request).items():
         try:
-            act = _accept(world, instant, name, value)
+            act = _accept(instant, name, value)
             target = model.target(name)
             if target in accepted:
                 raise ConflictingTargets((accepted[target][0], name), target)
@@ -82,13 +89,14 @@ def accept(
     return accepted, problems
 
 
-def _accept(world: World, instant: Instant, name: str, value: Any) -> Intervention:
+def _accept(instant: Instant, name: str, value: Any) -> Intervention:
+    declaration = instant.declaration
     try:
-        return world.model.accept(name, value)
+        return declaration.model.accept(name, value)
     except OutOfBounds as problem:
         # What physics did is possible: a state can always be put back to where it is.
-        if name in world.slices and np.array_equal(
-            problem.value, instant.state.vector[world.slices[name]]
+        if name in declaration.slices and np.array_equal(
+            problem.value, instant.state.vector[declaration.slices[name]]
         ):
             return Hard(problem.value)
         raise
@@ -102,30 +110,39 @@ def propose(
     Raises:
         InterventionError: With every problem of the request.
     """
-    accepted, problems = accept(world, instant, request)
+    moment = world.moment(instant.index)
+    instant = restructured(world.family, instant, request, moment)
+    accepted, problems = accept(instant, request)
     requests: Requests = {**instant.requests, **accepted}
-    draft = _Draft(world, instant, requests)
+    model = instant.declaration.model
+    # What was asked of bodies that are gone waits for them, should they come back at once.
+    draft = _Draft(instant, {t: act for t, act in requests.items() if t in model}, moment)
     with np.errstate(all="ignore"):  # what is not finite is refused by name
         draft.solve_parameters()
         problems += draft.set_states()
         problems += draft.check(accepted, space)
     raise_all(problems)
     asked = tuple(name for name, _ in accepted.values())
-    frozen = {target: draft.frozen(target, *named) for target, named in requests.items()}
-    return Proposal(draft.model, draft.static, draft.state, draft.index, frozen, asked)
+    frozen = {
+        target: draft.frozen(target, *named) if target in model else named
+        for target, named in requests.items()
+    }
+    return Proposal(
+        instant.declaration, draft.model, draft.static, draft.state, draft.index, frozen, asked
+    )
 
 
 @final
 class _Draft:
     """A world on paper."""
 
-    def __init__(self, world: World, instant: Instant, requests: Requests) -> None:
-        self._world, self._instant, self._requests = world, instant, requests
+    def __init__(self, instant: Instant, requests: Requests, moment: Moment) -> None:
+        self._world, self._instant, self._requests = instant.declaration, instant, requests
         self.static: dict[str, Value] = dict(instant.static)
         self.model = instant.model
         self.state = instant.state
         self.index = instant.index
-        self._moment = Moment(world.noise, world.episode, instant.index)
+        self._moment = moment
 
     def _is_state(self, target: str) -> bool:
         return self._world.model.declared(target).role == "state"
@@ -224,15 +241,22 @@ class _Draft:
     def _carry(self, variable: Measured) -> None:
         """Let a state follow the parents that act on it when set (a block that grows)."""
         parents = variable.set_parents()
-        old = [self._before(parent) for parent in parents]
         new = [self._value(parent) for parent in parents]
-        if all(same(a, b) for a, b in zip(old, new, strict=True)):
-            return
         where = self._world.slices[variable.name]
-        self.state.vector[where] = self._moved(variable, where, old, new)
+        if variable.name in self._instant.fresh:
+            if variable.start is not None:
+                self.state.vector[where] = variable.start.bind()(*new)
+            return
+        old = [self._before(parent) for parent in parents]
+        moved = {p for p, a, b in zip(parents, old, new, strict=True) if not same(a, b)}
+        if moved:
+            again = self._instant.at_start or not moved.isdisjoint(variable.restart)
+            self.state.vector[where] = self._moved(variable, where, old, new, again=again)
 
-    def _moved(self, variable: Measured, where: slice, old: list[Value], new: list[Value]) -> Value:
-        if self._instant.at_start and variable.start is not None:
+    def _moved(
+        self, variable: Measured, where: slice, old: list[Value], new: list[Value], *, again: bool
+    ) -> Value:
+        if again and variable.start is not None:
             return np.asarray(variable.start.bind()(*new))
         if variable.carry is None:
             return self._instant.state.vector[where]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, final
 
 import numpy as np
@@ -24,22 +24,22 @@ class Readouts:
         model: The declared model.
         now: Present values, which this object completes.
         before: Values of one control step ago, of the parents of lag 1.
+        order: What is computed, causes before effects.
     """
 
-    def __init__(self, model: SCM, now: dict[str, Value], before: dict[str, Value]) -> None:
+    def __init__(
+        self,
+        model: SCM,
+        now: dict[str, Value],
+        before: dict[str, Value],
+        order: tuple[str, ...],
+    ) -> None:
         self._now, self._before = now, before
         self._model = model
         self._plans: dict[tuple[str, ...], tuple[_Step, ...]] = {}
         self._fresh = False
-        moving = {v.name for v in model.variables if isinstance(v, Measured)}
-        follow = set(model.structure.instant_descendants(moving))
-        # Other coordinates of a quantity have no effects: computing them can wait until asked.
-        follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
-        self.order = tuple(
-            name
-            for name in model.structure.order
-            if (name in follow or name in moving) and _is_computed(model, name)
-        )
+        self.order = order
+        self._computed = frozenset(order)
         self.lagged = tuple(
             dict.fromkeys(
                 parent.name
@@ -51,14 +51,13 @@ class Readouts:
 
     def _plan(self, names: tuple[str, ...]) -> tuple[_Step, ...]:
         wanted: set[str] = set()
-        stack = [name for name in names if name in self.order]
-        stack += [name for name in self.lagged if name in self.order]
+        stack = [name for name in (*names, *self.lagged) if name in self._computed]
         while stack:
             name = stack.pop()
             if name not in wanted:
                 wanted.add(name)
                 parents = self._model.declared(name).all_parents
-                stack.extend(p.name for p in parents if p.lag == 0 and p.name in self.order)
+                stack.extend(p.name for p in parents if p.lag == 0 and p.name in self._computed)
         return tuple(self._bind(name) for name in self.order if name in wanted)
 
     def _bind(self, name: str) -> _Step:
@@ -96,11 +95,31 @@ class Readouts:
         for name in self.lagged:
             before[name][...] = now[name]
 
+    def recall(self, earlier: Mapping[str, Value]) -> None:
+        """Take over what is remembered of another structure; the present stands in for the rest."""
+        self.forget()
+        for name in self.lagged:
+            if name in earlier:
+                self._before[name] = np.array(earlier[name])
+
     def forget(self) -> None:
         """Begin an episode: there is no earlier step, so the present stands in for it."""
         self.evaluate(self.lagged)
         for name in self.lagged:
             self._before[name] = np.array(self._now[name])
+
+
+def computed_order(model: SCM) -> tuple[str, ...]:
+    """List the variables that are computed from what moves, causes before effects."""
+    moving = {v.name for v in model.variables if isinstance(v, Measured)}
+    follow = set(model.structure.instant_descendants(moving))
+    # Other coordinates of a quantity have no effects: computing them can wait until asked.
+    follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
+    return tuple(
+        name
+        for name in model.structure.order
+        if (name in follow or name in moving) and _is_computed(model, name)
+    )
 
 
 def _is_computed(model: SCM, name: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -10,10 +10,9 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.backends.base import EngineSnapshot
-from scm_world.graph import SCM
 from scm_world.scene import PhysicalState
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.variables import Intervention
+from scm_world.world.family import Family
 from scm_world.world.proposal import Instant, Requests
 
 
@@ -28,6 +27,7 @@ class SavedInstant:
     index: int
     requests: Requests
     at_start: bool
+    plan: Hashable = None
 
     @classmethod
     def of(cls, instant: Instant) -> SavedInstant:
@@ -39,13 +39,23 @@ class SavedInstant:
             instant.index,
             dict(instant.requests),
             instant.at_start,
+            instant.declaration.task.plan,
         )
 
-    def instant(self, model: SCM) -> Instant:
-        """Give the instant back, as one of a model without interventions."""
-        state = PhysicalState((len(self.vector) - ROBOT_SIZE) // BLOCK_SIZE, self.vector.copy())
-        held = model.with_interventions(self.interventions)
-        return Instant(held, self.static, state, self.index, dict(self.requests), self.at_start)
+    def instant(self, family: Family) -> Instant:
+        """Give the instant back."""
+        declaration = family.declaration(self.plan)
+        state = PhysicalState(declaration.n_blocks, self.vector.copy())
+        held = declaration.model.with_interventions(self.interventions)
+        return Instant(
+            declaration,
+            held,
+            self.static,
+            state,
+            self.index,
+            dict(self.requests),
+            self.at_start,
+        )
 
 
 @final
@@ -64,6 +74,7 @@ class WorldSnapshot:
         episode: Number of the episode.
         world: Task, options and names of all variables, to tell worlds apart.
         instant: What was done at this instant so far, and where it began.
+        plan: What stands in the world.
     """
 
     engine: EngineSnapshot
@@ -76,3 +87,4 @@ class WorldSnapshot:
     episode: int = 0
     world: tuple[Any, ...] = ()
     instant: SavedInstant | None = None
+    plan: Hashable = None

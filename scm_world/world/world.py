@@ -11,7 +11,7 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend, make_backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.entities import CONTROL_INDEX
+from scm_world.entities import ACTUATOR_NOISE, CONTROL_INDEX
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
 from scm_world.scene import (
@@ -19,19 +19,23 @@ from scm_world.scene import (
     Scene,
 )
 from scm_world.scene.kinematics import clip_kernel, inverse_kernel
-from scm_world.tasks import Task
-from scm_world.variables import Noise
+from scm_world.tasks import Task, make_task
+from scm_world.variables import Draw, Noise, Normal
+from scm_world.variables.catalogue import PRESET
 from scm_world.variables.kinds import SpaceName
 from scm_world.world.audit import Audit
 from scm_world.world.commit import commit, difference, refuse_overlaps
-from scm_world.world.declaration import Declaration
-from scm_world.world.proposal import Instant, propose
+from scm_world.world.declaration import Declaration, Options
+from scm_world.world.declared import Declared
+from scm_world.world.family import Family
+from scm_world.world.proposal import Instant, Proposal, propose
+from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
 from scm_world.world.start import beginning, whole_number
 
 
 @final
-class World(Declaration):
+class World(Declared):
     """A task as a causal model, with an engine that moves it.
 
     Args:
@@ -69,27 +73,32 @@ class World(Declaration):
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
     ) -> None:
-        super().__init__(
-            task,
+        self.options = Options.checked(
             preset_name=preset,
             action_mode=action_mode,
             frame_skip=frame_skip,
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
+        made = make_task(task) if isinstance(task, str) else task
+        self.family = Family(made, self.options)
+        self._mode = self.options.mode
         self.backend = make_backend(backend) if isinstance(backend, str) else backend
         self._started = False
         self.noise = Noise(0)
         self.episode = 0
         self.version = 0  # counts changes of anything but what physics moves
-        self._held = self.model
         self._static: Values = {}
         self._action_is_held = False
+        self._noisy = False
         self._index = 0
         self._clock = np.zeros((), dtype=np.int64)
         self._instant: Instant | None = None
         self._command = np.zeros(9)
         self._reached = np.zeros(3, dtype=np.bool_)
+        self._enter(self.family.natural(None))
+        self._held = self.model
+        self.structure = self.declaration.structure(self.model.solve(only=(PRESET,)))
 
     # --- looking ------------------------------------------------------------------------------
 
@@ -168,24 +177,41 @@ class World(Declaration):
         return self.do(do) if do else None
 
     def _begin(self) -> None:
+        origin = self.family.natural(None)
         if self._started:
             self.backend.restore(self._origin.engine)
         else:
-            self._build()
+            self._build(origin)
         self._now["action"] = np.zeros(9)
-        self.adopt(self.model, self._origin.static, 0)
+        self.adopt(origin, origin.model, self._origin.static, 0)
+        self._draw_nature()
         self._readouts.forget()
         self._instant = self._present(at_start=True)
 
-    def _build(self) -> None:
-        blocks = len(self.structure.blocks)
-        static, self._state = beginning(self.model, self.static_names, self.slices, blocks)
-        self._now.update(static)
-        self._now.update(self.states(self._state))
-        self._now[CONTROL_INDEX] = self._clock
-        self.backend.build(self.describe(self._now, self._state.copy()))
+    def _build(self, origin: Declaration) -> None:
+        static, state = beginning(origin, None)
+        self.backend.build(origin.describe(static, state))
         self._origin = WorldSnapshot(engine=self.backend.snapshot(), static=static)
         self._started = True
+
+    def _draw_nature(self) -> None:
+        """Draw what is random by declaration: the noise of this episode."""
+        moment = self.moment(0)
+        declaration = self.family.natural(moment)
+        if not declaration.random:
+            return
+        static, state = beginning(declaration, moment)
+        model = declaration.model
+        drawn = Proposal(declaration, model, static, state, 0, {}, declaration.random[:1])
+        change = difference(self, drawn)
+        refuse_overlaps(self, self._present(), drawn, change, {declaration.random[0]: Draw("A")})
+        if change:
+            self.backend.apply(change)
+        self.adopt(declaration, model, static, 0)
+
+    def moment(self, index: int) -> Moment:
+        """Say where in the noise a control step of this episode draws."""
+        return Moment(self.noise, self.episode, index, origin=0)
 
     def step(self, action: ArrayLike) -> None:
         """Advance one control step.
@@ -204,6 +230,8 @@ class World(Declaration):
         command = self._checked(action)
         self._readouts.remember()
         self._now["action"] = command
+        if self._noisy:
+            command = self._disturbed(command)
         if self.action_mode == "end_effector_positions":
             height = float(self._now["robot_height"])
             joints = self._state.joint_positions
@@ -215,6 +243,12 @@ class World(Declaration):
         self._clock[...] = self._index
         self._readouts.stale()
         self._instant = None
+
+    def _disturbed(self, command: Floats) -> Floats:
+        """Add the noise of the actuators to a command."""
+        low, high = self.action_low, self.action_high
+        drawn = self.moment(self._index).draw(Normal(), ACTUATOR_NOISE, (9,), {})
+        return command + float(self._now[ACTUATOR_NOISE]) * (high - low) / 2.0 * drawn
 
     def _checked(self, action: ArrayLike) -> Floats:
         try:
@@ -232,7 +266,7 @@ class World(Declaration):
             )
         if self._action_is_held:
             known = {**self._now, "action": command}
-            moment = Moment(self.noise, self.episode, self._index)
+            moment = self.moment(self._index)
             held = self._held.solve(known, moment=moment, only=("action",))["action"]
             clip_kernel(np.array(held), self.action_low, self.action_high, command)
         return command
@@ -268,21 +302,36 @@ class World(Declaration):
 
     def _present(self, *, at_start: bool = False) -> Instant:
         state = self._state.copy()
-        return Instant(self._held, self._static, state, self._index, at_start=at_start)
+        return Instant(
+            self.declaration, self._held, self._static, state, self._index, at_start=at_start
+        )
 
     def adopt(
-        self, model: SCM, static: Values, index: int, state: PhysicalState | None = None
+        self,
+        declaration: Declaration,
+        model: SCM,
+        static: Values,
+        index: int,
+        state: PhysicalState | None = None,
     ) -> None:
         """Take over what an intervention decided; the engine has taken over its part.
 
         Args:
+            declaration: Of the structure that there is now.
             model: With the interventions that hold.
             static: Values of everything that physics does not move.
             index: The control step.
             state: Where everything is; what the engine reports if None.
         """
+        earlier = dict(self._before)
+        changed = declaration is not self.declaration
+        if changed:
+            self._enter(declaration)
         self._held, self._static = model, static
         self._action_is_held = "action" in model.interventions
+        self._noisy = bool(static[ACTUATOR_NOISE] > 0.0)
+        self.structure = declaration.structure(static)
+        self._substeps = round(self.control_period / self.structure.preset.timestep)
         self._now.update(static)
         self.version += 1
         self._readouts.stale()
@@ -292,6 +341,18 @@ class World(Declaration):
             self.backend.read(self._state)
         else:
             self._state.vector[:] = state.vector
+        if changed:
+            self._readouts.recall(earlier)
+
+    def _enter(self, declaration: Declaration) -> None:
+        """Make room for the values of a structure."""
+        action = self._now["action"] if hasattr(self, "_now") else np.zeros(9)
+        self.declaration = declaration
+        self._now: dict[str, Value] = {"action": action, CONTROL_INDEX: self._clock}
+        self._before: dict[str, Value] = {}
+        self._state = PhysicalState(declaration.n_blocks)
+        self._now.update(declaration.states(self._state))
+        self._readouts = Readouts(declaration.model, self._now, self._before, declaration.computed)
 
     def current(self) -> tuple[Values, PhysicalState]:
         """Give the live values and the live state, for the parts of a ``do``."""
@@ -313,6 +374,7 @@ class World(Declaration):
             episode=self.episode,
             world=self.identity,
             instant=None if self._instant is None else SavedInstant.of(self._instant),
+            plan=self.task.plan,
         )
 
     def restore(self, snapshot: WorldSnapshot) -> None:
@@ -328,13 +390,14 @@ class World(Declaration):
         engine: EngineSnapshot = snapshot.engine
         self.backend.restore(engine)
         self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
-        held = self.model.with_interventions(snapshot.interventions)
+        declaration = self.family.declaration(snapshot.plan)
+        held = declaration.model.with_interventions(snapshot.interventions)
         self._now["action"] = np.array(snapshot.action)
-        self.adopt(held, snapshot.static, snapshot.index)
+        self.adopt(declaration, held, snapshot.static, snapshot.index)
         for name, value in snapshot.previous.items():
             self._before[name][...] = value
         saved = snapshot.instant
-        self._instant = None if saved is None else saved.instant(self.model)
+        self._instant = None if saved is None else saved.instant(self.family)
 
     def close(self) -> None:
         """Free the engine."""

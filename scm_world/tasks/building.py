@@ -1,0 +1,174 @@
+"""What all tasks have in common in which blocks should fill goals."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import ClassVar
+
+import numpy as np
+
+from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world.entities import Entity
+from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_fraction_kernel
+from scm_world.tasks import kernels
+from scm_world.tasks.base import Task
+from scm_world.tasks.observed import Observed, observe_goal, observe_obstacle, observe_tool
+from scm_world.tasks.rewards import FRACTION, FULFILLED, SUCCESS, UNIT, above, reward
+from scm_world.variables import Function, Integers, Measured, Variable
+
+SECONDS_PER_BLOCK = 10.0
+BOX = 10  # numbers of a box in a goal vector: size (3), position (3), quaternion (4)
+_POSE = ("size", "cartesian_position", "orientation")
+
+
+def gathered(*parents: Floats, tools: float) -> tuple[Floats, ...]:
+    """Stack sizes, positions and quaternions of blocks, then those of goals.
+
+    Args:
+        parents: Size, position and quaternion of each block, then of each goal.
+        tools: How many blocks there are.
+    """
+    n = 3 * int(tools)
+    groups = (parents[:n], parents[n:])
+    return tuple(np.array(group[i::3]) for group in groups for i in range(3))
+
+
+def filled(*parents: Floats, tools: float) -> float:
+    """Compute the fraction of the volume of all goals that the blocks fill, in [0, 1].
+
+    Args:
+        parents: Size, position and quaternion of each block, then of each goal.
+        tools: How many blocks there are.
+    """
+    return float(overlap_fraction_kernel(*gathered(*parents, tools=tools)))
+
+
+def aligned(*parents: Floats, tools: float) -> float:
+    """Compute the predecessor's overlap: of the axis-aligned hulls, not capped."""
+    return aabb_overlap_fraction(*gathered(*parents, tools=tools))
+
+
+class Building(Task):
+    """A task in which blocks should fill goals.
+
+    Attributes:
+        interleaved: Whether block and goal alternate in the observation.
+    """
+
+    interleaved: ClassVar[bool] = False
+
+    @abstractmethod
+    def tools(self) -> tuple[str, ...]:
+        """Name the blocks."""
+
+    @abstractmethod
+    def targets(self) -> dict[str, str]:
+        """Name the goals, each with the block that its solution puts there."""
+
+    def obstacles(self) -> tuple[str, ...]:
+        """Name the obstacles."""
+        return ()
+
+    @abstractmethod
+    def entities(self) -> Iterable[Entity]:
+        """List blocks, goals and obstacles."""
+
+    def dense(self) -> Iterable[Variable]:
+        """Declare the dense reward terms."""
+        return ()
+
+    @property
+    def seconds(self) -> float:
+        """Ten seconds for each block [s]."""
+        still = len(self.obstacles()) if self.conventions.static_counts else 0
+        return SECONDS_PER_BLOCK * (len(self.tools()) + still)
+
+    def readouts(self) -> Iterable[Variable]:
+        """Declare reward terms and success."""
+        yield from self.dense()
+        yield self.fractional_success()
+        yield Measured(
+            name=SUCCESS,
+            dtype="integer",
+            bounds=Integers(0, 1),
+            parents=(FRACTION,),
+            mechanism=Function(above, constants={"threshold": FULFILLED}),
+            doc="1 where more than nine tenths of the goal are filled.",
+        )
+        yield from self.terms
+        yield reward(self.weights)
+
+    def fractional_success(self) -> Measured:
+        """Declare how much of the goals is filled."""
+        tools, goals = self.tools(), tuple(self.targets())
+        exact = not self.conventions.aligned_boxes
+        if exact and len(tools) == len(goals) == 1:
+            mechanism = Function(kernels.filled)
+        else:
+            constants = {"tools": float(len(tools))}
+            mechanism = Function(filled if exact else aligned, constants=constants)
+        return Measured(
+            name=FRACTION,
+            bounds=UNIT if exact else None,
+            parents=tuple(f"{body}.{part}" for body in (*tools, *goals) for part in _POSE),
+            mechanism=mechanism,
+            doc="Fraction of the volume of all goals that the blocks fill.",
+        )
+
+    def observed(self) -> Iterable[Observed]:
+        """Observe blocks, goals and obstacles."""
+        targets = {tool: goal for goal, tool in self.targets().items()}
+        for tool in self.tools():
+            yield from observe_tool(tool)
+            if self.interleaved and tool in targets:
+                yield from observe_goal(targets[tool])
+        for goal in () if self.interleaved else targets.values():
+            yield from observe_goal(goal)
+        for obstacle in self.obstacles():
+            yield from observe_obstacle(obstacle)
+
+    def goals(self, values: Values) -> tuple[Floats, Floats]:
+        """Give size, position and quaternion of each goal and of its block, shape (10 n,)."""
+        targets = self.targets()
+
+        def boxes(names: Iterable[str]) -> Floats:
+            return np.concatenate([values[f"{name}.{part}"] for name in names for part in _POSE])
+
+        return boxes(targets.values()), boxes(targets)
+
+    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
+        """Compute how much of the desired boxes the achieved ones fill, shape (...)."""
+        have, want = np.asarray(achieved, dtype=float), np.asarray(desired, dtype=float)
+        shape = np.broadcast_shapes(have.shape[:-1], want.shape[:-1])
+        overlap = aabb_overlap_fraction if self.conventions.aligned_boxes else _exact
+        rows = [
+            np.broadcast_to(boxes, (*shape, boxes.shape[-1])).reshape(
+                -1, boxes.shape[-1] // BOX, BOX
+            )
+            for boxes in (have, want)
+        ]
+        found = [overlap(*_split(mine), *_split(its)) for mine, its in zip(*rows, strict=True)]
+        return np.array(found, dtype=float).reshape(shape)
+
+    def fulfilled(self, fraction: ArrayLike) -> Value:
+        """Tell whether more than nine tenths are filled."""
+        return np.asarray(fraction) > FULFILLED
+
+    def solution(self, values: Values) -> dict[str, Value]:
+        """Put each block where its goal is."""
+        return {
+            f"{tool}.{part}": values[f"{goal}.{part}"]
+            for goal, tool in self.targets().items()
+            for part in _POSE[1:]
+        }
+
+
+def _split(boxes: Floats) -> tuple[Floats, Floats, Floats]:
+    parts = (boxes[:, :3], boxes[:, 3:6], boxes[:, 6:])
+    size, position, orientation = (np.ascontiguousarray(part) for part in parts)
+    return size, position, orientation
+
+
+def _exact(*boxes: Floats) -> float:
+    return float(overlap_fraction_kernel(*boxes))

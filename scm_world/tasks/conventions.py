@@ -1,0 +1,93 @@
+"""Where the predecessor's choices differ from ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from scm_world.errors import UnknownOption
+from scm_world.variables import Box, Integers, Space, Variable
+from scm_world.variables import catalogue as numbers
+
+
+@final
+@dataclass(frozen=True)
+class Conventions:
+    """A set of choices that go together.
+
+    Attributes:
+        name: ``"scm_world"`` or ``"causal_world"``.
+        aligned_boxes: Overlap of axis-aligned hulls, not capped, instead of the exact one.
+        reward_times_dt: Rewards multiplied by the control period.
+        extra_step: Episodes one step longer than their length.
+        published_observation: The published normalisation of observations, which values may
+            leave, and a time feature in seconds minus steps where a length is given.
+        distance_as_reward: In reaching, the mean tip error itself is added to the reward.
+        published_spaces: The spaces of the code instead of those of the paper: bright floors,
+            blocks and goals in A, no space for gravity, blocks that begin in the air, and
+            ``A|B`` as the hull of A and B.
+        static_counts: Obstacles count for the length of an episode, like blocks.
+    """
+
+    name: str
+    aligned_boxes: bool = False
+    reward_times_dt: bool = False
+    extra_step: bool = False
+    published_observation: bool = False
+    distance_as_reward: bool = False
+    published_spaces: bool = False
+    static_counts: bool = False
+
+    def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
+        """Give variables the spaces that these conventions have."""
+        for variable in variables:
+            yield _as_published(variable) if self.published_spaces else variable
+
+
+CONVENTIONS = {
+    "scm_world": Conventions("scm_world"),
+    "causal_world": Conventions("causal_world", True, True, True, True, True, True, True),
+}
+
+
+def conventions(name: str) -> Conventions:
+    """Look conventions up by their name.
+
+    Raises:
+        UnknownOption: There are none of this name.
+    """
+    try:
+        return CONVENTIONS[name]
+    except KeyError:
+        raise UnknownOption("conventions", name, CONVENTIONS) from None
+
+
+def _as_published(variable: Variable) -> Variable:
+    """Source: CausalWorld 1.2, ``task_generators/base_task.py``."""
+    changes: dict[str, Space | None] = {}
+    a, b = variable.a, variable.b
+    if variable.name == "gravity":
+        a = b = None
+    elif variable.name.endswith("color") and not variable.name.startswith(("robot", "stage")):
+        a, b = numbers.BRIGHT, numbers.DARK
+    if a is not variable.a or b is not variable.b:
+        changes = {"a": a, "b": b}
+    hull = _hull(variable.shape, a, b)
+    if hull is not None:
+        changes["a_or_b"] = hull
+    return variable.model_copy(update=changes) if changes else variable
+
+
+def _hull(shape: tuple[int, ...], a: Space | None, b: Space | None) -> Space | None:
+    """Give the smallest box around two spaces; None where their corners follow variables."""
+    match a, b:
+        case Integers(), Integers():
+            return Integers(min(a.low, b.low), max(a.high, b.high))
+        case Box(), Box() if not a.parents() and not b.parents():
+            (low_a, high_a), (low_b, high_b) = a.bounds(shape, {}), b.bounds(shape, {})
+            low, high = np.minimum(low_a, low_b).ravel(), np.maximum(high_a, high_b).ravel()
+            return Box(tuple(low), tuple(high)) if shape else Box(float(low[0]), float(high[0]))
+    return None

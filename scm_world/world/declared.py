@@ -1,0 +1,122 @@
+"""What one can ask a world about its declaration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from scm_world._types import Floats, Value, Values
+from scm_world.entities import Composition
+from scm_world.graph import SCM
+from scm_world.scene import ParameterKey, PhysicalState, Scene
+from scm_world.tasks import Conventions, Task
+from scm_world.world.declaration import Declaration, Options
+from scm_world.world.family import Family
+
+
+class Declared:
+    """The declaration of the present structure, and the options, under short names.
+
+    Attributes:
+        options: What the world was made with.
+        family: All structures of its task.
+        declaration: Of the present one.
+    """
+
+    options: Options
+    family: Family
+    declaration: Declaration
+
+    @property
+    def task(self) -> Task:
+        """The task, with its present plan."""
+        return self.declaration.task
+
+    @property
+    def model(self) -> SCM:
+        """The causal model of the present structure, without interventions."""
+        return self.declaration.model
+
+    @property
+    def composition(self) -> Composition:
+        """The entities."""
+        return self.declaration.composition
+
+    @property
+    def slices(self) -> Mapping[str, slice]:
+        """Where each state stands in the state vector."""
+        return self.declaration.slices
+
+    @property
+    def parameter_keys(self) -> Mapping[str, ParameterKey]:
+        """Which physical parameter each variable sets."""
+        return self.declaration.parameter_keys
+
+    @property
+    def static_names(self) -> tuple[str, ...]:
+        """Everything that interventions alone decide, causes before effects."""
+        return self.declaration.static_names
+
+    @property
+    def computed(self) -> tuple[str, ...]:
+        """Variables that are computed from what moves, causes before effects."""
+        return self.declaration.computed
+
+    @property
+    def conventions(self) -> Conventions:
+        """Ours or the predecessor's."""
+        return self.options.conventions
+
+    @property
+    def action_mode(self) -> str:
+        """How the robot is commanded."""
+        return self.options.action_mode
+
+    @property
+    def frame_skip(self) -> int:
+        """Length of a control step in units of 4 ms."""
+        return self.options.frame_skip
+
+    @property
+    def control_period(self) -> float:
+        """Length of a control step [s]."""
+        return self.options.control_period
+
+    @property
+    def given_length(self) -> int | None:
+        """Length of an episode in control steps, if one was given."""
+        return self.options.given_length
+
+    @property
+    def max_episode_length(self) -> int:
+        """Length of an episode in control steps."""
+        return self.family.steps
+
+    @property
+    def action_low(self) -> Floats:
+        """Lower end of an action, shape (9,)."""
+        return self.declaration.action_bounds[0]
+
+    @property
+    def action_high(self) -> Floats:
+        """Upper end of an action, shape (9,)."""
+        return self.declaration.action_bounds[1]
+
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What two worlds have in common if one can take up a snapshot of the other."""
+        numbers = (self.frame_skip, self.max_episode_length)
+        options = (self.options.preset, self.action_mode, self.conventions.name)
+        return (self.task.name, *options, *numbers)
+
+    def describe(self, values: Values, state: PhysicalState) -> Scene:
+        """Describe the scene that some values stand for."""
+        return self.declaration.describe(values, state)
+
+    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
+        """Name some variables and what follows them at once, without physics, causes first."""
+        return self.declaration.static_order(targets)
+
+    def in_coordinates(self, name: str, value: Value) -> Value:
+        """Give a value of a quantity in other coordinates of it."""
+        return self.declaration.in_coordinates(name, value)

@@ -1,0 +1,109 @@
+"""All the worlds that a task can be: one declaration for each structure."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Hashable, Iterable
+from typing import Any, final
+
+from scm_world._types import Values
+from scm_world.errors import ModelError
+from scm_world.graph import SCM, Moment
+from scm_world.tasks import Task
+from scm_world.variables import Intervention, Variable
+from scm_world.world.declaration import Declaration, Options
+
+KEPT = 8  # declarations that are kept for structures that come again
+
+
+@final
+class Family:
+    """A task with all its structures.
+
+    Args:
+        task: Of any structure.
+        options: Of the world.
+
+    Attributes:
+        head: The model of what decides which entities there are, on its own.
+        steps: Length of an episode in control steps, by the structure without interventions.
+    """
+
+    def __init__(self, task: Task, options: Options) -> None:
+        self.options = options
+        self._task = task.at(None, options.conventions)
+        self.head = _head(self._task)
+        self._declarations: OrderedDict[Hashable, Declaration] = OrderedDict()
+        first = self._task.at(self.plan(self.head.solve()), options.conventions)
+        seconds = first.seconds
+        self.steps = options.given_length or round(seconds / options.control_period)
+
+    def plan(self, values: Values) -> Hashable:
+        """Say what stands in the world, given the values of the head."""
+        return self._task.arrange(values) if len(self.head) else None
+
+    def declaration(self, plan: Hashable) -> Declaration:
+        """Give the declaration of a structure."""
+        found = self._declarations.get(plan)
+        if found is None:
+            task = self._task.at(plan, self.options.conventions)
+            found = self._declarations[plan] = Declaration(task, self.options, self.steps)
+            while len(self._declarations) > KEPT:
+                self._declarations.popitem(last=False)
+        self._declarations.move_to_end(plan)
+        return found
+
+    def natural(self, moment: Moment | None) -> Declaration:
+        """Give the structure that an episode has when nobody intervenes."""
+        return self.declaration(self.plan(self.head.solve(moment=moment)))
+
+    def after(
+        self, acts: dict[str, Intervention], held: SCM, static: Values, moment: Moment
+    ) -> Declaration | None:
+        """Give the structure after an intervention; None where it has nothing to do with it.
+
+        Args:
+            acts: What is asked for now, by requested name.
+            held: The present model, with the interventions that hold.
+            static: Present values.
+            moment: Where to draw.
+        """
+        mine = {name: act for name, act in acts.items() if name in self.head}
+        if not mine:
+            return None
+        kept = {name: act for name, act in held.interventions.items() if name in self.head}
+        model = self.head.with_interventions(kept).with_interventions(mine)
+        targets = {self.head.target(name) for name in (*kept, *mine)}
+        known = {
+            v.name: static[v.name]
+            for v in self.head.variables
+            if v.kind == "exogenous" and v.name not in targets  # type: ignore[attr-defined]
+        }
+        return self.declaration(self.plan(model.solve(known, moment=moment)))
+
+
+def _head(task: Task) -> SCM:
+    """Cut the model of what decides the structure out of what the task's entities share.
+
+    Raises:
+        ModelError: A deciding variable, or a cause of one, is not declared in ``shared``.
+    """
+    shared = {variable.name: variable for variable in task.shared()}
+    wanted = _with_causes(task.decided_by, shared)
+    missing = sorted(wanted - shared.keys())
+    if missing:
+        where = "decides what stands in the world: declare it in shared()"
+        raise ModelError([f"{name!r} {where}" for name in missing])
+    return SCM(variable for name, variable in shared.items() if name in wanted)
+
+
+def _with_causes(names: Iterable[str], declared: dict[str, Variable]) -> set[str]:
+    found: set[str] = set()
+    stack: list[Any] = list(names)
+    while stack:
+        name = stack.pop()
+        if name not in found:
+            found.add(name)
+            variable = declared.get(name)
+            stack.extend(p.name for p in (variable.all_parents if variable else ()))
+    return found

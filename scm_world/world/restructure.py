@@ -1,0 +1,93 @@
+"""What becomes of a world when entities come or go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from scm_world._types import Value
+from scm_world.errors import InterventionError
+from scm_world.graph import SCM, Moment, flatten
+from scm_world.scene import PhysicalState
+from scm_world.scene.state import ROBOT_SIZE
+from scm_world.variables import Exogenous, Intervention, Measured
+from scm_world.world.declaration import Declaration
+from scm_world.world.family import Family
+
+if TYPE_CHECKING:
+    from scm_world.world.proposal import Instant
+
+
+def restructured(
+    family: Family, instant: Instant, request: Mapping[str, Any], moment: Moment
+) -> Instant:
+    """Give the instant as it is in the structure that a request asks for.
+
+    What exists before and after keeps its values, its state and the interventions on it; what is
+    new begins as at the start of an episode. Where the structure stays, so does the instant.
+    """
+    acts = dict(instant.requests.values())
+    acts |= _structural(family, instant, request)
+    declaration = family.after(acts, instant.model, dict(instant.static), moment)
+    if declaration is None or declaration is instant.declaration:
+        return instant
+    model = _held(instant.model, declaration)
+    static = _static(instant, declaration, model, moment)
+    state = _state(instant, declaration)
+    fresh = frozenset(declaration.slices.keys() - instant.declaration.slices.keys())
+    return replace(
+        instant,
+        declaration=declaration,
+        model=model,
+        static=static,
+        state=state,
+        fresh=fresh,
+    )
+
+
+def _structural(
+    family: Family, instant: Instant, request: Mapping[str, Any]
+) -> dict[str, Intervention]:
+    """Pick what concerns the structure out of a request; what is wrong is reported later."""
+    found: dict[str, Intervention] = {}
+    for name, value in flatten(request).items():
+        if name in family.head:
+            try:
+                found[name] = instant.declaration.model.accept(name, value)
+            except InterventionError:
+                continue
+    return found
+
+
+def _held(before: SCM, declaration: Declaration) -> SCM:
+    model = declaration.model
+    kept = {name: act for name, act in before.interventions.items() if name in model}
+    return model.with_interventions(kept)
+
+
+def _static(
+    instant: Instant, declaration: Declaration, model: SCM, moment: Moment
+) -> dict[str, Value]:
+    """Solve the new model from the roots that both have; those that are held follow from that."""
+    held = {model.target(name) for name in model.interventions}
+    known = {
+        v.name: instant.static[v.name]
+        for v in model.variables
+        if isinstance(v, Exogenous) and v.name in instant.static and v.name not in held
+    }
+    solved = model.solve(known, moment=moment, only=declaration.static_names)
+    return {name: solved[name] for name in declaration.static_names}
+
+
+def _state(instant: Instant, declaration: Declaration) -> PhysicalState:
+    """Keep the states that both have; the others get what they are without causes."""
+    before, state = instant.declaration.slices, PhysicalState(declaration.n_blocks)
+    state.vector[:ROBOT_SIZE] = instant.state.vector[:ROBOT_SIZE]
+    for name, where in declaration.slices.items():
+        variable = declaration.model.declared(name)
+        if name in before:
+            state.vector[where] = instant.state.vector[before[name]]
+        elif isinstance(variable, Measured) and variable.default is not None:
+            state.vector[where] = variable.array(variable.default)
+    return state
