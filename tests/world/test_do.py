@@ -227,7 +227,8 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         request = {name: other(world, name)}
         proposal = propose(world, world._present(), request, None)
         told = difference(world, proposal)
-        expected = diff(world.scene(), world.describe(proposal.static, proposal.state))
+        then = proposal.declaration.describe(proposal.static, proposal.state)
+        expected = diff(world.scene(), then)
         assert told.parameters.keys() == expected.parameters.keys()
         assert all(np.array_equal(told.parameters[k], v) for k, v in expected.parameters.items())
         assert told.state == expected.state

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from scm_world.scene import trifinger
-from scm_world.variables import Draw, Scale, Shift
+from scm_world.variables import Categories, Draw, Integers, Scale, Shift
 from scm_world.world import World
 
 TASKS = ("reaching", "pushing")
@@ -108,7 +108,15 @@ def other(world: World, name: str) -> np.ndarray:
         return _PLACES[quantity]
     if quantity in _MOVES:
         return world[name] + _MOVES[quantity]
-    return 0.8 * world[name]
+    variable, present = world.model.declared(name), world[name]
+    if isinstance(variable.bounds, Categories):
+        return np.array(next(m for m in variable.bounds.members if m != present))
+    if isinstance(variable.bounds, Integers):
+        return present + 1
+    if not present.any():
+        low, high = variable.bounds.bounds(variable.shape, {})
+        return low + 0.02 * (high - low)
+    return 0.8 * present
 
 
 def settable(world: World) -> list[str]:
