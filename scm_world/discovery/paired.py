@@ -22,7 +22,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.discovery.probes import Probe
 from scm_world.discovery.scores import EdgeKey
 from scm_world.errors import InterventionError
-from scm_world.variables import Box, Integers, Measured, Noise, Rotations, Variable
+from scm_world.variables import Box, Categories, Integers, Measured, Noise, Rotations, Variable
 from scm_world.world import World
 
 STEPS = (0.05, -0.05, 0.02, -0.02, 0.005, -0.005, 0.001, -0.001)
@@ -81,7 +81,11 @@ class Paired:
             for v in model.variables
             if v.settable and v.role != "action" and model.target(v.name) == v.name
         )
+        self._declaration = world.declaration
         self._computed = world.computed
+        self._states = frozenset(
+            v.name for v in model.variables if isinstance(v, Measured) and v.mechanism is None
+        )
         reported = tuple(
             v.name
             for v in model.variables
@@ -125,7 +129,12 @@ class Paired:
                 self._world.do({target: value})
             except InterventionError:
                 continue
-            if self._within_the_instant(target, value):
+            restructured = self._world.declaration is not self._declaration
+            if (
+                self._in_another_structure(target, value)
+                if restructured
+                else (self._within_the_instant(target, value))
+            ):
                 return
         self.effects.refused[target] = self.effects.refused.get(target, 0) + 1
 
@@ -143,8 +152,14 @@ class Paired:
                 return np.asarray(np.clip(inside, low, high))
             case Rotations():
                 return variable.bounds.nearest(present + 4 * step * direction)
-            case Integers():
-                return np.asarray(present + 1 + attempt)
+            case Integers(high=high):
+                step_up = 1 + attempt
+                return np.asarray(
+                    np.where(present + step_up > high, present - step_up, present + step_up)
+                )
+            case Categories(members=members):
+                others = [member for member in members if member != present]
+                return np.asarray(others[attempt % len(others)]) if others else None
             case _:
                 return None
 
@@ -164,6 +179,31 @@ class Paired:
         self._see_later(target)
         self._undo(target, value)
         return True
+
+    def _in_another_structure(self, target: str, value: Value) -> bool:
+        """Find the effects of a change of structure, on what there is before and after it."""
+        world = self._world
+        reached = world.values()
+        both = [n for n in reached if n != target and self._alike(n)]
+        moved = [n for n in both if gap(reached[n], self._at_once[n]) > 0.0]
+        try:
+            self._see_settable(target, value, moved)
+            self._hold(target, value, moved)
+        except InterventionError:
+            return False
+        after, _ = self._advanced(self._probe.action)
+        for name in self._states.intersection(after):
+            self.effects.see(target, name, 1, gap(after[name], self._later[name]))
+        self._undo(target, value)
+        return True
+
+    def _alike(self, name: str) -> bool:
+        """Tell whether something can be held that is there before and after a new structure."""
+        if name not in self._at_once or name in self._computed:
+            return False
+        before = self._declaration.model.declared(name)
+        after = self._world.model.declared(name)
+        return after.settable and before.shape == after.shape and type(before) is type(after)
 
     def _hold(self, target: str, value: Value, names: Iterable[str]) -> None:
         """Set the target, with some other variables kept at their old values."""
@@ -196,8 +236,7 @@ class Paired:
 
     def _compare_later(self, cause: str, after: Values, memory: Values) -> None:
         for name in after:
-            variable = self._world.model.declared(name)
-            if isinstance(variable, Measured) and variable.mechanism is None:
+            if name in self._states:
                 self.effects.see(cause, name, 1, gap(after[name], self._later[name]))
         self._see_memory(cause, memory)
 

@@ -23,7 +23,8 @@ from scm_world.world import World, WorldSnapshot
 
 TIP = trifinger.COLLISION["tip"].radius  # [m]
 CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch
-_DRAWS = 64
+HIGHEST = 6  # blocks that are stacked
+_DRAWS = 96
 
 
 @final
@@ -102,6 +103,54 @@ def touch(world: World, dice: Dice) -> Setting:
     }
     drive = _around(place, dice.between(0.0, 0.02), angles + 0.4, dice.between(0.01, 0.06))
     return states, drive
+
+
+def tower(world: World, dice: Dice) -> Setting:
+    """Stand the blocks on one another and let the fingers press on one of them."""
+    names, sizes = world.composition.blocks[:HIGHEST], _sizes(world)[:HIGHEST]
+    middle, bottom = dice.between(-0.01, 0.01, 2), 0.0
+    states: dict[str, Value] = {}
+    for name, size in zip(names, sizes, strict=True):
+        place = middle + dice.between(-0.001, 0.001, 2)
+        states[f"{name}.cartesian_position"] = np.array([*place, bottom + size[2] / 2])
+        states[f"{name}.euler_orientation"] = np.array([0.0, 0.0, dice.between(-0.05, 0.05)])
+        bottom += size[2]
+    pressed = min(int(dice.between(0.0, 2.0)), len(names) - 1)
+    height = float(sizes[:pressed, 2].sum()) + dice.between(0.3, 0.7) * sizes[pressed, 2]
+    center, angles = np.array([*middle, 0.0]), _facing(dice)
+    reach = float(np.hypot(*sizes[pressed, :2])) / 2 + TIP + CLEARANCE
+    states["joint_positions"] = _joints(world, _around(center, reach, angles, height))
+    return states, _around(center, dice.between(0.0, 0.01), angles + 0.4, height - 0.01)
+
+
+def on_obstacle(world: World, dice: Dice) -> Setting:
+    """Stand the block on an obstacle and let all three fingers press on it."""
+    obstacle, name, size = (
+        world.composition.obstacles[0],
+        world.composition.blocks[0],
+        _sizes(world)[0],
+    )
+    middle = world[f"{obstacle}.cartesian_position"]
+    bottom = float(middle[2] + world[f"{obstacle}.size"][2] / 2)
+    place = np.array([*(middle[:2] + dice.between(-0.002, 0.002, 2)), bottom + size[2] / 2])
+    angles = _facing(dice)
+    reach = float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE
+    height = bottom + dice.between(0.4, 0.7) * size[2]
+    states = {
+        f"{name}.cartesian_position": place,
+        f"{name}.euler_orientation": np.array([0.0, 0.0, dice.between(-0.1, 0.1)]),
+        "joint_positions": _joints(world, _around(place, reach, angles, height)),
+    }
+    return states, _around(place, dice.between(0.0, 0.02), angles + 0.4, height - 0.02)
+
+
+def obstacle_ahead(world: World, dice: Dice) -> Setting:
+    """Say that obstacles, should there be any, are where the fingers are about to go."""
+    tips = np.array(world["end_effector_positions"]).reshape(3, 3)
+    places = np.array(world["obstacle_places"])
+    inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
+    places[:3] = tips + inward * (TIP + dice.between(0.0056, 0.006))
+    return {"obstacle_places": places}, (tips + 0.05 * inward).ravel()
 
 
 def finger_on_floor(world: World, dice: Dice) -> Setting:
@@ -198,7 +247,20 @@ _WITHOUT_BLOCKS: tuple[Callable[[World, Dice], Setting], ...] = (
 )
 
 
-_AT_ONCE = frozenset(scenario.__name__ for scenario in (solved, block_at_wall, block_in_air))
+def _scenarios(world: World) -> tuple[Callable[[World, Dice], Setting], ...]:
+    """List what can be tried in a world, the most telling first."""
+    made = world.composition
+    found = _WITH_BLOCKS if made.blocks else _WITHOUT_BLOCKS
+    if len(made.blocks) > 1:
+        found = (tower, *found)
+    if made.blocks and made.obstacles:
+        found = (on_obstacle, *found)
+    return (*found, obstacle_ahead) if "obstacle_places" in world.model else found
+
+
+_AT_ONCE = frozenset(
+    scenario.__name__ for scenario in (solved, block_at_wall, block_in_air, obstacle_ahead)
+)
 """Settings whose moment passes: a block hits the wall once, a goal is fulfilled until one moves."""
 
 
@@ -211,7 +273,8 @@ def probes(world: World, n: int, seed: int) -> Iterator[Probe]:
         seed: Of the choices.
     """
     noise = Noise(seed)
-    kinds = _WITH_BLOCKS if world.composition.blocks else _WITHOUT_BLOCKS
+    world.reset(seed=seed)
+    kinds = _scenarios(world)
     for number in range(n):
         yield _prepare(world, kinds[number % len(kinds)], noise, number)
 

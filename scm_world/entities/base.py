@@ -153,10 +153,13 @@ class Composition:
     Attributes:
         entities: In the order of the observation.
         shared: Variables that belong to no single entity.
+        deciding: Variables that decide which entities there are. A body that comes or goes acts
+            on the others by contact, so they do.
     """
 
     entities: tuple[Entity, ...]
     shared: tuple[Variable, ...] = ()
+    deciding: tuple[str, ...] = ()
     blocks: tuple[str, ...] = field(init=False)
     obstacles: tuple[str, ...] = field(init=False)
     hulls: tuple[tuple[str, Hull], ...] = field(init=False)
@@ -173,8 +176,8 @@ class Composition:
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
-        names = (name for entity in self.entities for name in entity.inputs())
-        inputs = tuple(Parent(name, 1, "contact") for name in names)
+        names = [name for entity in self.entities for name in entity.inputs()]
+        inputs = tuple(Parent(name, 1, "contact") for name in (*names, *self.deciding))
         declared: list[Variable] = list(self.shared)
         for entity in self.entities:
             declared.extend(entity.variables())

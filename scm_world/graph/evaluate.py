@@ -50,8 +50,7 @@ class Moment:
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
     ) -> Value:
         """Draw what a variable has by itself, without intervention."""
-        at_once = self.origin is None or self.origin == self.step
-        moment = self if at_once else replace(self, step=self.origin, origin=None)
+        moment = self if self.origin is None else replace(self, step=self.origin, origin=None)
         return moment.draw(source, name, shape, values)
 
     def draw(

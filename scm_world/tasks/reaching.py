@@ -179,7 +179,7 @@ class Reaching(Task):
     def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute how near tips are to their goals, shape (...)."""
         error = np.abs(np.asarray(achieved) - np.asarray(desired)).mean(axis=-1)
-        return 1.0 - (np.clip(error, REACHED, FAR) - REACHED) / (FAR - REACHED)
+        return np.asarray(1.0 - (np.clip(error, REACHED, FAR) - REACHED) / (FAR - REACHED))
 
     def fulfilled(self, fraction: ArrayLike) -> Value:
         """Tell whether all tips are there."""

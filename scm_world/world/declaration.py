@@ -113,7 +113,7 @@ class Declaration:
             Clock(steps, options.control_period),
             *task.entities(),
         )
-        self.composition = Composition(entities, tuple(task.shared()))
+        self.composition = Composition(entities, tuple(task.shared()), task.decided_by)
         variables = [*self.composition.variables(), *task.readouts()]
         self.model = SCM(options.conventions.adapt(variables))
         self.slices = self.composition.slices()
