@@ -148,6 +148,19 @@ def do(
     raise typer.Exit(run(assignments, options, show_all=show_all, out=out))
 
 
+@app.command()
+def variables(
+    task: Annotated[str, typer.Argument(help="Name of a task, or 'all'.")],
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Write the tables of all tasks as Markdown.")
+    ] = False,
+) -> None:
+    """Show every variable of a task: unit, role, default, and the spaces A and B."""
+    from scm_world.cli.variables import run
+
+    run(task, as_markdown=markdown)
+
+
 @app.command(name="list")
 def list_() -> None:
     """List tasks, engines, presets, conventions and environments."""

@@ -65,7 +65,7 @@ class Light:
     """
 
     direction: tuple[float, float, float] = (0.25, -0.5, 0.83)
-    ambient: float = 0.45
+    ambient: float = 0.3
 
 
 @final

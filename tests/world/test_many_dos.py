@@ -2,55 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from worlds import NEEDS_BULLET, actions, play, same, settable
 
 from scm_world.errors import InterventionError
-from scm_world.variables import Box, Draw, Integers, Normal, Scale, Shift
+from scm_world.testing.requests import random_request
 from scm_world.world import World
-
-BAD = (None, "x", float("nan"), float("inf"), [], [1.0, 2.0], {"x": 1.0}, 1e300, -1e300, True)
-
-
-def spread(world: World, name: str, generator: np.random.Generator) -> Any:
-    """Draw a value somewhere in, at, or just outside the bounds of a variable."""
-    variable: Any = world.model.declared(name)
-    bounds = variable.bounds
-    if isinstance(bounds, Box):
-        low, high = bounds.bounds(variable.shape, {})
-        return low + (high - low) * generator.uniform(-0.02, 1.02, variable.shape)
-    if isinstance(bounds, Integers):
-        return int(generator.integers(-1, 200))
-    value = generator.normal(size=variable.shape)
-    return value / np.linalg.norm(value) if variable.shape == (4,) else 0.1 * value
-
-
-def one(world: World, names: list[str], generator: np.random.Generator) -> dict[str, Any]:
-    """Draw a request."""
-    request: dict[str, Any] = {}
-    for _ in range(generator.integers(1, 4)):
-        name = str(generator.choice(names))
-        variable = world.model.declared(name)
-        near = world[name] + 0.01 * generator.normal(size=variable.shape)
-        match generator.integers(8):
-            case 0:
-                request[name] = BAD[generator.integers(len(BAD))]
-            case 1:
-                request[name] = Shift(float(generator.normal(scale=0.01)))
-            case 2:
-                request[name] = Scale(float(generator.uniform(-0.1, 2.0)))
-            case 3:
-                request[name] = Draw(("A", "B", "A|B")[generator.integers(3)])
-            case 4:
-                request[name] = Draw(Normal(0.0, 0.05))
-            case 5 | 6:
-                request[name] = near
-            case _:
-                request[name] = spread(world, name, generator)
-    return request
 
 
 def check(backend: str, count: int) -> None:
@@ -59,13 +17,12 @@ def check(backend: str, count: int) -> None:
     world.reset(seed=1)
     fresh, future = world.values(), play(world, actions(20))
     generator = np.random.default_rng(8)
-    names = list(world.model)
     done = refused = 0
     for index in range(count):
         if index % 50 == 0:
             world.reset(seed=index)
         try:
-            world.do(one(world, names, generator))
+            world.do(random_request(world, generator))
             done += 1
         except InterventionError:
             refused += 1
@@ -117,7 +74,7 @@ def test_taking_everything_back_at_one_instant_leaves_no_trace() -> None:
     names = [name for name in settable(world) if world.model.target(name) == name]
     for _ in range(300):
         try:
-            world.do(one(world, names, generator))
+            world.do(random_request(world, generator))
         except InterventionError:
             continue
     world.do({name: values[name] for name in names})

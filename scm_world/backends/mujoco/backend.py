@@ -15,6 +15,7 @@ from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapsh
 from scm_world.backends.mujoco.contacts import Touches, touches
 from scm_world.backends.mujoco.model import compiled, shape_owners
 from scm_world.backends.mujoco.parameters import Slot, couple, slots
+from scm_world.backends.mujoco.servos import steer
 from scm_world.backends.mujoco.state import (
     Instant,
     finite,
@@ -28,7 +29,7 @@ from scm_world.scene.controller import ControlMode
 from scm_world.scene.difference import Difference, complete
 from scm_world.scene.scene import ParameterKey, Parameters, Scene, Structure
 from scm_world.scene.state import PhysicalState
-from scm_world.scene.trifinger import FINGERS, N_JOINTS
+from scm_world.scene.trifinger import N_JOINTS
 
 # Everything that decides how MuJoCo goes on.
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -207,26 +208,18 @@ class MujocoBackend(Backend):
         self._positions, self._velocities = data.qpos, data.qvel
         self._torques = data.qfrc_actuator[:N_JOINTS]
         self._command = data.ctrl[:N_JOINTS]
-        self._switch(ControlMode.JOINT_POSITIONS)
+        self._mode = ControlMode.JOINT_POSITIONS
 
     def _switch(self, mode: ControlMode) -> None:
         """Make the nine servos follow positions, or pass torques on."""
-        controller = self._present.controller
-        gains = np.zeros((N_JOINTS, 3))  # of the command, the position and the velocity
-        gains[:, 0] = 1.0
-        if mode is ControlMode.JOINT_POSITIONS:
-            gains[:, 0] = np.tile(controller.kp, len(FINGERS))
-            gains[:, 1] = -gains[:, 0]
-            gains[:, 2] = np.negative(np.tile(controller.kd, len(FINGERS)))
-        self._model.actuator_gainprm[:N_JOINTS, 0] = gains[:, 0]
-        self._model.actuator_biasprm[:N_JOINTS, 1:3] = gains[:, 1:]
+        steer(self._model.actuator_gainprm, self._model.actuator_biasprm, mode)
         self._mode = mode
 
     def _edit(self, parameters: Parameters) -> None:
         """Write parameters, then whatever follows from them; those in force cost nothing."""
         self._check(parameters)
         kept, places = self._kept, self._slots
-        constant = coupled = False
+        constant = coupled = steered = False
         for key, value in parameters.items():
             present = kept.get(key)
             if present is value:
@@ -238,8 +231,11 @@ class MujocoBackend(Backend):
             place.write(given)
             constant |= place.constant
             coupled |= place.coupled
+            steered |= place.steered
         if coupled:
             couple(*self._pairs)
+        if steered:
+            self._switch(self._mode)
         if constant:
             mujoco.mj_setConst(self._model, self._scratch)
 

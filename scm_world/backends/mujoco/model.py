@@ -9,8 +9,10 @@ from functools import lru_cache
 import mujoco
 
 from scm_world.backends.mujoco.settings import Settings, settings, write_options
+from scm_world.geometry.hulls import Hull
 from scm_world.scene import trifinger
 from scm_world.scene.controller import ControllerSpec
+from scm_world.scene.presets import Preset
 from scm_world.scene.scene import (
     SPINNING_FRICTION,
     WALL_HEIGHT,
@@ -27,6 +29,8 @@ SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 
 
 _BLOCK_HALF = 0.0325  # [m] any positive size and mass do: parameters follow
 _BLOCK_MASS = 0.02  # [kg]
+_TORQUE_LIMIT = ControllerSpec().limit  # [N m] any positive one does
+_OBSTACLE_POSE = (0.1, 0.2, 0.3), (0.9, 0.1, 0.2, 0.3)  # MuJoCo fixes poses of zero for good
 _ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
 
 
@@ -38,10 +42,12 @@ def compiled(structure: Structure) -> mujoco.MjModel:
     spec.compiler.degree = False
     write_options(spec, structure.preset)
     _add_arena(spec)
-    _add_robot(spec, structure)
+    for name in structure.obstacles:
+        _add_obstacle(spec, name)
+    _add_robot(spec, structure.preset)
     for name in structure.blocks:
-        _add_block(spec, name)
-    for first, second, sliding in contact_pairs(structure.blocks):
+        _add_block(spec, name, structure.hull(name))
+    for first, second, sliding in contact_pairs(structure):
         _add_pair(spec, first, second, settings(structure.preset), sliding=sliding)
     return spec.compile()
 
@@ -74,24 +80,28 @@ def shape_owners(structure: Structure) -> dict[str, str]:
     for finger in FINGERS:
         for index in range(trifinger.LINKS_PER_FINGER):
             owners |= {name: link_name(finger, index) for name in link_shapes(finger, index)}
-    return owners | {name: name for name in structure.blocks}
+    return owners | {name: name for name in (*structure.blocks, *structure.obstacles)}
 
 
-def contact_pairs(blocks: tuple[str, ...]) -> Iterator[tuple[str, str, bool]]:
+def contact_pairs(structure: Structure) -> Iterator[tuple[str, str, bool]]:
     """List which shapes can touch, and whether they slide (True) or grip (False).
 
     Yields:
         Two shapes, and whether their friction is the soft one.
     """
-    walls = [wall_name(i) for i in range(WALL_SEGMENTS)]
+    walls, blocks = [wall_name(i) for i in range(WALL_SEGMENTS)], structure.blocks
     for i, block in enumerate(blocks):
         yield FLOOR, block, True
-        yield from ((wall, block, True) for wall in walls)
+        yield from ((fixed, block, True) for fixed in (*walls, *structure.obstacles))
         yield from ((block, other, True) for other in blocks[i + 1 :])
         for finger in FINGERS:
             yield from ((shape_name(finger, shape), block, False) for shape in SHAPES)
     for finger in FINGERS:
-        yield from ((FLOOR, shape_name(finger, shape), False) for shape in SHAPES[1:])
+        yield from (
+            (fixed, shape_name(finger, shape), False)
+            for fixed in (FLOOR, *structure.obstacles)
+            for shape in SHAPES[1:]
+        )
         yield from (
             # Nothing but a tip reaches the ring: the knee stays within 0.232 m of the center.
             (wall, shape_name(finger, "tip"), False)
@@ -114,7 +124,7 @@ def _add_pair(
         geomname2=second,
         condim=4,
         solref=chosen.contact,
-        solreffriction=chosen.sliding if sliding else (0.0, 0.0),
+        solreffriction=chosen.sliding if sliding else chosen.contact,
         friction=(1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION),
         margin=0.0,
         gap=0.0,
@@ -146,22 +156,45 @@ def _add_arena(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_block(spec: mujoco.MjSpec, name: str) -> None:
+def _add_obstacle(spec: mujoco.MjSpec, name: str) -> None:
+    position, orientation = _OBSTACLE_POSE
+    _add_box(spec.worldbody, name, pos=position, quat=orientation)
+
+
+def _add_block(spec: mujoco.MjSpec, name: str, hull: Hull | None) -> None:
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint()
     body.mass = _BLOCK_MASS
     body.inertia = (_BLOCK_MASS / 6 * (2 * _BLOCK_HALF) ** 2,) * 3
     body.explicitinertial = True
+    if hull is None:
+        _add_box(body, name)
+    else:
+        _add_hull(spec, body, name, hull)
+
+
+def _add_box(body: mujoco.MjsBody, name: str, **pose: tuple[float, ...]) -> None:
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=(_BLOCK_HALF,) * 3,
         contype=0,
         conaffinity=0,
+        **pose,
     )
 
 
-def _add_robot(spec: mujoco.MjSpec, structure: Structure) -> None:
+def _add_hull(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, hull: Hull) -> None:
+    """Add a mesh. MuJoCo moves it into a frame of its own and the shape back by as much."""
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = [number for vertex in hull.vertices for number in vertex]
+    mesh.userface = [index for face in hull.faces for index in face]
+    body.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, contype=0, conaffinity=0
+    )
+
+
+def _add_robot(spec: mujoco.MjSpec, preset: Preset) -> None:
     """Hang each finger from the world.
 
     MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
@@ -184,12 +217,11 @@ def _add_robot(spec: mujoco.MjSpec, structure: Structure) -> None:
             conaffinity=0,
         )
         root = spec.worldbody.add_body(name=base_name(finger), pos=position, quat=orientation)
-        _add_finger(root, finger, structure)
-    _add_controller(spec, structure.controller)
+        _add_finger(root, finger, preset)
+    _add_controller(spec)
 
 
-def _add_finger(body: mujoco.MjsBody, finger: str, structure: Structure) -> None:
-    limit = structure.controller.limit
+def _add_finger(body: mujoco.MjsBody, finger: str, preset: Preset) -> None:
     for index in (1, 2, 3):
         body = body.add_body(name=link_name(finger, index), pos=trifinger.JOINT_ORIGINS[index - 1])
         _set_inertial(body, index)
@@ -200,9 +232,9 @@ def _add_finger(body: mujoco.MjsBody, finger: str, structure: Structure) -> None
             axis=trifinger.JOINT_AXES[index - 1],
             limited=True,
             range=(-reach, reach),
-            solref_limit=settings(structure.preset).contact,
+            solref_limit=settings(preset).contact,
             actfrclimited=True,
-            actfrcrange=(-limit, limit),
+            actfrcrange=(-_TORQUE_LIMIT, _TORQUE_LIMIT),
         )
         _add_capsule(body, finger, SHAPES[index - 1])
     tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=trifinger.TIP_ORIGIN)
@@ -232,29 +264,29 @@ def _add_capsule(body: mujoco.MjsBody, finger: str, shape: str) -> None:
     )
 
 
-def _add_controller(spec: mujoco.MjSpec, controller: ControllerSpec) -> None:
+def _add_controller(spec: mujoco.MjSpec) -> None:
     """Add nine servos whose force is clipped, then nine dampers; the joint clips the sum."""
     joints = [link_name(finger, index) for finger in FINGERS for index in (1, 2, 3)]
     for joint in joints:
-        spec.add_actuator(
-            name=f"{joint}/servo",
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            target=joint,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-            forcelimited=True,
-            forcerange=(-controller.limit, controller.limit),
-        )
-    for joint, damping in zip(joints, controller.safety * len(FINGERS), strict=True):
-        spec.add_actuator(
-            name=f"{joint}/safety",
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            target=joint,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            gainprm=[0.0] * 10,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-            biasprm=[0.0, 0.0, -damping] + [0.0] * 7,
-        )
+        _add_actuator(spec, joint, "servo", limit=_TORQUE_LIMIT)
+    for joint in joints:
+        _add_actuator(spec, joint, "safety")
+
+
+def _add_actuator(
+    spec: mujoco.MjSpec, joint: str, purpose: str, limit: float | None = None
+) -> None:
+    """Add a source of torque without gains: they are parameters and follow."""
+    spec.add_actuator(
+        name=f"{joint}/{purpose}",
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        target=joint,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=[0.0] * 10,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        forcelimited=limit is not None,
+        forcerange=(-(limit or 0.0), limit or 0.0),
+    )
 
 
 def _yaw(angle: float) -> tuple[float, float, float, float]:

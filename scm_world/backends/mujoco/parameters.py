@@ -7,7 +7,7 @@ weights) follow with ``mj_setConst``, wherever ``constant`` says so.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import math
 from dataclasses import dataclass
 from typing import final
 
@@ -25,42 +25,12 @@ from scm_world.backends.mujoco.model import (
     shape_owners,
     wall_name,
 )
+from scm_world.backends.mujoco.servos import controller_slots
+from scm_world.backends.mujoco.settings import settings
+from scm_world.backends.mujoco.slots import Everywhere, Slot, Vector
+from scm_world.geometry.hulls import Hull
 from scm_world.scene import trifinger
 from scm_world.scene.scene import WALL_SEGMENTS, ParameterKey, Structure
-
-
-class Slot(ABC):
-    """A place in the arrays of a model.
-
-    Attributes:
-        constant: Whether derived constants have to follow a write.
-        coupled: Whether the friction of the pairs has to follow a write.
-    """
-
-    constant = False
-    coupled = False
-
-    @abstractmethod
-    def write(self, value: Floats) -> None:
-        """Write a value in the units of the scene."""
-
-    @abstractmethod
-    def read(self) -> Floats:
-        """Read it back."""
-
-
-@final
-@dataclass(frozen=True)
-class _Gravity(Slot):
-    """Acceleration, shape (3,) [m/s²]."""
-
-    vector: Floats
-
-    def write(self, value: Floats) -> None:
-        self.vector[:] = value
-
-    def read(self) -> Floats:
-        return self.vector.copy()
 
 
 @final
@@ -115,18 +85,18 @@ class _Color(Slot):
 
 @final
 @dataclass(frozen=True)
-class _LinkMass(Slot):
-    """Mass of a link [kg]; its moments of inertia scale with it."""
+class _ScaledMass(Slot):
+    """Mass of a link or a hull [kg]; its moments of inertia scale with it."""
 
     masses: Floats
-    inertias: Floats
+    inertia: Floats
     body: int
     per_mass: Floats
     constant = True
 
     def write(self, value: Floats) -> None:
         self.masses[self.body] = value
-        self.inertias[self.body] = value * self.per_mass
+        self.inertia[:] = value * self.per_mass
 
     def read(self) -> Floats:
         return np.array(self.masses[self.body])
@@ -134,8 +104,8 @@ class _LinkMass(Slot):
 
 @final
 @dataclass(frozen=True)
-class _BlockMass(Slot):
-    """Mass of a block [kg]."""
+class _BoxMass(Slot):
+    """Mass of a box [kg]."""
 
     masses: Floats
     inertia: Floats
@@ -153,8 +123,8 @@ class _BlockMass(Slot):
 
 @final
 @dataclass(frozen=True)
-class _BlockSize(Slot):
-    """Full edge lengths of a block, shape (3,) [m]."""
+class _BoxSize(Slot):
+    """Full edge lengths of a box that can move, shape (3,) [m]."""
 
     masses: Floats
     inertia: Floats
@@ -168,6 +138,65 @@ class _BlockSize(Slot):
 
     def read(self) -> Floats:
         return 2.0 * self.half
+
+
+@final
+@dataclass(frozen=True)
+class _FixedSize(Slot):
+    """Full edge lengths of an obstacle, shape (3,) [m]."""
+
+    half: Floats
+    constant = True
+
+    def write(self, value: Floats) -> None:
+        np.multiply(value, 0.5, out=self.half)
+
+    def read(self) -> Floats:
+        return 2.0 * self.half
+
+
+@final
+@dataclass(frozen=True)
+class _Orientation(Slot):
+    """Of an obstacle, quaternion (x, y, z, w); MuJoCo keeps (w, x, y, z)."""
+
+    quaternion: Floats
+    constant = True
+
+    def write(self, value: Floats) -> None:
+        self.quaternion[:] = np.roll(value, 1)
+
+    def read(self) -> Floats:
+        return np.roll(self.quaternion, -1)
+
+
+@final
+@dataclass(frozen=True)
+class _Restitution(Slot):
+    """How much of its speed a body keeps when it bounces, in [0, 1).
+
+    A contact is a spring and a damper. A damping ratio z leaves ``exp(-pi z / sqrt(1 - z²))`` of
+    the speed after half a period; the frequency stays, and with it how far a body sinks in.
+
+    Attributes:
+        references: Time constant [s] and damping ratio of every pair, shape (n, 2).
+        rigid: Both of a contact without restitution, which is critically damped.
+    """
+
+    references: Floats
+    rigid: tuple[float, float]
+
+    def write(self, value: Floats) -> None:
+        time, ratio = self.rigid
+        loss = -math.log(value) if value > 0.0 else math.inf
+        damping = loss / math.hypot(math.pi, loss) if loss < math.inf else 1.0
+        self.references[:, 0], self.references[:, 1] = time / damping, ratio * damping
+
+    def read(self) -> Floats:
+        damping = float(self.references[0, 1]) / self.rigid[1]
+        if damping >= 1.0:
+            return np.array(0.0)
+        return np.array(math.exp(-math.pi * damping / math.sqrt(1.0 - damping * damping)))
 
 
 @numba.njit("void(f8, f8[::1], f8[::1])", cache=True)
@@ -193,35 +222,63 @@ def slots(model: mujoco.MjModel, structure: Structure) -> dict[ParameterKey, Slo
     """Find the place of every parameter of this structure in this model."""
     hanging = [name(finger) for finger in trifinger.FINGERS for name in (base_name, _fixed_link)]
     found: dict[ParameterKey, Slot] = {
-        ("world", "gravity"): _Gravity(model.opt.gravity),
+        ("world", "gravity"): Vector(model.opt.gravity),
+        ("world", "restitution"): _Restitution(
+            model.pair_solref, settings(structure.preset).contact
+        ),
+        ("world", "spinning_friction"): Everywhere(model.pair_friction[:, 2]),
         ("robot", "height"): _Height(
             model.body_pos, tuple(int(model.body(name).id) for name in hanging)
         ),
+        ("robot", "joint_damping"): Everywhere(model.dof_damping[: trifinger.N_JOINTS]),
+        **controller_slots(model),
     }
     owners = shape_owners(structure)
     links = [name for name, owner in owners.items() if owner in trifinger.LINK_NAMES]
     _add_surface(found, model, "robot", links, color=False)
     _add_surface(found, model, FLOOR, [FLOOR])
     _add_surface(found, model, STAGE, [wall_name(i) for i in range(WALL_SEGMENTS)])
+    _add_links(found, model)
+    for block in structure.blocks:
+        _add_block(found, model, block, structure.hull(block))
+    for obstacle in structure.obstacles:
+        _add_obstacle(found, model, obstacle)
+    return found
+
+
+def _add_links(found: dict[ParameterKey, Slot], model: mujoco.MjModel) -> None:
     for finger in trifinger.FINGERS:
         for index, inertial in enumerate(trifinger.INERTIAL):
             link = trifinger.link_name(finger, index)
-            found[link, "mass"] = _LinkMass(
-                model.body_mass,
-                model.body_inertia,
-                model.body(link).id,
-                np.array(inertial.per_mass),
-            )
+            found[link, "mass"] = _scaled_mass(model, link, inertial.per_mass)
             found[link, "color"] = _Color(
                 model.geom_rgba, _ids(model, list(link_shapes(finger, index)))
             )
-    for block in structure.blocks:
-        body, shape = model.body(block).id, model.geom(block).id
+
+
+def _add_block(
+    found: dict[ParameterKey, Slot], model: mujoco.MjModel, name: str, hull: Hull | None
+) -> None:
+    if hull is None:
+        body, shape = model.body(name).id, model.geom(name).id
         box = (model.body_mass, model.body_inertia[body], model.geom_size[shape], body)
-        found[block, "mass"] = _BlockMass(*box)
-        found[block, "size"] = _BlockSize(*box)
-        _add_surface(found, model, block, [block])
-    return found
+        found[name, "mass"], found[name, "size"] = _BoxMass(*box), _BoxSize(*box)
+    else:
+        found[name, "mass"] = _scaled_mass(model, name, hull.moments)
+    _add_surface(found, model, name, [name])
+
+
+def _add_obstacle(found: dict[ParameterKey, Slot], model: mujoco.MjModel, name: str) -> None:
+    shape = model.geom(name).id
+    found[name, "size"] = _FixedSize(model.geom_size[shape])
+    found[name, "position"] = Vector(model.geom_pos[shape], constant=True)
+    found[name, "orientation"] = _Orientation(model.geom_quat[shape])
+    _add_surface(found, model, name, [name])
+
+
+def _scaled_mass(model: mujoco.MjModel, name: str, per_mass: tuple[float, ...]) -> _ScaledMass:
+    body = model.body(name).id
+    return _ScaledMass(model.body_mass, model.body_inertia[body], body, np.array(per_mass))
 
 
 def _add_surface(

@@ -1,0 +1,131 @@
+"""Rays against solids, one at a time.
+
+A ray is ``origin + t * direction``. Directions are not normalized: t is the depth along the
+optical axis. Solids are convex, so a ray enters and leaves at most once. A ray that starts within
+a solid meets it from inside.
+
+No kernel reorders floating-point arithmetic, so pictures are equal bit for bit between processes.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from scm_world._types import Floats
+
+Hit = tuple[float, float, float, float]
+"""The depth at which a ray is seen to meet a surface, and the normal towards the ray."""
+
+
+@njit(cache=True, error_model="numpy")
+def hit_box(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float) -> Hit:
+    """Meet the cube from -1 to 1."""
+    enter, leave, enter_axis, leave_axis = -math.inf, math.inf, 0, 0
+    for axis in range(3):
+        o, d = (ox, dx) if axis == 0 else ((oy, dy) if axis == 1 else (oz, dz))
+        if d == 0.0:
+            if abs(o) > 1.0:
+                return math.inf, 0.0, 0.0, 0.0
+            continue
+        inverse = 1.0 / d
+        middle, half = -o * inverse, abs(inverse)
+        if middle - half > enter:
+            enter, enter_axis = middle - half, axis
+        if middle + half < leave:
+            leave, leave_axis = middle + half, axis
+    if enter > leave or leave < near:
+        return math.inf, 0.0, 0.0, 0.0
+    t, axis = (enter, enter_axis) if enter >= near else (leave, leave_axis)
+    return (
+        t,
+        -math.copysign(1.0, dx) if axis == 0 else 0.0,
+        -math.copysign(1.0, dy) if axis == 1 else 0.0,
+        -math.copysign(1.0, dz) if axis == 2 else 0.0,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def hit_ball(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float) -> Hit:
+    """Meet the unit ball."""
+    a = dx * dx + dy * dy + dz * dz
+    b = ox * dx + oy * dy + oz * dz
+    discriminant = b * b - a * (ox * ox + oy * oy + oz * oz - 1.0)
+    if discriminant < 0.0:
+        return math.inf, 0.0, 0.0, 0.0
+    root = math.sqrt(discriminant)
+    t, side = (-b - root) / a, 1.0
+    if t < near:
+        t, side = (-b + root) / a, -1.0
+    if t < near:
+        return math.inf, 0.0, 0.0, 0.0
+    return t, side * (ox + t * dx), side * (oy + t * dy), side * (oz + t * dz)
+
+
+@njit(cache=True, error_model="numpy")
+def _capsule_side(
+    o: tuple[float, float, float], d: tuple[float, float, float], half: float, side: float
+) -> float:
+    """Find where a ray enters (side -1) or leaves (side 1) a capsule of radius 1 along z.
+
+    Where the ray meets the endless cylinder beyond the end of the segment, it is the ball at that
+    end which it meets, if any.
+    """
+    a = max(d[0] * d[0] + d[1] * d[1], 1e-300)  # a ray along the axis meets it far, far away
+    b = o[0] * d[0] + o[1] * d[1]
+    discriminant = b * b - a * (o[0] * o[0] + o[1] * o[1] - 1.0)
+    if discriminant < 0.0:
+        return math.inf
+    t = (-b + side * math.sqrt(discriminant)) / a
+    z = o[2] + t * d[2]
+    if abs(z) <= half:
+        return t
+    height = o[2] - math.copysign(half, z)
+    a += d[2] * d[2]
+    b += height * d[2]
+    discriminant = b * b - a * (o[0] * o[0] + o[1] * o[1] + height * height - 1.0)
+    if discriminant < 0.0:
+        return math.inf
+    return (-b + side * math.sqrt(discriminant)) / a
+
+
+@njit(cache=True, error_model="numpy")
+def hit_capsule(
+    o: tuple[float, float, float], d: tuple[float, float, float], half: float, near: float
+) -> Hit:
+    """Meet the capsule of radius 1 around the segment from -half to half along z."""
+    t, side = _capsule_side(o, d, half, -1.0), 1.0
+    if t < near:
+        t, side = _capsule_side(o, d, half, 1.0), -1.0
+    if t < near or t == math.inf:
+        return math.inf, 0.0, 0.0, 0.0
+    z = o[2] + t * d[2]
+    z -= min(max(z, -half), half)
+    return t, side * (o[0] + t * d[0]), side * (o[1] + t * d[1]), side * z
+
+
+@njit(cache=True, error_model="numpy")
+def hit_hull(
+    facets: Floats,
+    o: tuple[float, float, float],
+    d: tuple[float, float, float],
+    near: float,
+) -> Hit:
+    """Meet the polyhedron behind all planes ``facets``, shape (p, 4)."""
+    enter, leave, enter_facet, leave_facet = -math.inf, math.inf, 0, 0
+    for p in range(len(facets)):
+        slope = facets[p, 0] * d[0] + facets[p, 1] * d[1] + facets[p, 2] * d[2]
+        gap = facets[p, 3] - (facets[p, 0] * o[0] + facets[p, 1] * o[1] + facets[p, 2] * o[2])
+        if slope < 0.0:
+            if gap < enter * slope:
+                enter, enter_facet = gap / slope, p
+        elif slope > 0.0:
+            if gap < leave * slope:
+                leave, leave_facet = gap / slope, p
+        elif gap < 0.0:
+            return math.inf, 0.0, 0.0, 0.0
+    if enter > leave or leave < near:
+        return math.inf, 0.0, 0.0, 0.0
+    t, facet, side = (enter, enter_facet, 1.0) if enter >= near else (leave, leave_facet, -1.0)
+    return t, side * facets[facet, 0], side * facets[facet, 1], side * facets[facet, 2]
