@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable
+from functools import partial
+from operator import mul
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -100,11 +102,7 @@ class Function(Frozen):
             key: np.asarray(value, float) if isinstance(value, tuple) else value
             for key, value in self.constants.items()
         }
-
-        def bound(*parents: Value, **noise: Value) -> Any:
-            return function(*parents, **constants, **noise)
-
-        return bound
+        return partial(function, **constants)
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -135,10 +133,7 @@ class Linear(Frozen):
         weights, intercept = self.weights, self.intercept
 
         def linear(*parents: Value, noise: Value | float = 0.0) -> Any:
-            total = noise + intercept
-            for weight, parent in zip(weights, parents, strict=True):
-                total = total + weight * parent
-            return total
+            return sum(map(mul, weights, parents), noise + intercept)
 
         return linear
 
