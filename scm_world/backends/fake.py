@@ -91,6 +91,9 @@ class FakeBackend(Backend):
         if body in trifinger.LINK_NAMES:
             index = trifinger.LINK_NAMES.index(body) % trifinger.LINKS_PER_FINGER
             return np.asarray(mass * np.array(trifinger.INERTIAL[index].per_mass))
+        hull = self._structure.hull(body)
+        if hull is not None:
+            return np.asarray(mass * np.array(hull.moments))
         squares = self._parameters[body, "size"] ** 2
         return np.asarray(mass / 12.0 * (squares.sum() - squares))
 

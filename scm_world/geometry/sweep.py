@@ -1,9 +1,10 @@
 """Which of many boxes and capsules intersect, in one compiled pass.
 
-Bodies are numbered: first the boxes, then the bodies made of capsules, then the floor (the plane
-z = 0) and the wall (see ``penetration``). Several capsules may belong to one body; the deepest
-counts. Every box is compared with everything; what a capsule is compared with besides the boxes
-is up to its flags.
+Bodies are numbered: first the boxes that can move, then the bodies made of capsules, then the
+boxes that cannot, then the floor (the plane z = 0) and the wall (see ``penetration``). Several
+capsules may belong to one body; the deepest counts. Every box that can move is compared with
+everything; what a capsule is compared with besides these is up to its flags. What cannot move is
+not compared with one another.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from scm_world.geometry.penetration import (
 from scm_world.geometry.rotations import rotation_kernel
 
 OTHERS, FLOOR, WALL = 1, 2, 4
-"""Flags: compare a capsule with those of other groups that have this flag; the floor; the wall."""
+"""Flags: compare a capsule with those of other groups that have this flag, and with the boxes that
+cannot move; with the floor; with the wall."""
 
 
 class Found(NamedTuple):
@@ -67,18 +69,28 @@ def _place_capsules(
 
 @njit(cache=True)
 def _sweep_boxes(
-    halves: Floats, centers: Floats, rotations: Floats, inner: float, height: float, table: Floats
+    halves: Floats,
+    centers: Floats,
+    rotations: Floats,
+    n_fixed: int,
+    inner: float,
+    height: float,
+    table: Floats,
 ) -> None:
-    """Compare the boxes with one another, the floor and the wall.
+    """Compare the boxes that can move with all boxes, the floor and the wall.
 
     The wall has no upper end for a box whose center is beyond it: that one has left the arena.
     """
     floor = len(table) - 2
-    for i in range(len(halves)):
+    n_movable = len(halves) - n_fixed
+    for i in range(n_movable):
         half, center, rotation = halves[i], centers[i], rotations[i]
         for j in range(i):
             depth = box_box_kernel(half, center, rotation, halves[j], centers[j], rotations[j])
             _deepen(table, i, j, depth)
+        for j in range(n_movable, len(halves)):
+            depth = box_box_kernel(half, center, rotation, halves[j], centers[j], rotations[j])
+            _deepen(table, i, floor - len(halves) + j, depth)
         _deepen(table, i, floor, box_floor_kernel(half, center, rotation))
         top = math.inf if math.hypot(center[0], center[1]) > inner else height
         _deepen(table, i, floor + 1, box_wall_kernel(half, center, rotation, inner, top))
@@ -139,11 +151,13 @@ def sweep_kernel(
     members: Integers,
     frame_origins: Floats,
     frame_orientations: Floats,
+    n_fixed: int,
     wall: tuple[float, float],
     tolerance: float,
 ) -> tuple[Integers, Floats]:
     """Find all intersections; see ``sweep``, which names the result."""
     n_boxes, n_bodies = len(sizes), 0
+    n_movable = n_boxes - n_fixed
     for c in range(len(members)):
         n_bodies = max(n_bodies, members[c, 1] + 1)
     table = np.full((n_boxes + n_bodies + 2, n_boxes + n_bodies + 2), -np.inf)
@@ -152,14 +166,17 @@ def sweep_kernel(
         rotation_kernel(orientations[i], rotations[i])
     ends = np.empty((len(capsules), 2, 3))
     _place_capsules(capsules, members, frame_origins, frame_orientations, ends)
-    _sweep_boxes(halves, positions, rotations, wall[0], wall[1], table)
-    _sweep_capsules(capsules, members, ends, n_boxes, wall[0], wall[1], table)
+    _sweep_boxes(halves, positions, rotations, n_fixed, wall[0], wall[1], table)
+    _sweep_capsules(capsules, members, ends, n_movable, wall[0], wall[1], table)
     for i in range(n_boxes):
+        number = i if i < n_movable else n_bodies + i
         for c in range(len(capsules)):
+            if i >= n_movable and not members[c, 3] & OTHERS:
+                continue
             depth = box_capsule_kernel(
                 halves[i], positions[i], rotations[i], ends[c, 0], ends[c, 1], capsules[c, 6]
             )
-            _deepen(table, i, n_boxes + members[c, 1], depth)
+            _deepen(table, number, n_movable + members[c, 1], depth)
     return _select(table, tolerance)
 
 
@@ -172,6 +189,7 @@ def sweep(
     frame_origins: Floats,
     frame_orientations: Floats,
     *,
+    n_fixed: int,
     wall: tuple[float, float],
     tolerance: float,
 ) -> Found:
@@ -180,7 +198,7 @@ def sweep(
     The arrays must be writable and contiguous: the kernel is compiled for nothing else.
 
     Args:
-        sizes: Full edge lengths of the boxes, shape (n, 3) [m].
+        sizes: Full edge lengths of the boxes, those last that cannot move, shape (n, 3) [m].
         positions: Their centers, shape (n, 3) [m].
         orientations: Their quaternions (x, y, z, w), shape (n, 4).
         capsules: Start, end and radius in a frame, shape (m, 7) [m].
@@ -188,6 +206,7 @@ def sweep(
             and its flags, shape (m, 4).
         frame_origins: Shape (k, 3) [m].
         frame_orientations: Quaternions (x, y, z, w), shape (k, 4).
+        n_fixed: How many boxes cannot move.
         wall: Inner radius and height [m].
         tolerance: Only deeper intersections are found [m].
 
@@ -203,6 +222,7 @@ def sweep(
             members,
             frame_origins,
             frame_orientations,
+            n_fixed,
             wall,
             tolerance,
         )

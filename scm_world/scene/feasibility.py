@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import final
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.geometry.arrays import compact, rows
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, sweep
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
@@ -34,7 +36,7 @@ class Overlap:
     """Two bodies in one place.
 
     Attributes:
-        bodies: Their names: blocks first, then links, ``"floor"`` and ``"stage"`` last.
+        bodies: Their names: blocks first, then links, obstacles, ``"floor"`` and ``"stage"``.
         depth: How deep they lie in one another [m]; see ``scm_world.geometry.penetration``.
     """
 
@@ -69,6 +71,11 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     another; both with the floor; the tips with the ring, as in the engines. A block whose center
     is outside the arena lies in the stage (beyond the ring, at any height) or in the floor (below
     it). Links of the same finger, and the upper links, cannot collide with anything but blocks.
+    Obstacles cannot move, so that they are not compared with one another, the floor or the ring.
+
+    A block that is a hull counts as the box around it, in its own frame: it may be reported where
+    only its box is in something, and never goes unreported. The floor and the inner radius of
+    the ring are compared with its corners.
 
     Args:
         scene: With complete parameters.
@@ -86,21 +93,56 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
         >>> print(*overlaps(scene, tolerance=1e-4))
         'tool_block' lies 2.5 mm deep in 'floor'
     """
-    blocks, state = scene.structure.blocks, scene.state
-    sizes = rows([scene.parameters[block, "size"] for block in blocks], 3)
+    structure = scene.structure
     height = float(scene.parameters["robot", "height"])
     found = sweep(
-        sizes,
-        compact(state.positions),
-        compact(state.orientations),
+        *_boxes(scene),
         _CAPSULES,
         _MEMBERS,
-        *link_frames(state.joint_positions, height),
+        *link_frames(scene.state.joint_positions, height),
+        n_fixed=len(structure.obstacles),
         wall=_WALL,
         tolerance=float(tolerance),
     )
     if not len(found.depths):
         return ()
-    names = (*blocks, *trifinger.LINK_NAMES, "floor", "stage")
+    names = (*structure.blocks, *trifinger.LINK_NAMES, *structure.obstacles, "floor", "stage")
     pairs = zip(found.pairs.tolist(), found.depths.tolist(), strict=True)
-    return tuple(Overlap((names[i], names[j]), depth) for (i, j), depth in pairs)
+    result = (Overlap((names[i], names[j]), depth) for (i, j), depth in pairs)
+    return tuple(_sharper(scene, result, tolerance) if structure.hulls else result)
+
+
+def _boxes(scene: Scene) -> tuple[Floats, Floats, Floats]:
+    """Gather sizes, centers and orientations of the boxes: blocks first, then obstacles."""
+    structure, parameters = scene.structure, scene.parameters
+    centers, orientations = compact(scene.state.positions), compact(scene.state.orientations)
+    sizes = {
+        name: parameters[name, "size"] for name in structure.blocks if not structure.hull(name)
+    }
+    for name, hull in structure.hulls:
+        corners, index = np.array(hull.vertices), structure.blocks.index(name)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        sizes[name] = high - low
+        centers[index] += 0.5 * rotation_matrix(orientations[index]) @ (low + high)
+    fixed = structure.obstacles
+    if fixed:
+        sizes |= {name: parameters[name, "size"] for name in fixed}
+        centers = np.vstack([centers, *(parameters[name, "position"] for name in fixed)])
+        turned = (parameters[name, "orientation"] for name in fixed)
+        orientations = np.vstack([orientations, *turned])
+    return rows([sizes[name] for name in (*structure.blocks, *fixed)], 3), centers, orientations
+
+
+def _sharper(scene: Scene, found: Iterable[Overlap], tolerance: float) -> Iterator[Overlap]:
+    """Compare the corners of hulls with the floor and the inner radius of the ring."""
+    for overlap in found:
+        name, other = overlap.bodies
+        hull, depth = scene.structure.hull(name), overlap.depth
+        if hull is not None and other in ("floor", "stage"):
+            pose = scene.state.blocks[scene.structure.blocks.index(name)]
+            corners = pose[:3] + np.array(hull.vertices) @ rotation_matrix(pose[3:7]).T
+            beyond = np.hypot(corners[:, 0], corners[:, 1]) - WALL_RADIUS
+            exact = -corners[:, 2] if other == "floor" else beyond
+            depth = min(depth, float(exact.max()))
+        if depth > tolerance:
+            yield Overlap(overlap.bodies, depth)

@@ -166,9 +166,9 @@ CONTROLLER = ("position_gains", "velocity_gains", "safety_damping", "torque_limi
 
 def controller_spec(parameters: Parameters) -> ControllerSpec:
     """Read the joint controller from the parameters of a scene."""
-    numbers = [parameters["controller", name].tolist() for name in CONTROLLER]
-    kp, kd, safety, limit = (tuple(n) if isinstance(n, list) else n for n in numbers)
-    return ControllerSpec(kp, kd, safety, limit)
+    *gains, limit = (parameters["controller", name] for name in CONTROLLER)
+    kp, kd, safety = (tuple(gain.tolist()) for gain in gains)
+    return ControllerSpec(kp, kd, safety, float(limit))
 
 
 def default_parameters(structure: Structure) -> dict[ParameterKey, Floats]:

@@ -11,8 +11,8 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend, make_backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.entities import ACTUATOR_NOISE, CONTROL_INDEX
-from scm_world.errors import ActionError, NotReset, SnapshotMismatch
+from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX
+from scm_world.errors import NotReset, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, Moment
 from scm_world.scene import (
     PhysicalState,
@@ -20,10 +20,11 @@ from scm_world.scene import (
 )
 from scm_world.scene.kinematics import clip_kernel, inverse_kernel
 from scm_world.tasks import Task, make_task
-from scm_world.variables import Draw, Noise, Normal
+from scm_world.variables import Draw, Noise
 from scm_world.variables.catalogue import PRESET
 from scm_world.variables.kinds import SpaceName
 from scm_world.world.audit import Audit
+from scm_world.world.commands import clipped, disturbed
 from scm_world.world.commit import commit, difference, refuse_overlaps
 from scm_world.world.declaration import Declaration, Options
 from scm_world.world.declared import Declared
@@ -46,6 +47,8 @@ class World(Declared):
         frame_skip: Length of a control step in units of 4 ms, whatever the preset.
         max_episode_length: In control steps; the task's own length if None.
         conventions: ``"scm_world"``, or ``"causal_world"`` for the predecessor's.
+        variables_space: The space that every target of an intervention must lie in, unless ``do``
+            is told another one: ``"A"``, ``"B"`` or ``"A|B"``.
 
     Raises:
         UnknownOption: One of the names does not exist.
@@ -72,7 +75,11 @@ class World(Declared):
         frame_skip: int = 10,
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
+        variables_space: SpaceName | None = None,
     ) -> None:
+        if variables_space not in (None, "A", "B", "A|B"):
+            raise UnknownOption("variables_space", variables_space, ("A", "B", "A|B"))
+        self.variables_space = variables_space
         self.options = Options.checked(
             preset_name=preset,
             action_mode=action_mode,
@@ -83,6 +90,7 @@ class World(Declared):
         made = make_task(task) if isinstance(task, str) else task
         self.family = Family(made, self.options)
         self._mode = self.options.mode
+        self._action_unit = ACTIONS[action_mode][0]
         self.backend = make_backend(backend) if isinstance(backend, str) else backend
         self._started = False
         self.noise = Noise(0)
@@ -231,7 +239,9 @@ class World(Declared):
         self._readouts.remember()
         self._now["action"] = command
         if self._noisy:
-            command = self._disturbed(command)
+            bounds = self.declaration.action_bounds
+            noise = float(self._now[ACTUATOR_NOISE])
+            command = disturbed(command, *bounds, noise, self.moment(self._index))
         if self.action_mode == "end_effector_positions":
             height = float(self._now["robot_height"])
             joints = self._state.joint_positions
@@ -244,31 +254,14 @@ class World(Declared):
         self._readouts.stale()
         self._instant = None
 
-    def _disturbed(self, command: Floats) -> Floats:
-        """Add the noise of the actuators to a command."""
-        low, high = self.action_low, self.action_high
-        drawn = self.moment(self._index).draw(Normal(), ACTUATOR_NOISE, (9,), {})
-        return command + float(self._now[ACTUATOR_NOISE]) * (high - low) / 2.0 * drawn
-
     def _checked(self, action: ArrayLike) -> Floats:
-        try:
-            given = np.ascontiguousarray(action, dtype=np.float64)
-        except (TypeError, ValueError):  # text, or a ragged list
-            given = np.empty(0)
-        command = np.empty(9)
-        if given.shape != (9,) or not clip_kernel(
-            given, self.action_low, self.action_high, command
-        ):
-            raise ActionError(
-                f"an action is 9 finite numbers [{self.model.declared('action').unit}], "
-                f"got {action!r}",
-                action,
-            )
+        low, high = self.declaration.action_bounds
+        command = clipped(action, low, high, self._action_unit)
         if self._action_is_held:
             known = {**self._now, "action": command}
             moment = self.moment(self._index)
             held = self._held.solve(known, moment=moment, only=("action",))["action"]
-            clip_kernel(np.array(held), self.action_low, self.action_high, command)
+            clip_kernel(np.array(held), low, high, command)
         return command
 
     # --- intervening --------------------------------------------------------------------------
@@ -281,7 +274,8 @@ class World(Declared):
 
         Args:
             request: Values, ``Shift``, ``Scale`` or ``Draw`` by name, dotted or nested.
-            space: If given, every target must lie in this space: ``"A"``, ``"B"`` or ``"A|B"``.
+            space: If given, every target must lie in this space: ``"A"``, ``"B"`` or ``"A|B"``;
+                ``variables_space`` of the world if None.
 
         Returns:
             What was requested, applied and read back, and what followed.
@@ -292,7 +286,7 @@ class World(Declared):
         """
         self._require_episode()
         instant = self._instant or self._present()
-        proposal = propose(self, instant, request, space)
+        proposal = propose(self, instant, request, space or self.variables_space)
         change = difference(self, proposal)
         refuse_overlaps(self, instant, proposal, change, request)
         audit, self._instant = commit(self, instant, proposal, change, request)

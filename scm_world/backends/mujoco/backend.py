@@ -14,8 +14,9 @@ from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
 from scm_world.backends.mujoco.contacts import Touches, touches
 from scm_world.backends.mujoco.model import compiled, shape_owners
-from scm_world.backends.mujoco.parameters import Slot, couple, slots
+from scm_world.backends.mujoco.parameters import couple, slots
 from scm_world.backends.mujoco.servos import steer
+from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.state import (
     Instant,
     finite,

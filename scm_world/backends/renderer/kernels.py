@@ -20,6 +20,7 @@ from scm_world.backends.renderer.rays import Hit, hit_ball, hit_box, hit_capsule
 Depths = NDArray[np.float32]
 Owners = NDArray[np.int32]
 Colors = NDArray[np.uint8]
+Triple = tuple[float, float, float]
 
 EDGE = 0.06  # how wide the edge of a silhouette is, in halves of its size
 SHARP = 0.9  # the cosine between the normals of two sides below which they meet in an edge
@@ -100,14 +101,23 @@ def _to_body(bodies: Bodies, n: int, rays: Floats, scale: Floats) -> Floats:
 
 
 @njit(cache=True, error_model="numpy")
-def _dot(a: Floats, b: Floats, axes: int) -> float:
-    """Multiply the first two or three components of vectors."""
-    product = a[0] * b[0] + a[1] * b[1]
-    return float(product if axes == 2 else product + a[2] * b[2])
+def _ray(rays: Floats, row: int, u: float, v: float) -> Triple:
+    """Give the origin (row 0) or the direction (row 3) of the ray of a pixel."""
+    return (
+        rays[row, 0] + u * rays[row + 1, 0] + v * rays[row + 2, 0],
+        rays[row, 1] + u * rays[row + 1, 1] + v * rays[row + 2, 1],
+        rays[row, 2] + u * rays[row + 1, 2] + v * rays[row + 2, 2],
+    )
 
 
 @njit(cache=True, error_model="numpy")
-def _round_span(rays: Floats, v: int, axes: int, left: int, right: int) -> tuple[int, int]:
+def _dot(a: Triple, b: Triple, third: float) -> float:
+    """Multiply vectors; the third components count only as much as ``third``, 0 or 1."""
+    return a[0] * b[0] + a[1] * b[1] + third * a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tuple[int, int]:
     """Bound the columns of a row whose rays can meet a ball or an endless cylinder of radius 1.
 
     The discriminant of the intersection is a quadratic in the column. One more column on either
@@ -116,17 +126,16 @@ def _round_span(rays: Floats, v: int, axes: int, left: int, right: int) -> tuple
     Args:
         rays: In the frame of the body, shape (6, 3).
         v: The row.
-        axes: 3 for a ball, 2 for a cylinder along z.
+        third: 1 for a ball, 0 for a cylinder along z.
         left: First column of the rectangle.
         right: Last column of the rectangle plus one.
     """
-    o, d = rays[0] + v * rays[2], rays[3] + v * rays[5]
-    step_o, step_d = rays[1], rays[4]
-    a0, a1 = _dot(d, d, axes), 2.0 * _dot(d, step_d, axes)
-    a2 = _dot(step_d, step_d, axes)
-    b0, b1 = _dot(o, d, axes), _dot(o, step_d, axes) + _dot(step_o, d, axes)
-    c0, c1 = _dot(o, o, axes) - 1.0, 2.0 * _dot(o, step_o, axes)
-    c2 = _dot(step_o, step_o, axes)
+    o, d = _ray(rays, 0, 0.0, v), _ray(rays, 3, 0.0, v)
+    step_o, step_d = (rays[1, 0], rays[1, 1], rays[1, 2]), (rays[4, 0], rays[4, 1], rays[4, 2])
+    a0, a1, a2 = _dot(d, d, third), 2.0 * _dot(d, step_d, third), _dot(step_d, step_d, third)
+    b0, b1 = _dot(o, d, third), _dot(o, step_d, third) + _dot(step_o, d, third)
+    c0, c1 = _dot(o, o, third) - 1.0, 2.0 * _dot(o, step_o, third)
+    c2 = _dot(step_o, step_o, third)
     q0, q1 = b0 * b0 - a0 * c0, 2.0 * b0 * b1 - a0 * c1 - a1 * c0
     q2 = b1 * b1 - a0 * c2 - a1 * c1 - a2 * c0
     if q2 >= 0.0:
@@ -143,9 +152,9 @@ def _round_span(rays: Floats, v: int, axes: int, left: int, right: int) -> tuple
 def _span(shape: int, rays: Floats, v: int, left: int, right: int) -> tuple[int, int]:
     """Bound the columns of a row that a body can cover, within those of its rectangle."""
     if shape == CAPSULE:
-        return _round_span(rays, v, 2, left, right)
+        return _round_span(rays, v, 0.0, left, right)
     if shape == ELLIPSOID:
-        return _round_span(rays, v, 3, left, right)
+        return _round_span(rays, v, 1.0, left, right)
     return left, right
 
 
@@ -162,9 +171,7 @@ def brightness(cosine: float, ambient: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _opacity(
-    shape: int, facets: Floats, point: tuple[float, float, float], n: tuple[float, float, float]
-) -> float:
+def _opacity(shape: int, facets: Floats, point: Triple, n: Triple) -> float:
     """Give silhouettes of boxes and hulls visible edges: twice as opaque where sides meet.
 
     The point is on the cube from -1 to 1, or on a hull; ``n`` is the normal there.
@@ -196,7 +203,7 @@ def _scale(bodies: Bodies, n: int) -> tuple[Floats, float]:
 
 
 @njit(cache=True, error_model="numpy")
-def _turned(rotation: Floats, vector: Floats) -> tuple[float, float, float]:
+def _turned(rotation: Floats, vector: Floats) -> Triple:
     """Express a direction of the world in the frame of a body."""
     x = rotation[0, 0] * vector[0] + rotation[1, 0] * vector[1] + rotation[2, 0] * vector[2]
     y = rotation[0, 1] * vector[0] + rotation[1, 1] * vector[1] + rotation[2, 1] * vector[2]
@@ -205,9 +212,7 @@ def _turned(rotation: Floats, vector: Floats) -> tuple[float, float, float]:
 
 
 @njit(cache=True, error_model="numpy")
-def _cosine(
-    shape: int, n: tuple[float, float, float], scale: Floats, lamp: tuple[float, float, float]
-) -> float:
+def _cosine(shape: int, n: Triple, scale: Floats, lamp: Triple) -> float:
     """Give the cosine between a normal and the light, both in the frame of the body.
 
     The normal of a scaled ball, divided by the scale, is normal to the ellipsoid; those of
@@ -216,7 +221,7 @@ def _cosine(
     if shape != ELLIPSOID:
         return n[0] * lamp[0] + n[1] * lamp[1] + n[2] * lamp[2]
     x, y, z = n[0] / scale[0], n[1] / scale[1], n[2] / scale[2]
-    product = x * lamp[0] + y * lamp[1] + z * lamp[2]
+    product: float = x * lamp[0] + y * lamp[1] + z * lamp[2]
     return product / math.sqrt(x * x + y * y + z * z)
 
 
@@ -225,8 +230,8 @@ def _meet(
     shape: int,
     segment: float,
     facets: Floats,
-    o: tuple[float, float, float],
-    d: tuple[float, float, float],
+    o: Triple,
+    d: Triple,
     near: float,
 ) -> Hit:
     """Meet a body of any shape, in its own frame."""
@@ -240,9 +245,7 @@ def _meet(
 
 
 @njit(cache=True, error_model="numpy")
-def _paint(
-    rgb: Colors, v: int, u: int, color: tuple[float, float, float], light: float, paint: float
-) -> None:
+def _paint(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float) -> None:
     """Blend a color, 255 where it is full, with what a pixel shows."""
     if paint == 1.0:
         rgb[0, v, u] = byte(light * color[0])
@@ -253,16 +256,6 @@ def _paint(
     rgb[0, v, u] = byte(rest * rgb[0, v, u] + light * color[0])
     rgb[1, v, u] = byte(rest * rgb[1, v, u] + light * color[1])
     rgb[2, v, u] = byte(rest * rgb[2, v, u] + light * color[2])
-
-
-@njit(cache=True, error_model="numpy")
-def _ray(rays: Floats, row: int, u: int, v: int) -> tuple[float, float, float]:
-    """Give the origin (row 0) or the direction (row 3) of the ray of a pixel."""
-    return (
-        rays[row, 0] + u * rays[row + 1, 0] + v * rays[row + 2, 0],
-        rays[row, 1] + u * rays[row + 1, 1] + v * rays[row + 2, 1],
-        rays[row, 2] + u * rays[row + 1, 2] + v * rays[row + 2, 2],
-    )
 
 
 @njit(cache=True, error_model="numpy")
