@@ -108,8 +108,6 @@ class World(Declared):
         self._held = self.model
         self.structure = self.declaration.structure(self.model.solve(only=(PRESET,)))
 
-    # --- looking ------------------------------------------------------------------------------
-
     @property
     def graph(self) -> SCM:
         """The causal model as it is now, with the parameters that ``do`` holds."""
@@ -155,8 +153,6 @@ class World(Declared):
         """Describe the present for a picture, or for another engine."""
         self._require_episode()
         return self.describe(self._now, self._state.copy())
-
-    # --- running ------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, do: Mapping[str, Any] | None = None
@@ -264,8 +260,6 @@ class World(Declared):
             clip_kernel(np.array(held), low, high, command)
         return command
 
-    # --- intervening --------------------------------------------------------------------------
-
     def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.
 
@@ -351,8 +345,6 @@ class World(Declared):
     def current(self) -> tuple[Values, PhysicalState]:
         """Give the live values and the live state, for the parts of a ``do``."""
         return self._now, self._state
-
-    # --- going back ---------------------------------------------------------------------------
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything that decides how the world goes on. It can be pickled."""

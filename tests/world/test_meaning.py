@@ -20,18 +20,16 @@ from worlds import (
     shared,
 )
 
-from scm_world.entities import Composition
 from scm_world.entities.base import lowest_point
 from scm_world.errors import (
     Infeasible,
-    ModelError,
     OutOfBounds,
     OutOfSpace,
 )
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.scene import trifinger
-from scm_world.variables import Affine, Box, Draw, Scale, Shift, Variable
+from scm_world.variables import Affine, Box, Draw, Scale, Shift
 from scm_world.world import World
 
 # --- what is moved, and what is not --------------------------------------------------------------
@@ -344,20 +342,3 @@ def test_worlds_of_other_sizes_are_other_worlds() -> None:
     world = World(make_task("pushing", tool_block_mass=0.05), backend="fake")
     world.reset(seed=0)
     assert world["tool_block.mass"] == 0.05
-
-
-def test_randomness_that_would_be_ignored_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A world begins at defaults, so a variable that is declared as random is an error."""
-    honest = Composition.variables
-
-    def random_mass(self: Composition) -> tuple[Variable, ...]:
-        return tuple(
-            v.model_copy(update={"distribution": Box(0.01, 0.1)})
-            if v.name == "tool_block.mass"
-            else v
-            for v in honest(self)
-        )
-
-    monkeypatch.setattr(Composition, "variables", random_mass)
-    with pytest.raises(ModelError, match=r"tool_block\.mass"):
-        World("pushing", backend="fake")

@@ -273,11 +273,13 @@ def _draw_body(
     colored, owned = rgb.shape[1] > 0, solid and owners.shape[0] > 0
     lamp = _turned(bodies.rotations[n], light)
     rays = _to_body(bodies, n, view.rays, scale)
+    so, sd = (rays[1, 0], rays[1, 1], rays[1, 2]), (rays[4, 0], rays[4, 1], rays[4, 2])
     for v in range(top, bottom):
         start, stop = _span(shape, rays, v, left, right)
-        met = False
+        o0, d0, met = _ray(rays, 0, 0.0, v), _ray(rays, 3, 0.0, v), False
         for u in range(start, stop):
-            o, d = _ray(rays, 0, u, v), _ray(rays, 3, u, v)
+            o = (o0[0] + u * so[0], o0[1] + u * so[1], o0[2] + u * so[2])
+            d = (d0[0] + u * sd[0], d0[1] + u * sd[1], d0[2] + u * sd[2])
             t, nx, ny, nz = _meet(shape, segment, facets, o, d, view.near)
             if t == math.inf and met:
                 break  # solids are convex: the row will not meet it again
