@@ -1,4 +1,4 @@
-"""How pictures look: the light. Nothing physical depends on it."""
+"""How pictures look: light and cameras. Nothing physical depends on them."""
 
 from __future__ import annotations
 
@@ -8,19 +8,22 @@ from typing import final
 from scm_world._types import Values
 from scm_world.entities.base import Entity
 from scm_world.scene import Light
+from scm_world.scene.camera import CAMERAS, Camera, camera_from, published_poses
 from scm_world.variables import Box, Exogenous, Variable
+from scm_world.variables import catalogue as numbers
 
 _DEFAULT = Light()
+_NEAR, _FAR = 0.01, 0.03  # [m] how far a camera is moved in A and in B
 
 
 @final
 class Looks(Entity):
-    """The light."""
+    """The light and the three cameras."""
 
     name = "looks"
 
     def variables(self) -> Iterable[Variable]:
-        """Declare where the light comes from and how bright shade is."""
+        """Declare where the light comes from, how bright shade is, and what cameras see."""
         yield Exogenous(
             name="light_direction",
             shape=(3,),
@@ -38,8 +41,54 @@ class Looks(Entity):
             default=_DEFAULT.ambient,
             doc="Brightness of what the light does not reach; only pictures depend on it.",
         )
+        for camera in CAMERAS:
+            yield from self._camera(camera)
+
+    def _camera(self, camera: Camera) -> Iterable[Variable]:
+        name = f"camera_{camera.name}"
+        position, orientation = (pose.tolist() for pose in published_poses()[camera.name])
+        x, y, z = position
+        yield Exogenous(
+            name=f"{name}.position",
+            unit="m",
+            shape=(3,),
+            bounds=Box(-2.0, 2.0),
+            a=Box((x - _NEAR, y - _NEAR, z - _NEAR), (x + _NEAR, y + _NEAR, z + _NEAR)),
+            b=Box((x - _NEAR, y - _NEAR, z + _NEAR), (x + _NEAR, y + _NEAR, z + _FAR)),
+            default=tuple(position),
+            doc="Where the camera stands; only pictures depend on it.",
+        )
+        yield Exogenous(
+            name=f"{name}.orientation",
+            shape=(4,),
+            bounds=numbers.QUATERNION_BOUNDS,
+            default=tuple(orientation),
+            doc="Quaternion (x, y, z, w) of its axes right, down and forward.",
+        )
+        yield Exogenous(
+            name=f"{name}.field_of_view",
+            unit="deg",
+            bounds=Box(5.0, 150.0),
+            a=Box(50.0, 54.0),
+            b=Box(54.0, 60.0),
+            default=camera.field_of_view,
+            doc="Vertical opening angle; only pictures depend on it.",
+        )
 
     def light(self, values: Values) -> Light:
         """Describe the light."""
         x, y, z = values["light_direction"].tolist()
         return Light((x, y, z), float(values["light_ambient"]))
+
+
+def cameras(values: Values) -> tuple[Camera, ...]:
+    """Describe the three cameras, with pictures of 128 x 128 pixels."""
+    return tuple(
+        camera_from(
+            camera.name,
+            values[f"camera_{camera.name}.position"],
+            values[f"camera_{camera.name}.orientation"],
+            float(values[f"camera_{camera.name}.field_of_view"]),
+        )
+        for camera in CAMERAS
+    )

@@ -11,13 +11,14 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend, make_backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX
+from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX, cameras
 from scm_world.errors import NotReset, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, Moment
 from scm_world.scene import (
     PhysicalState,
     Scene,
 )
+from scm_world.scene.camera import Camera
 from scm_world.scene.kinematics import clip_kernel, inverse_kernel
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Noise
@@ -153,6 +154,11 @@ class World(Declared):
         """Describe the present for a picture, or for another engine."""
         self._require_episode()
         return self.describe(self._now, self._state.copy())
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Describe the three cameras of the robot as they are now."""
+        self._require_episode()
+        return cameras(self._now)
 
     def reset(
         self, *, seed: int | None = None, do: Mapping[str, Any] | None = None
