@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from operator import itemgetter
 from typing import Any, final
 
 import numpy as np
@@ -11,7 +12,8 @@ from scm_world._types import Value
 from scm_world.graph import SCM
 from scm_world.variables import Derived, Measured
 
-_Step = tuple[str, Callable[..., Any], tuple[tuple[dict[str, Value], str], ...]]
+_Step = tuple[str, Callable[..., Any], Callable[[dict[str, Value]], Any], bool]
+"""A variable, its function, what picks the arguments, and whether it is a single one."""
 
 
 @final
@@ -62,11 +64,9 @@ class Readouts:
 
     def _bind(self, name: str) -> _Step:
         variable: Any = self._model.declared(name)
-        arguments = tuple(
-            (self._now if parent.lag == 0 else self._before, parent.name)
-            for parent in variable.all_parents
-        )
-        return name, variable.mechanism.bind(), arguments
+        keys = [p.name if p.lag == 0 else _earlier(p.name) for p in variable.all_parents]
+        pick = itemgetter(*keys) if keys else _nothing
+        return name, variable.mechanism.bind(), pick, len(keys) == 1
 
     def evaluate(self, names: tuple[str, ...] | None = None) -> None:
         """Compute variables and whatever they need, into the present values.
@@ -79,8 +79,8 @@ class Readouts:
         if plan is None:
             plan = self._plans[wanted] = self._plan(wanted)
         now = self._now
-        for name, function, arguments in plan:
-            now[name] = function(*[source[parent] for source, parent in arguments])
+        for name, function, pick, single in plan:
+            now[name] = function(pick(now)) if single else function(*pick(now))
         self._fresh = True
 
     def stale(self) -> None:
@@ -100,13 +100,25 @@ class Readouts:
         self.forget()
         for name in self.lagged:
             if name in earlier:
-                self._before[name] = np.array(earlier[name])
+                self._keep(name, earlier[name])
 
     def forget(self) -> None:
         """Begin an episode: there is no earlier step, so the present stands in for it."""
         self.evaluate(self.lagged)
         for name in self.lagged:
-            self._before[name] = np.array(self._now[name])
+            self._keep(name, self._now[name])
+
+    def _keep(self, name: str, value: Value) -> None:
+        """Keep a value of one step ago, beside the present ones so that one look-up finds all."""
+        self._before[name] = self._now[_earlier(name)] = np.array(value)
+
+
+def _earlier(name: str) -> str:
+    return f"{name}, one step ago"
+
+
+def _nothing(now: dict[str, Value]) -> tuple[()]:
+    return ()
 
 
 def computed_order(model: SCM) -> tuple[str, ...]:
