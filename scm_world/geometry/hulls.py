@@ -23,6 +23,7 @@ MOST_VERTICES = 256
 FORMATS = ("obj", "stl")
 INSTALL = "pip install 'scm-world[mesh]'"
 THINNEST = 1e-6  # of the greatest extent: what is thinner has no volume
+ROUGHNESS = 3e-7  # of the greatest extent: what sticks out less is the rounding of a file
 SAME_NORMAL = 1e-5  # [rad] sides that differ by less are one side
 SAME_OFFSET = 1e-6  # of the greatest extent
 SAME_MOMENT = 1e-6  # of the greatest second moment: axes of equal ones can be chosen freely
@@ -226,7 +227,7 @@ def _wrap(cloud: Floats) -> Any:
     if thickness[2] <= THINNEST * thickness[0]:
         raise ModelError(["the points lie in one plane and have no volume"])
     try:
-        return ConvexHull(cloud)
+        return ConvexHull(cloud, qhull_options=f"Qt C-{ROUGHNESS}")
     except QhullError as error:
         raise ModelError([f"the points have no convex hull: {error}"]) from error
 
@@ -275,7 +276,7 @@ def _assemble(
     for normal, corners in sides:
         first, *fan = (number[corner] for corner in corners)
         faces += [(first, q, r) for q, r in pairwise(fan)]
-        planes.append([*normal, float(np.max(vertices[[first, *fan]] @ normal))])
+        planes.append([*normal, float(np.max(vertices @ normal))])
     _check_closed(faces)
     return vertices, np.array(faces, dtype=np.int64), np.array(planes)
 

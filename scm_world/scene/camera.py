@@ -107,19 +107,61 @@ class Camera:
         return np.stack([column, row, depth], axis=-1)
 
 
-def _published(
-    name: str, eye: Vector, orientation: tuple[float, float, float, float], *, original: bool
+def camera_from(
+    name: str,
+    position: ArrayLike,
+    orientation: ArrayLike,
+    field_of_view: float = 52.0,
+    width: int = 128,
+    height: int = 128,
 ) -> Camera:
-    """Read a camera of CausalWorld: its second axis points down and its third one forward."""
-    x, y, z, w = np.divide(orientation, np.linalg.norm(orientation)).tolist()
+    """Make a camera from plain numbers, in the convention of the published cameras.
+
+    The first axis of the camera points to the right of the picture, the second one down and the
+    third one forward. With the poses of ``published_poses`` it makes the cameras of ``CAMERAS``.
+
+    Args:
+        name: What the camera is called.
+        position: Where it stands, z from the table top, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w) of any length, shape (4,).
+        field_of_view: Vertical opening angle [deg].
+        width: Of the picture [pixels].
+        height: Of the picture [pixels].
+
+    Raises:
+        ValueError: The quaternion is zero or not finite, or a shape is wrong.
+
+    Example:
+        >>> down = camera_from("top", [0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
+        >>> down.target, down.up
+        ((0.0, 0.0, 0.0), (-0.0, 1.0, -0.0))
+    """
+    x, y, z = np.asarray(position, dtype=np.float64).tolist()
+    down, forward = _down_and_forward(orientation)
+    target = (x + forward[0], y + forward[1], z + forward[2])
+    up = (-down[0], -down[1], -down[2])
+    return Camera(name, (x, y, z), target, up, float(field_of_view), int(width), int(height))
+
+
+def _down_and_forward(orientation: ArrayLike) -> tuple[Vector, Vector]:
+    """Read the second and the third axis of a camera from its quaternion."""
+    length = float(np.linalg.norm(orientation))
+    if not (length > 0.0 and math.isfinite(length)):
+        raise ValueError(f"orientation: expected a quaternion of some length, got {orientation!r}")
+    x, y, z, w = np.divide(orientation, length).tolist()
     down = (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
     forward = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
-    shifted = (eye[0], eye[1], eye[2] - TABLE_OFFSET)
-    if original:
-        point = (forward[0], forward[1], forward[2] - TABLE_OFFSET)
-        return Camera(name, shifted, point, down)
-    target = (shifted[0] + forward[0], shifted[1] + forward[1], shifted[2] + forward[2])
-    return Camera(name, shifted, target, (-down[0], -down[1], -down[2]))
+    return down, forward
+
+
+def _above_table(eye: Vector) -> Vector:
+    return eye[0], eye[1], eye[2] - TABLE_OFFSET
+
+
+def _original(name: str, eye: Vector, orientation: tuple[float, float, float, float]) -> Camera:
+    """Make a camera as CausalWorld does, whose mistakes are those of ``ORIGINAL_CAMERAS``."""
+    down, forward = _down_and_forward(orientation)
+    return Camera(name, _above_table(eye), _above_table(forward), down)
 
 
 _PUBLISHED: tuple[tuple[str, Vector, tuple[float, float, float, float]], ...] = (
@@ -128,14 +170,33 @@ _PUBLISHED: tuple[tuple[str, Vector, tuple[float, float, float, float]], ...] = 
     ("300", (-0.2470, 0.2513, 0.50), (-0.3633, 0.8686, -0.3141, 0.1220)),
 )
 
-CAMERAS = tuple(_published(*row, original=False) for row in _PUBLISHED)
+
+def published_poses() -> dict[str, tuple[Floats, Floats]]:
+    """Give the poses of ``CAMERAS`` as ``camera_from`` takes them.
+
+    Returns:
+        By name: the position, z from the table top, shape (3,) [m], and the unit quaternion
+        (x, y, z, w), shape (4,).
+
+    Example:
+        >>> position, orientation = published_poses()["60"]
+        >>> camera_from("60", position, orientation) == CAMERAS[0]
+        True
+    """
+    return {
+        name: (np.array(_above_table(eye)), np.divide(turn, np.linalg.norm(turn)))
+        for name, eye, turn in _PUBLISHED
+    }
+
+
+CAMERAS = tuple(camera_from(name, *pose) for name, pose in published_poses().items())
 """The three cameras of the real robot, upright and looking along their optical axes.
 
 Source:
     CausalWorld 1.2, ``envs/robot/camera.py``: positions, orientations, 52°, 128 x 128.
 """
 
-ORIGINAL_CAMERAS = tuple(_published(*row, original=True) for row in _PUBLISHED)
+ORIGINAL_CAMERAS = tuple(_original(*row) for row in _PUBLISHED)
 """The same cameras as CausalWorld 1.2 realises them.
 
 It takes the direction of the optical axis for a point to look at, so that its views are off by

@@ -10,6 +10,8 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.geometry.arrays import compact, rows
+from scm_world.geometry.convex import Convex, placed, sides_depth
+from scm_world.geometry.hulls import box_hull
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, sweep
 from scm_world.scene import trifinger
@@ -73,9 +75,9 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     it). Links of the same finger, and the upper links, cannot collide with anything but blocks.
     Obstacles cannot move, so that they are not compared with one another, the floor or the ring.
 
-    A block that is a hull counts as the box around it, in its own frame: it may be reported where
-    only its box is in something, and never goes unreported. The floor and the inner radius of
-    the ring are compared with its corners.
+    A block that is a hull is judged by its corners, against the floor and the inner radius of the
+    ring, and by the sides of both bodies elsewhere (see ``sides_depth``): its depth is never
+    underestimated, and it may be reported where only two edges pass one another closely.
 
     Args:
         scene: With complete parameters.
@@ -134,15 +136,44 @@ def _boxes(scene: Scene) -> tuple[Floats, Floats, Floats]:
 
 
 def _sharper(scene: Scene, found: Iterable[Overlap], tolerance: float) -> Iterator[Overlap]:
-    """Compare the corners of hulls with the floor and the inner radius of the ring."""
+    """Judge hulls by their shapes, of which the boxes around them are only bounds."""
+    hulls = {name for name, _ in scene.structure.hulls}
+    links: dict[str, list[Convex]] = {}
     for overlap in found:
-        name, other = overlap.bodies
-        hull, depth = scene.structure.hull(name), overlap.depth
-        if hull is not None and other in ("floor", "stage"):
-            pose = scene.state.blocks[scene.structure.blocks.index(name)]
-            corners = pose[:3] + np.array(hull.vertices) @ rotation_matrix(pose[3:7]).T
-            beyond = np.hypot(corners[:, 0], corners[:, 1]) - WALL_RADIUS
-            exact = -corners[:, 2] if other == "floor" else beyond
-            depth = min(depth, float(exact.max()))
+        first, second = overlap.bodies
+        depth = overlap.depth
+        if hulls & {first, second}:
+            if second in trifinger.LINK_NAMES:
+                links = links or _links(scene)
+                deep = max(sides_depth(_solid(scene, first), part) for part in links[second])
+            elif second in ("floor", "stage"):
+                corners = _solid(scene, first).corners
+                beyond = np.hypot(corners[:, 0], corners[:, 1]) - WALL_RADIUS
+                deep = float((-corners[:, 2] if second == "floor" else beyond).max())
+            else:
+                deep = sides_depth(_solid(scene, first), _solid(scene, second))
+            depth = min(depth, deep)
         if depth > tolerance:
             yield Overlap(overlap.bodies, depth)
+
+
+def _solid(scene: Scene, name: str) -> Convex:
+    """Give a block or an obstacle its flat sides."""
+    structure, parameters = scene.structure, scene.parameters
+    hull = structure.hull(name) or box_hull(parameters[name, "size"])
+    if name in structure.obstacles:
+        return placed(hull, parameters[name, "position"], parameters[name, "orientation"])
+    pose = scene.state.blocks[structure.blocks.index(name)]
+    return placed(hull, pose[:3], pose[3:7])
+
+
+def _links(scene: Scene) -> dict[str, list[Convex]]:
+    """Put the capsules of all links into the world."""
+    height = float(scene.parameters["robot", "height"])
+    origins, orientations = link_frames(scene.state.joint_positions, height)
+    links: dict[str, list[Convex]] = {}
+    for capsule, (frame, body, *_) in zip(_CAPSULES, _MEMBERS.tolist(), strict=True):
+        ends = origins[frame] + capsule[:6].reshape(2, 3) @ rotation_matrix(orientations[frame]).T
+        part = Convex(ends, np.empty((0, 3)), float(capsule[6]))
+        links.setdefault(trifinger.LINK_NAMES[body], []).append(part)
+    return links

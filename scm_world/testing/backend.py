@@ -24,11 +24,14 @@ from scm_world.scene import trifinger
 from scm_world.scene.controller import ControlMode
 from scm_world.scene.difference import Difference
 from scm_world.scene.scene import (
+    Parameters,
     Scene,
     Structure,
+    controller_spec,
     default_scene,
 )
 from scm_world.scene.state import PhysicalState
+from scm_world.testing.effects import EffectConformance
 from scm_world.testing.parameters import ParameterConformance
 from scm_world.testing.scenes import (
     SEED,
@@ -44,7 +47,7 @@ from scm_world.testing.scenes import (
 from scm_world.testing.states import StateConformance
 
 
-class BackendConformance(ParameterConformance, StateConformance):
+class BackendConformance(ParameterConformance, StateConformance, EffectConformance):
     """Every sentence of ``Backend``, as a test.
 
     Attributes:
@@ -118,24 +121,33 @@ class BackendConformance(ParameterConformance, StateConformance):
         """The torque of one physics step is the specified function of the state before it."""
         if not backend.capabilities.physics:
             return
+        self.check_control_law(backend, mode, scene.parameters)
+        keys = [key for key in scene.parameters if key[0] == "controller"]
+        other = {key: other_value(key, scene.parameters[key]) for key in keys}
+        backend.apply(Difference(parameters=other))
+        self.check_control_law(backend, mode, other)
+
+    def check_control_law(
+        self, backend: Backend, mode: ControlMode, parameters: Parameters
+    ) -> None:
+        """Compare many single steps with the law that these parameters specify."""
         generator = np.random.default_rng(5)
+        spec = controller_spec(parameters)
         saturated = 0
         for _ in range(100):
             state = backend.state()
             state.joint_positions[:] = trifinger.REST + generator.uniform(-0.5, 0.5, 9)
             state.joint_velocities[:] = generator.normal(size=9, scale=3.0)
-            state.positions[:, 2] = 2.0 + np.arange(3)
+            state.positions[:, 2] = 2.0 + np.arange(state.n_blocks)
             command = state.joint_positions + generator.uniform(-0.1, 0.1, 9)
             if mode is ControlMode.JOINT_TORQUES:
                 command = generator.uniform(-0.5, 0.5, 9)
-            expected = scene.structure.controller.torques(
-                mode, command, state.joint_positions, state.joint_velocities
-            )
+            expected = spec.torques(mode, command, state.joint_positions, state.joint_velocities)
             backend.apply(Difference(state=state))
             backend.step(mode, command, 1)
             applied = backend.state().joint_torques
             np.testing.assert_allclose(applied, expected, rtol=0, atol=1e-12)
-            saturated += int((np.abs(expected) == scene.structure.controller.limit).sum())
+            saturated += int((np.abs(expected) == spec.limit).sum())
         assert 0 < saturated < 900
 
     def test_contacts_carry_the_weight(self, scene: Scene) -> None:
@@ -158,8 +170,9 @@ class BackendConformance(ParameterConformance, StateConformance):
             assert abs(contact.depth) < 1e-3
 
     def test_contacts_name_bodies(self, backend: Backend, scene: Scene) -> None:
-        """Contacts name blocks, links, the floor and the stage; normals have length one."""
-        known = {*scene.structure.blocks, *trifinger.LINK_NAMES, "floor", "stage"}
+        """Contacts name blocks, links, obstacles, floor and stage; normals have length one."""
+        structure = scene.structure
+        known = {*structure.blocks, *trifinger.LINK_NAMES, *structure.obstacles, "floor", "stage"}
         seen: set[str] = set()
         for _ in range(300):
             backend.step(ControlMode.JOINT_POSITIONS, np.array(trifinger.REST), 1)
@@ -168,7 +181,7 @@ class BackendConformance(ParameterConformance, StateConformance):
                 assert np.linalg.norm(contact.normal) == pytest.approx(1.0)
         assert seen <= known
         if backend.capabilities.physics:
-            assert {"near", "falling", "sliding", "floor", "stage"} <= seen
+            assert {*structure.blocks, *structure.obstacles, "floor", "stage"} <= seen
 
     def test_contacts_are_those_of_the_last_step(self, backend: Backend) -> None:
         """Moving a block away does not change what touched in the last step."""

@@ -14,6 +14,7 @@ from scm_world.scene.scene import (
 )
 from scm_world.scene.state import PhysicalState
 from scm_world.testing.scenes import (
+    STONE,
     apart_scene,
     changed_states,
     check_parameters,
@@ -102,7 +103,7 @@ class ParameterConformance(Suite):
 
         def with_detours() -> None:
             for key in sorted(other, reverse=True):
-                backend.apply(Difference(parameters={key: other[key] * 1.1}))
+                backend.apply(Difference(parameters={key: other_value(key, other[key])}))
                 backend.apply(Difference(parameters={key: other[key]}))
             for _, detour in changed_states(state):
                 backend.apply(Difference(state=detour))
@@ -168,7 +169,7 @@ class ParameterConformance(Suite):
             for key, value in scene.parameters.items():
                 if key[0] in ("world", "floor", "stage"):
                     continue
-                untouched = others if key[0] == "apart" else alone
+                untouched = others if key[0] in ("apart", "ledge") else alone
                 backend.restore(start)
                 backend.apply(Difference(parameters={key: other_value(key, value)}))
                 if not same(play(backend, 40)[:, untouched], expected[:, untouched]):
@@ -192,13 +193,15 @@ class ParameterConformance(Suite):
             np.testing.assert_allclose(play(backend, 40), others, rtol=0, atol=1e-7)
 
     def test_inertia_follows_mass_and_size(self, backend: Backend) -> None:
-        """A block is a solid box, and the inertia of a link scales with its mass."""
+        """A block is a solid body, and the inertia of a link scales with its mass."""
         mass, size = np.array(0.04), np.array([0.03, 0.05, 0.08])
         link = trifinger.link_name("120", 2)
         changes = {("near", "mass"): mass, ("near", "size"): size, (link, "mass"): np.array(0.3)}
-        backend.apply(Difference(parameters=changes))
+        backend.apply(Difference(parameters={**changes, ("stone", "mass"): mass}))
         squares = size**2
         expected = mass / 12.0 * (squares.sum() - squares)
         np.testing.assert_allclose(backend.inertia("near"), expected, rtol=1e-9)
         per_mass = np.array(trifinger.INERTIAL[2].per_mass)
         np.testing.assert_allclose(backend.inertia(link), 0.3 * per_mass, rtol=1e-6)
+        moments = mass * np.array(STONE.moments)
+        np.testing.assert_allclose(backend.inertia("stone"), moments, rtol=1e-9)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
+from itertools import product
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend
+from scm_world.geometry.hulls import Hull
+from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
 from scm_world.scene import trifinger
 from scm_world.scene.controller import ControlMode
-from scm_world.scene.presets import FAST, Preset
+from scm_world.scene.presets import FAST, PRECISE, Preset
 from scm_world.scene.scene import (
+    CONTROLLER,
     ParameterKey,
     Parameters,
     Scene,
@@ -27,28 +32,64 @@ LONG = 250  # control steps
 SEED = 20_26
 
 
+def octahedron(a: float, b: float, c: float) -> Hull:
+    """Make a hull whose six corners lie on its axes, at these distances from the center [m].
+
+    Example:
+        >>> round(octahedron(1.0, 1.0, 1.0).volume, 3)
+        1.333
+    """
+    corners, planes, faces = (a, b, c), [], []
+    for signs in product((1.0, -1.0), repeat=3):
+        normal = [sign / corner for sign, corner in zip(signs, corners, strict=True)]
+        length = math.hypot(*normal)
+        planes.append((normal[0] / length, normal[1] / length, normal[2] / length, 1.0 / length))
+        i, j, k = (axis + (0 if sign > 0.0 else 3) for axis, sign in enumerate(signs))
+        faces.append((i, j, k) if math.prod(signs) > 0.0 else (i, k, j))
+    vertices = ((a, 0.0, 0.0), (0.0, b, 0.0), (0.0, 0.0, c))
+    opposite = tuple((-x, -y, -z) for x, y, z in vertices)
+    moments = ((b * b + c * c) / 10.0, (a * a + c * c) / 10.0, (a * a + b * b) / 10.0)
+    volume = 4.0 / 3.0 * a * b * c
+    return Hull((*vertices, *opposite), tuple(faces), tuple(planes), volume, moments)
+
+
+STONE = octahedron(0.03, 0.035, 0.025)
+
+
 def busy_scene(preset: Preset = FAST) -> Scene:
     """Make a scene in which everything touches something sooner or later.
 
-    One block stands before a finger, one falls askew on it, one slides into the ring.
+    One block stands before a finger, one falls askew on it, one slides into the ring, and a stone
+    falls on a ledge.
     """
-    scene = default_scene(Structure(("near", "falling", "sliding"), preset=preset))
+    blocks = ("near", "falling", "sliding", "stone")
+    structure = Structure(blocks, preset, obstacles=("ledge",), hulls=(("stone", STONE),))
+    scene = default_scene(structure)
     state = scene.state
-    state.positions[:] = [[-0.06, 0.11, 0.0325], [-0.05, 0.1, 0.12], [-0.02, -0.13, 0.0325]]
+    state.positions[:3] = [[-0.06, 0.11, 0.0325], [-0.05, 0.1, 0.12], [-0.02, -0.13, 0.0325]]
+    state.positions[3] = [0.1, 0.1, 0.06]
     state.orientations[1] = np.array([0.1, -0.2, 0.3, 0.9]) / np.sqrt(0.95)
     state.linear_velocities[2] = [1.8, -0.2, 0.0]
     state.angular_velocities[1] = [0.5, -1.0, 2.0]
+    state.angular_velocities[3] = [1.0, 0.5, 4.0]
     state.joint_velocities[:] = np.linspace(-0.5, 0.5, 9)
-    return scene
+    ledge = {"size": [0.06, 0.05, 0.02], "position": [0.11, 0.1, 0.012]}
+    return scene.with_(parameters={**scene.parameters, **named("ledge", ledge)})
+
+
+def named(body: str, values: Mapping[str, ArrayLike]) -> dict[ParameterKey, Floats]:
+    """Write down parameters of one body."""
+    return {(body, name): np.asarray(value, dtype=np.float64) for name, value in values.items()}
 
 
 def apart_scene(preset: Preset = FAST) -> Scene:
-    """Make a scene of a block that rocks alone, and of one that a finger pushes."""
-    scene = default_scene(Structure(("apart", "near"), preset=preset))
+    """Make a scene of a block that rocks alone on a ledge, and of one that a finger pushes."""
+    scene = default_scene(Structure(("apart", "near"), preset, obstacles=("ledge",)))
     state = scene.state
-    state.positions[:] = [[0.03, -0.05, 0.05], [-0.06, 0.11, 0.0325]]
+    state.positions[:] = [[0.1, 0.12, 0.05], [-0.06, 0.11, 0.0325]]
     state.angular_velocities[0] = [1.0, -2.0, 0.5]
-    return scene
+    ledge = {"size": [0.04, 0.04, 0.01], "position": [0.1, 0.08, 0.005]}
+    return scene.with_(parameters={**scene.parameters, **named("ledge", ledge)})
 
 
 def play(
@@ -83,15 +124,30 @@ def other_value(key: ParameterKey, value: Floats) -> Floats:
     """Give another possible value of a parameter."""
     match key[1]:
         case "gravity":
-            return np.array([0.5, -0.3, -7.0])
+            return np.asarray(value + np.array([0.5, -0.3, 2.8]))
         case "height":
             return np.asarray(value + 0.02)
         case "color":
-            return np.array([0.2, 0.7, 0.4])
+            return np.asarray(0.5 * value + 0.1)
+        case "restitution":
+            return np.asarray(value + 0.4)
+        case "joint_damping":
+            return np.asarray(value + 0.05)
+        case "position":
+            return np.asarray(value + np.array([0.004, -0.006, 0.003]))
+        case "orientation":
+            return quaternion_product(from_rotation_vector([0.05, -0.03, 0.1]), value)
         case "size":
             return np.asarray(value * np.array([0.8, 0.9, 0.7]))
+        case name if name in CONTROLLER:
+            return np.asarray(value * 1.2)  # with less of them, fingers reach farther
         case _:
             return np.asarray(value * 0.7)
+
+
+def another(preset: Preset) -> Preset:
+    """Give the other numerical settings."""
+    return PRECISE if preset is FAST else FAST
 
 
 def changed_states(state: PhysicalState) -> Iterator[tuple[str, PhysicalState]]:

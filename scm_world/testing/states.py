@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +20,15 @@ from scm_world.scene.scene import (
     parameter_keys,
 )
 from scm_world.scene.state import PhysicalState
-from scm_world.testing.scenes import changed_states, other_value, play, same
+from scm_world.testing.scenes import (
+    another,
+    changed_states,
+    check_parameters,
+    octahedron,
+    other_value,
+    play,
+    same,
+)
 from scm_world.testing.suite import Suite
 
 
@@ -70,25 +79,46 @@ class StateConformance(Suite):
 
     def test_a_new_block_moves_nothing(self, backend: Backend, scene: Scene) -> None:
         """When a block comes, the others keep their state and their parameters."""
-        more = Structure((*scene.structure.blocks, "new"), preset=self.preset)
+        more = replace(scene.structure, blocks=(*scene.structure.blocks, "new"))
         backend.apply(Difference(parameters={("near", "mass"): np.array(0.05)}))
         before = backend.state()
         backend.apply(Difference(structure=more))
-        assert backend.n_blocks == 4
-        assert same(backend.state().blocks[:3], before.blocks)
+        assert backend.n_blocks == before.n_blocks + 1
+        assert same(backend.state().blocks[:-1], before.blocks)
         assert same(backend.state().vector[:27], before.vector[:27])
         mass = backend.parameters([("near", "mass")])["near", "mass"]
         np.testing.assert_allclose(mass, 0.05, rtol=1e-12)
 
-    def test_a_block_that_comes_and_goes_leaves_no_trace(
-        self, backend: Backend, scene: Scene
-    ) -> None:
-        """Adding or removing a block and taking it back has exactly no effect."""
+    def test_what_stays_keeps_its_parameters(self, backend: Backend, scene: Scene) -> None:
+        """When an obstacle comes or another preset does, every other parameter stays."""
+        other = {key: other_value(key, value) for key, value in scene.parameters.items()}
+        backend.apply(Difference(parameters=other))
+        before = backend.state()
+        more = replace(scene.structure, obstacles=("new", "ledge"))
+        for structure in (more, replace(more, preset=another(self.preset))):
+            backend.apply(Difference(structure=structure))
+            check_parameters(backend.parameters(other), other)
+            assert same(backend.state().settable(), before.settable())
+
+    def structures(self, scene: Scene) -> Iterator[Structure]:
+        """List what can become of the busy scene: blocks, obstacles, shapes, settings."""
+        whole = scene.structure
+        yield replace(whole, blocks=(*whole.blocks, "new"))
+        yield Structure(("sliding", "near"), self.preset)
+        yield Structure((), self.preset)
+        yield replace(whole, obstacles=())
+        yield replace(whole, obstacles=("new", *whole.obstacles))
+        yield replace(whole, hulls=())
+        yield replace(whole, hulls=(*whole.hulls, ("near", octahedron(0.04, 0.05, 0.03))))
+        yield replace(whole, preset=another(self.preset))
+
+    def test_bodies_that_come_and_go_leave_no_trace(self, backend: Backend, scene: Scene) -> None:
+        """Changing the structure in any way and taking it back has exactly no effect."""
         start, now = backend.snapshot(), backend.state()
         expected = self.continued(backend, start, 20)
-        for blocks in (("near", "falling", "sliding", "new"), ("sliding", "near"), ()):
+        for structure in self.structures(scene):
             backend.restore(start)
-            backend.apply(Difference(structure=Structure(blocks, preset=self.preset)))
+            backend.apply(Difference(structure=structure))
             backend.apply(Difference(scene.structure, scene.parameters, now))
             assert backend.state() == now
             assert same(play(backend, 20), expected)

@@ -32,7 +32,7 @@ JOINT_BOUNDS = Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3)
 JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
 CONTROL_INDEX_BOUNDS = Integers(0, 10**9)
 OBSTACLE_SIZE_BOUNDS = Box(0.005, 0.6)  # [m]
-RESTITUTION_BOUNDS = Box(0.0, 0.9)
+RESTITUTION_BOUNDS = Box(0.0, 0.8)
 SPINNING_BOUNDS = Box(0.0, 0.1)
 DAMPING_BOUNDS = Box(0.0, 0.5)  # [N m s/rad]
 POSITION_GAIN_BOUNDS = Box(0.0, 50.0)  # [N m/rad]
@@ -79,6 +79,41 @@ def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
     """Give the space of cylindrical positions between two radii and two heights [m, rad, m]."""
     return Box((radii[0], -math.pi, low), (radii[1], math.pi, high))
 
+
+# --- goal families whose blocks follow from a few numbers ------------------------------------------
+PART_SIZE_BOUNDS = Box(0.005, 0.3)  # [m] edges of a block that is a part of something
+BLOCKS_MASS_A = Box(0.02, 0.06)  # [kg]
+BLOCKS_MASS_B = Box(0.06, 0.08)
+BLOCKS_MASS = 0.08  # [kg]
+
+TOWER_COUNT_BOUNDS = Integers(1, 6)
+TOWER_COUNT_A = Integers(1, 4)
+TOWER_COUNT_B = Integers(4, 6)
+TOWER_DIMS_BOUNDS = Box(0.02, 0.24)  # [m]
+TOWER_DIMS_A = Box(0.08, 0.12)
+TOWER_DIMS_B = Box(0.12, 0.20)
+TOWER_CENTER_BOUNDS = Box(-0.15, 0.15)  # [m]
+TOWER_CENTER_A = Box(-0.1, 0.05)
+TOWER_CENTER_B = Box(0.05, 0.1)
+
+STACK_LEVELS_BOUNDS = Integers(1, 10)
+STACK_LEVELS_A = Integers(1, 5)
+STACK_LEVELS_B = Integers(6, 8)
+CREATIVE_LEVELS_A = Integers(3, 5)
+MIN_SIZE_BOUNDS = Box(0.02, 0.1)  # [m]
+MIN_SIZE_A = Box(0.035, 0.065)
+MIN_SIZE_B = Box(0.065, 0.075)
+LEVEL_WIDTH_BOUNDS = Box(0.02, 0.3)  # [m]
+LEVEL_WIDTH_A = Box(0.035, 0.12)
+LEVEL_WIDTH_B = Box(0.12, 0.15)
+
+NUMS_OBJECTS_BOUNDS = Integers(1, 9)
+NUMS_OBJECTS_A = Integers(1, 5)
+NUMS_OBJECTS_B = Integers(6, 9)
+DROPPED_SIZE_BOUNDS = Box(0.02, 0.1)  # [m]
+DROPPED_SIZE_A = Box(0.05, 0.07)
+DROPPED_SIZE_B = Box(0.04, 0.05)
+DROP_REGION = ((-0.11, -0.11, 0.0), (0.11, 0.11, 0.22))  # [m]
 
 # --- spaces of what the predecessor hides: ours, around the defaults -----------------------------
 RESTITUTION_A = Box(0.0, 0.3)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-3  # [m] how deep two bodies may lie in one another after an intervention
 READ_BACK = 1e-6  # how far an engine may report a number from what it was given
-_MOVES = ("size", "height")
+_MOVES = ("size", "height", "position", "orientation")
 """Parameters that change where the surfaces of bodies are."""
 
 

@@ -12,6 +12,7 @@ from scm_world.backends.mujoco import MujocoBackend
 from scm_world.backends.mujoco.installation import judge
 from scm_world.backends.mujoco.model import compiled
 from scm_world.errors import MissingEngine, MixedInstallation, SnapshotMismatch, UnknownOption
+from scm_world.geometry.hulls import hull_of
 from scm_world.scene import ControlMode, Difference, Structure, default_scene, trifinger
 from scm_world.scene.kinematics import forward
 from scm_world.testing.backend import busy_scene, other_value, play
@@ -95,7 +96,7 @@ def test_any_path_ends_in_the_same_model(backend: MujocoBackend) -> None:
     scene = busy_scene()
     final = {key: other_value(key, value) for key, value in scene.parameters.items()}
     for key in sorted(final):
-        backend.apply(Difference(parameters={key: 1.3 * final[key]}))
+        backend.apply(Difference(parameters={key: other_value(key, final[key])}))
         play(backend, 1)
         backend.apply(Difference(parameters={key: final[key]}))
     fresh = MujocoBackend()
@@ -121,6 +122,57 @@ def test_unknown_parameters_change_nothing(backend: MujocoBackend) -> None:
     with pytest.raises(UnknownOption, match=r"nobody\.mass"):
         backend.apply(Difference(parameters=changes))
     assert fields(backend._model) == before
+
+
+def test_corners_of_a_hull_are_where_the_hull_says() -> None:
+    """MuJoCo turns meshes into a frame of its own, and the shape of the body back again."""
+    pytest.importorskip("scipy")
+    points = np.random.default_rng(2).normal(size=(12, 3), scale=0.02)
+    hull = hull_of(points)
+    backend = MujocoBackend()
+    backend.build(default_scene(Structure(("stone",), hulls=(("stone", hull),))))
+    model = backend._model
+    shape = model.geom("stone").id
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[shape])
+    corners = model.geom_pos[shape] + model.mesh_vert @ rotation.reshape(3, 3).T
+    np.testing.assert_allclose(corners, hull.vertices, rtol=0, atol=1e-8)
+    reach = np.linalg.norm(model.mesh_vert, axis=1).max()
+    assert model.geom_rbound[shape] >= reach
+
+
+def test_obstacles_cost_few_pairs() -> None:
+    """An obstacle can meet the blocks and nine shapes of the robot, and nothing else."""
+    alone = compiled(Structure(("a", "b")))
+    with_two = compiled(Structure(("a", "b"), obstacles=("wall", "post")))
+    assert with_two.npair - alone.npair == 2 * (2 + 9)
+
+
+def test_an_obstacle_that_grew_is_found(backend: MujocoBackend) -> None:
+    """The radius within which MuJoCo looks for contacts follows the size of an obstacle."""
+    backend.apply(Difference(parameters={("ledge", "size"): np.array([0.6, 0.02, 0.1])}))
+    shape = backend._model.geom("ledge").id
+    assert backend._model.geom_rbound[shape] == pytest.approx(np.linalg.norm([0.3, 0.01, 0.05]))
+
+
+def test_restitution_of_zero_is_critical_damping(backend: MujocoBackend) -> None:
+    """Without restitution all pairs have the numbers they were compiled with, bit for bit."""
+    before = backend._model.pair_solref.copy()
+    for restitution in (0.5, 0.0):
+        value = np.array(restitution)
+        backend.apply(Difference(parameters={("world", "restitution"): value}))
+    assert np.array_equal(backend._model.pair_solref, before)
+    assert np.array_equal(before, compiled(busy_scene().structure).pair_solref)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 1e-9, 0.05, 0.5, 0.9])
+def test_restitution_keeps_the_frequency(backend: MujocoBackend, restitution: float) -> None:
+    """Time constant times damping ratio stays, and the value is read back."""
+    key = ("world", "restitution")
+    before = backend._model.pair_solref.prod(axis=1)
+    backend.apply(Difference(parameters={key: np.array(restitution)}))
+    np.testing.assert_allclose(backend._model.pair_solref.prod(axis=1), before, rtol=1e-14)
+    np.testing.assert_allclose(backend.parameters([key])[key], restitution, rtol=0, atol=1e-13)
 
 
 def test_other_versions_are_refused(backend: MujocoBackend) -> None:

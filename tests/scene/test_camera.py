@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scm_world.scene.camera import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW, Camera
+from scm_world.geometry import rotation_matrix
+from scm_world.scene.camera import (
+    CAMERAS,
+    ORIGINAL_CAMERAS,
+    OVERVIEW,
+    Camera,
+    camera_from,
+    published_poses,
+)
 from scm_world.scene.trifinger import TABLE_OFFSET
 
 EVERY = [*CAMERAS, *ORIGINAL_CAMERAS, OVERVIEW]
@@ -81,3 +89,44 @@ def test_up_along_the_axis_is_refused() -> None:
 
     with pytest.raises(ValueError, match="camera 'lost': up"):
         camera.axes()
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
+def test_camera_from_numbers_is_the_published_one(camera: Camera) -> None:
+    """Pose and quaternion of a published camera, of any length and sign, make that camera."""
+    position, orientation = published_poses()[camera.name]
+    assert camera_from(camera.name, position, orientation) == camera
+    for factor in (-1.0, 3.0):
+        made = camera_from(camera.name, position, factor * orientation)
+        np.testing.assert_allclose(made.view_matrix(), camera.view_matrix(), atol=1e-12)
+
+    assert np.linalg.norm(orientation) == pytest.approx(1.0, abs=1e-15)
+    np.testing.assert_allclose(position, camera.eye, atol=1e-15)
+
+
+def test_published_poses_are_those_of_the_predecessor() -> None:
+    """Positions are published from the plane below the table top, and ours from the table top."""
+    poses = published_poses()
+
+    assert list(poses) == ["60", "120", "300"]
+    np.testing.assert_allclose(poses["60"][0], [0.2496, 0.2458, 0.58 - TABLE_OFFSET])
+    quaternion = np.array([0.9655, -0.0098, -0.0065, -0.2603])
+    np.testing.assert_allclose(poses["120"][1], quaternion / np.linalg.norm(quaternion))
+
+
+def test_quaternion_turns_the_axes_of_the_camera() -> None:
+    """The first axis points right, the second one down and the third one forward."""
+    orientation = np.array([0.3, -0.5, 0.2, 0.7])
+    camera = camera_from("it", [0.1, 0.2, 0.3], orientation, 40.0, 64, 32)
+    right, down, forward = rotation_matrix(orientation).T
+
+    np.testing.assert_allclose(camera.axes(), [right, -down, -forward], atol=1e-12)
+    assert (camera.field_of_view, camera.width, camera.height) == (40.0, 64, 32)
+    assert camera.eye == (0.1, 0.2, 0.3)
+
+
+@pytest.mark.parametrize("orientation", [np.zeros(4), np.full(4, np.nan), [1.0, 0.0, 0.0]])
+def test_no_orientation_is_refused(orientation: list[float]) -> None:
+    """A quaternion that names no rotation makes no camera."""
+    with pytest.raises(ValueError, match=r"quaternion|unpack"):
+        camera_from("it", [0.0, 0.0, 1.0], orientation)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scm_world._types import ArrayLike
 from scm_world.geometry import from_rotation_vector
+from scm_world.geometry.hulls import Hull, box_hull
 from scm_world.scene import Scene, Structure, default_scene, trifinger
 from scm_world.scene.feasibility import overlaps
 from scm_world.scene.kinematics import inverse, link_frames
 from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS
+from scm_world.testing.scenes import octahedron
 
 TOLERANCE = 1e-4  # [m]
 CUBE = 0.065  # [m]
@@ -186,3 +190,120 @@ def test_looking_changes_nothing() -> None:
     overlaps(scene, tolerance=TOLERANCE)
     assert scene.state == state
     assert all(np.array_equal(scene.parameters[k], v) for k, v in parameters.items())
+
+
+def _with_wall(scene: Scene, size: ArrayLike, position: ArrayLike, yaw: float = 0.0) -> Scene:
+    """Put an obstacle named wall into a scene."""
+    values = {
+        "size": np.array(size),
+        "position": np.array(position),
+        "orientation": from_rotation_vector([0.0, 0.0, yaw]),
+    }
+    structure = replace(scene.structure, obstacles=("wall",))
+    parameters = dict(default_scene(structure).parameters)
+    parameters |= {("wall", name): value for name, value in values.items()}
+    return scene.with_(structure=structure, parameters=parameters)
+
+
+def test_a_block_in_an_obstacle_is_reported() -> None:
+    """A block that reaches into an obstacle is named before it, with the depth."""
+    wall = [0.015, 0.5, 0.065], [0.0, 0.0, CUBE / 2]
+    free = _with_wall(_scene((0.0, 0.15, 2 * CUBE), (0.1, 0.0, CUBE / 2)), *wall)
+    assert not _found(free)
+    free.state.positions[1, 0] = CUBE / 2 + 0.0055
+    assert _found(free) == {("b", "wall"): pytest.approx(0.002)}
+
+
+def test_size_and_orientation_of_an_obstacle_count() -> None:
+    """A wall that grows or turns towards a block reaches it."""
+    block = (0.0, 0.1, CUBE / 2)
+    place = [0.0, 0.0, CUBE / 2]
+    assert not _found(_with_wall(_scene(block), [0.2, 0.015, 0.065], place))
+    long = _with_wall(_scene(block), [0.015, 0.2, 0.065], place)
+    assert set(_found(long)) == {("a", "wall")}
+    turned = _with_wall(_scene(block), [0.2, 0.015, 0.065], place, np.pi / 2)
+    assert _found(turned) == {("a", "wall"): pytest.approx(_found(long)["a", "wall"])}
+
+
+def test_a_finger_in_an_obstacle_is_reported() -> None:
+    """Middle and lower links are compared with obstacles, upper ones are not."""
+    scene = default_scene(Structure())
+    origins, _ = link_frames(scene.state.joint_positions, trifinger.NOMINAL_HEIGHT)
+    at_tip = _with_wall(scene, [0.01] * 3, origins[4])
+    assert set(_found(at_tip)) == {("robot_finger_60_link_3", "wall")}
+    everywhere = _with_wall(scene, [1.0] * 3, [0.0, 0.0, 0.5])
+    links = {f"robot_finger_{f}_link_{i}" for f in trifinger.FINGERS for i in (2, 3)}
+    assert set(_found(everywhere)) == {(link, "wall") for link in links}
+
+
+def test_obstacles_may_stand_anywhere() -> None:
+    """What cannot move may reach through the floor, the ring and other obstacles."""
+    structure = Structure(obstacles=("wall", "post"))
+    parameters = dict(default_scene(structure).parameters)
+    for name in structure.obstacles:
+        parameters[name, "size"] = np.array([1.0, 1.0, 0.02])
+        parameters[name, "position"] = np.zeros(3)
+    assert not _found(default_scene(structure).with_(parameters=parameters))
+
+
+def _stone(hull: Hull, position: ArrayLike) -> Scene:
+    """Put a hull named a somewhere."""
+    scene = default_scene(Structure(("a", "b"), hulls=(("a", hull),)))
+    scene.state.positions[0], scene.state.positions[1] = position, (0.0, 0.15, CUBE / 2)
+    return scene
+
+
+def test_a_hull_on_a_side_stands_on_the_floor() -> None:
+    """A hull that lies on a side is not in the floor, although the box around it is."""
+    hull = octahedron(0.03, 0.03, 0.03)
+    scene = _stone(hull, (0.0, 0.0, 0.03 / np.sqrt(3.0)))
+    axis = np.array([-1.0, 1.0, 0.0]) / np.sqrt(2.0)
+    scene.state.orientations[0] = from_rotation_vector(axis * np.arccos(-1 / np.sqrt(3.0)))
+    assert not _found(scene)
+    scene.state.positions[0, 2] -= 0.001
+    assert _found(scene) == {("a", "floor"): pytest.approx(0.001)}
+
+
+def test_a_hull_in_the_ring_is_in_the_stage() -> None:
+    """The corner of a hull that is beyond the inner radius counts, not that of its box."""
+    scene = _stone(octahedron(0.03, 0.03, 0.03), (WALL_RADIUS - 0.0305, 0.0, 0.1))
+    assert not _found(scene)
+    scene.state.positions[0, 0] += 0.001
+    assert _found(scene) == {("a", "stage"): pytest.approx(0.0005)}
+
+
+def test_a_stone_may_lie_on_a_block() -> None:
+    """A hull that lies on a side on a block or an obstacle is in neither, though its box is."""
+    hull = octahedron(0.03, 0.03, 0.03)
+    scene = _with_wall(_stone(hull, (0.0, 0.0, 0.0)), [0.1, 0.1, 0.02], [0.0, -0.05, 0.09])
+    axis = np.array([-1.0, 1.0, 0.0]) / np.sqrt(2.0)
+    scene.state.orientations[0] = from_rotation_vector(axis * np.arccos(-1 / np.sqrt(3.0)))
+    for place, height, below in (((0.0, -0.05), 0.1, "wall"), ((0.0, 0.15), CUBE, "b")):
+        scene.state.positions[0] = (*place, height + 0.03 / np.sqrt(3.0) + 1e-9)
+        assert not _found(scene)
+        scene.state.positions[0, 2] -= 0.002
+        assert _found(scene) == {("a", below): pytest.approx(0.002, abs=1e-6)}
+
+
+def test_a_finger_beside_a_stone_is_not_in_it() -> None:
+    """A fingertip in the box around a hull is reported only where it reaches a side."""
+    hull = octahedron(0.05, 0.05, 0.05)
+    scene = _stone(hull, (0.0, 0.0, 0.0))
+    origins, _ = link_frames(scene.state.joint_positions, trifinger.NOMINAL_HEIGHT)
+    radius = trifinger.COLLISION["tip"].radius
+    name = "robot_finger_60_link_3"
+    for gap, hit in ((0.004, False), (-0.004, True)):
+        normal = np.ones(3) / np.sqrt(3.0)  # the stone hangs below the tip, beside it
+        scene.state.positions[0] = origins[4] - normal * (0.05 / np.sqrt(3.0) + radius + gap)
+        assert (("a", name) in _found(scene)) == hit
+
+
+def test_a_box_that_is_a_hull_is_a_box() -> None:
+    """A box that is a hull is as deep in a block as the box itself, wherever its center is."""
+    box = box_hull([0.04, 0.05, 0.06])
+    corners = np.add(box.vertices, [0.01, 0.0, 0.0])
+    shifted = replace(box, vertices=tuple(tuple(corner) for corner in corners.tolist()))
+    for hull, x in ((box, 0.0), (shifted, -0.01)):
+        scene = _stone(hull, (x, 0.15 - CUBE / 2 - 0.024, 0.1))
+        scene.state.positions[1, 2] = 0.1
+        assert _found(scene) == {("a", "b"): pytest.approx(0.001)}
