@@ -24,8 +24,8 @@ class Contact:
     """One point where two bodies touch.
 
     Attributes:
-        bodies: Names of the two bodies: blocks, ``"floor"``, ``"stage"`` or links of the robot
-            (the fingertip counts as link 3).
+        bodies: Names of the two bodies: blocks, obstacles, ``"floor"``, ``"stage"`` or links of
+            the robot (the fingertip counts as link 3).
         position: Of the point, shape (3,) [m].
         normal: Unit vector from the first body to the second, shape (3,).
         depth: How deep they intersect [m]; negative while they are apart.

@@ -19,7 +19,7 @@ from typing import final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.discovery.probes import Probe
+from scm_world.discovery.probes import Probe, another_count
 from scm_world.discovery.scores import EdgeKey
 from scm_world.errors import InterventionError
 from scm_world.variables import Box, Categories, Integers, Measured, Noise, Rotations, Variable
@@ -152,11 +152,8 @@ class Paired:
                 return np.asarray(np.clip(inside, low, high))
             case Rotations():
                 return variable.bounds.nearest(present + 4 * step * direction)
-            case Integers(high=high):
-                step_up = 1 + attempt
-                return np.asarray(
-                    np.where(present + step_up > high, present - step_up, present + step_up)
-                )
+            case Integers():
+                return another_count(variable, present, attempt)
             case Categories(members=members):
                 others = [member for member in members if member != present]
                 return np.asarray(others[attempt % len(others)]) if others else None

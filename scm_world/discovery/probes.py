@@ -18,12 +18,13 @@ from scm_world.errors import InterventionError
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
 from scm_world.scene.scene import WALL_RADIUS
-from scm_world.variables import Noise
+from scm_world.variables import Integers, Noise, Variable
 from scm_world.world import World, WorldSnapshot
 
 TIP = trifinger.COLLISION["tip"].radius  # [m]
 CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch
 HIGHEST = 6  # blocks that are stacked
+REACH = 0.045  # [m] from here up all three fingers can press on something in the middle
 _DRAWS = 96
 
 
@@ -64,6 +65,17 @@ class Probe:
     kind: str
     snapshot: WorldSnapshot
     action: Floats
+
+
+def another_count(variable: Variable, present: Value, attempt: int) -> Value:
+    """Change one whole number, the last one first, and by one where there are several."""
+    highest = variable.bounds.high if isinstance(variable.bounds, Integers) else 2**31
+    other = np.array(present)
+    flat = other.reshape(-1)
+    index = (-1 - attempt) % flat.size
+    step = 1 + attempt // flat.size
+    flat[index] += step if flat[index] + step <= highest else -step
+    return other
 
 
 Setting = tuple[dict[str, Value], Floats]
@@ -107,20 +119,57 @@ def touch(world: World, dice: Dice) -> Setting:
 
 def tower(world: World, dice: Dice) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
-    names, sizes = world.composition.blocks[:HIGHEST], _sizes(world)[:HIGHEST]
-    middle, bottom = dice.between(-0.01, 0.01, 2), 0.0
-    states: dict[str, Value] = {}
-    for name, size in zip(names, sizes, strict=True):
-        place = middle + dice.between(-0.001, 0.001, 2)
-        states[f"{name}.cartesian_position"] = np.array([*place, bottom + size[2] / 2])
-        states[f"{name}.euler_orientation"] = np.array([0.0, 0.0, dice.between(-0.05, 0.05)])
-        bottom += size[2]
-    pressed = min(int(dice.between(0.0, 2.0)), len(names) - 1)
-    height = float(sizes[:pressed, 2].sum()) + dice.between(0.3, 0.7) * sizes[pressed, 2]
+    return _pressed(world, dice, dice.between(-0.01, 0.01, 2), 0.0)
+
+
+def on_newcomer(world: World, dice: Dice) -> Setting:
+    """Stand the blocks where a further one would come into being, as if it were there already."""
+    place = _newcomer(world, dice)
+    return tower(world, dice) if place is None else _pressed(world, dice, place[:2], place[2])
+
+
+def _newcomer(world: World, dice: Dice) -> Floats | None:
+    """Find where a further block or obstacle would be: its middle and its top, shape (3,) [m]."""
+    start = world.snapshot()
+    names = world.task.decided_by
+    name = names[min(int(dice.between(0.0, len(names))), len(names) - 1)]
+    try:
+        came = world.do({name: another_count(world.model.declared(name), world[name], 0)}).came
+        if not came:
+            return None
+        center, size = world[f"{came[-1]}.cartesian_position"], world[f"{came[-1]}.size"]
+        return np.array([center[0], center[1], center[2] + size[2] / 2])
+    except InterventionError:
+        return None
+    finally:
+        world.restore(start)
+
+
+def _pressed(world: World, dice: Dice, middle: Floats, bottom: float) -> Setting:
+    """Stack the blocks and let the fingers press on one of them that they reach."""
+    sizes = _sizes(world)[:HIGHEST]
+    states = _stacked(world, dice, middle, bottom)
+    middles = bottom + np.cumsum(sizes[:, 2]) - sizes[:, 2] / 2
+    pressed = int(np.flatnonzero(middles >= min(REACH, middles[-1]))[0])
+    height = float(middles[pressed]) + dice.between(-0.2, 0.2) * sizes[pressed, 2]
     center, angles = np.array([*middle, 0.0]), _facing(dice)
     reach = float(np.hypot(*sizes[pressed, :2])) / 2 + TIP + CLEARANCE
     states["joint_positions"] = _joints(world, _around(center, reach, angles, height))
     return states, _around(center, dice.between(0.0, 0.01), angles + 0.4, height - 0.01)
+
+
+def _stacked(
+    world: World, dice: Dice, middle: Floats, bottom: float, yaw: float = 0.0
+) -> dict[str, Value]:
+    """Stand the blocks on one another, not quite straight."""
+    states: dict[str, Value] = {}
+    for name, size in zip(world.composition.blocks[:HIGHEST], _sizes(world), strict=False):
+        place = middle + dice.between(-0.001, 0.001, 2)
+        turn = yaw + dice.between(-0.05, 0.05)
+        states[f"{name}.cartesian_position"] = np.array([*place, bottom + size[2] / 2])
+        states[f"{name}.euler_orientation"] = np.array([0.0, 0.0, turn])
+        bottom += size[2]
+    return states
 
 
 def on_obstacle(world: World, dice: Dice) -> Setting:
@@ -175,18 +224,17 @@ def finger_at_wall(world: World, dice: Dice) -> Setting:
 
 
 def block_at_wall(world: World, dice: Dice) -> Setting:
-    """Let the block slide along the wall."""
+    """Let the blocks slide along the wall, on one another."""
     size = _sizes(world)[0]
-    name = world.composition.blocks[0]
     angle = dice.between(-np.pi, np.pi)
     out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     radius = np.sqrt((WALL_RADIUS - 3e-3) ** 2 - (size[1] / 2) ** 2) - size[0] / 2
     velocity = 0.6 * out + dice.between(0.2, 0.5) * along
-    states = {
-        f"{name}.cartesian_position": np.array([*(radius * out), size[2] / 2 + CLEARANCE]),
-        f"{name}.euler_orientation": np.array([0.0, 0.0, angle]),
-        f"{name}.linear_velocity": np.array([*velocity, 0.0]),
-    }
+    several = len(world.composition.blocks) > 1
+    inward = 4e-3 if several else 0.0  # they are not quite straight
+    states = _stacked(world, dice, (radius - inward) * out, CLEARANCE, angle)
+    for name in world.composition.blocks[:HIGHEST]:
+        states[f"{name}.linear_velocity"] = np.array([*velocity, 0.0])
     return states, _rest_tips(world)
 
 
@@ -253,13 +301,16 @@ def _scenarios(world: World) -> tuple[Callable[[World, Dice], Setting], ...]:
     found = _WITH_BLOCKS if made.blocks else _WITHOUT_BLOCKS
     if len(made.blocks) > 1:
         found = (tower, *found)
+    if made.blocks and world.task.decided_by:
+        found = (on_newcomer, *found)
     if made.blocks and made.obstacles:
         found = (on_obstacle, *found)
     return (*found, obstacle_ahead) if "obstacle_places" in world.model else found
 
 
 _AT_ONCE = frozenset(
-    scenario.__name__ for scenario in (solved, block_at_wall, block_in_air, obstacle_ahead)
+    scenario.__name__
+    for scenario in (solved, block_at_wall, block_in_air, obstacle_ahead, on_newcomer)
 )
 """Settings whose moment passes: a block hits the wall once, a goal is fulfilled until one moves."""
 

@@ -34,13 +34,17 @@ def standing(size: Floats, orientation: Floats, *, place: Floats) -> Floats:
     return np.array([place[0], place[1], place[2] + lowest_point(size, orientation)])
 
 
-def keep_lowest_point(
-    position: Floats, size: Floats, orientation: Floats, new_size: Floats, new_orientation: Floats
-) -> Floats:
+def keep_lowest_point(position: Floats, *parents: Floats) -> Floats:
     """Raise or lower the center so that the lowest point stays where it was.
 
     A block that grows does not sink into the floor, and one that shrinks does not hang above it.
+
+    Args:
+        position: Of the center, shape (3,) [m].
+        parents: Size, orientation and what else moves it, before; then the same after.
     """
+    size, orientation = parents[:2]
+    new_size, new_orientation = parents[len(parents) // 2 :][:2]
     lift = lowest_point(new_size, new_orientation) - lowest_point(size, orientation)
     return np.array([position[0], position[1], position[2] + lift])
 

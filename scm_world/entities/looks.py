@@ -36,8 +36,8 @@ class Looks(Entity):
         yield Exogenous(
             name="light_ambient",
             bounds=Box(0.0, 1.0),
-            a=Box(0.3, 0.6),
-            b=Box(0.6, 0.9),
+            a=Box(0.2, 0.4),
+            b=Box(0.4, 0.7),
             default=_DEFAULT.ambient,
             doc="Brightness of what the light does not reach; only pictures depend on it.",
         )

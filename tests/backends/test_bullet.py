@@ -182,7 +182,9 @@ def test_sizes_there_and_back_leave_no_trace_for_long(backend: BulletBackend) ->
 # --- snapshots ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("quantity", ["", "friction", "mass", "gravity"])
+@pytest.mark.parametrize(
+    "quantity", ["", "friction", "mass", "gravity", "restitution", "joint_damping", "torque_limit"]
+)
 def test_replay_and_saved_state_agree_for_long(backend: BulletBackend, quantity: str) -> None:
     """A long episode goes on alike from the engine's memory and from its past, changed or not."""
     watched, scene = watch(backend), busy_scene()

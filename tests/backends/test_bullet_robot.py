@@ -14,7 +14,9 @@ import pytest
 from scm_world.backends.bullet import BulletBackend, arena
 from scm_world.backends.bullet.description import PARTS, link_index
 from scm_world.backends.bullet.law import compile_law
+from scm_world.backends.bullet.passive import MASSES, inverse_dynamics, mass_matrix
 from scm_world.errors import EngineFailure, MissingEngine
+from scm_world.geometry.rotations import rotation_matrix
 from scm_world.scene import (
     ControllerSpec,
     ControlMode,
@@ -25,6 +27,7 @@ from scm_world.scene import (
     trifinger,
 )
 from scm_world.scene.kinematics import link_frames
+from scm_world.scene.scene import SPINNING_FRICTION
 from scm_world.testing.backend import busy_scene
 
 pytestmark = pytest.mark.skipif(
@@ -110,7 +113,7 @@ def test_frictions_reach_the_links(backend: BulletBackend) -> None:
         info = engine.getDynamicsInfo(body, link, physicsClientId=client)
         assert info[1] == pytest.approx(0.37)
         assert info[5] == 0.0
-        assert info[7] == arena.OTHER_SPINNING
+        assert info[7] == 0.75 * SPINNING_FRICTION
     for joint in range(engine.getNumJoints(body, physicsClientId=client)):
         assert engine.getJointInfo(body, joint, physicsClientId=client)[6] == 0.0
 
@@ -133,6 +136,7 @@ def test_who_may_touch_whom() -> None:
     """Links meet blocks, the other fingers and what stands around them, as specified."""
     bodies = {"block": (arena.BLOCK, -1), "floor": (arena.FLOOR, arena.FLOOR_MASK)}
     bodies["wall"] = (arena.WALL, arena.WALL_MASK)
+    bodies["obstacle"] = (arena.OBSTACLE, arena.OBSTACLE_MASK)
     bodies |= {f"{part}{f}": arena.groups(f, part) for f in range(3) for part in PARTS}
 
     def meets(first: str, second: str) -> bool:
@@ -141,11 +145,81 @@ def test_who_may_touch_whom() -> None:
 
     assert all(meets("block", other) for other in bodies)
     assert [part for part in PARTS if meets(f"{part}0", "floor")] == ["middle", "lower", "tip"]
+    assert [part for part in PARTS if meets(f"{part}0", "obstacle")] == ["middle", "lower", "tip"]
     assert [part for part in PARTS if meets(f"{part}0", "wall")] == ["tip"]
+    assert not any(meets("obstacle", other) for other in ("floor", "wall", "obstacle"))
     assert not any(meets(f"{a}0", f"{b}0") for a in PARTS for b in PARTS)
     for a in PARTS:
         for b in PARTS:
             assert meets(f"{a}0", f"{b}2") == ("upper" not in (a, b))
+
+
+# --- viscous joints ------------------------------------------------------------------------------
+
+
+def test_the_dynamics_of_a_finger_are_the_engines(backend: BulletBackend) -> None:
+    """Mass matrix and bias in closed form equal those that the engine computes."""
+    backend.build(default_scene(Structure()))
+    engine, client, body = robot(backend)
+    generator, weights = np.random.default_rng(0), np.array(trifinger.LINK_MASS[1:])
+    for _ in range(10):
+        angles, speeds = generator.uniform(-1, 1, 9), generator.normal(size=9, scale=5.0)
+        matrix = engine.calculateMassMatrix(body, angles.tolist(), physicsClientId=client)
+        bias = engine.calculateInverseDynamics(
+            body, angles.tolist(), speeds.tolist(), [0.0] * 9, physicsClientId=client
+        )
+        for finger in range(3):
+            own = slice(3 * finger, 3 * finger + 3)
+            mine = mass_matrix(angles[own], weights)
+            np.testing.assert_allclose(mine, np.array(matrix)[own, own], rtol=1e-12, atol=1e-16)
+            gravity = (0.0, 0.0, -9.81)
+            torques = inverse_dynamics(angles[own], speeds[own], np.zeros(3), gravity, weights)
+            np.testing.assert_allclose(torques, bias[own], rtol=1e-9, atol=1e-12)
+
+
+def test_a_damped_step_is_implicit(backend: BulletBackend) -> None:
+    """The engine moves as the equations of an implicit step say, tilted and with other masses."""
+    damping, gravity = 0.3, np.array([1.0, -2.0, -9.0])
+    masses = np.linspace(0.02, 0.2, 9)
+    scene = default_scene(Structure())
+    values = {
+        ("robot", "joint_damping"): np.array(damping),
+        ("world", "gravity"): gravity,
+        ("controller", "safety_damping"): np.zeros(3),
+        **dict(zip(MASSES, masses, strict=True)),
+    }
+    scene.state.joint_velocities[:] = np.linspace(-3.0, 3.0, 9)
+    backend.build(scene.with_(parameters={**scene.parameters, **values}))
+    command = np.linspace(-0.3, 0.3, 9)
+    backend.step(ControlMode.JOINT_TORQUES, command, 1)
+    after, before = backend.state(), scene.state
+    np.testing.assert_array_equal(after.joint_torques, command)
+
+    h = scene.structure.preset.timestep
+    for finger in range(3):
+        own = slice(3 * finger, 3 * finger + 3)
+        angles, speeds = before.joint_positions[own], before.joint_velocities[own]
+        yaw = trifinger.WORLD_YAW + trifinger.FINGER_YAW[finger]
+        pull = rotation_matrix([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]).T @ gravity
+        bias = inverse_dynamics(angles, speeds, np.zeros(3), tuple(pull), masses[own])
+        inertia = mass_matrix(angles, masses[own]) + h * damping * np.eye(3)
+        rates = np.linalg.solve(inertia, command[own] - bias - damping * speeds)
+        # The engine integrates the bias with terms of higher order in the step.
+        np.testing.assert_allclose(after.joint_velocities[own], speeds + h * rates, atol=1e-6)
+
+
+def test_a_driven_joint_reaches_its_final_speed(backend: BulletBackend) -> None:
+    """With strong damping, the speed of a joint becomes torque over damping."""
+    damping, torque = 0.5, 0.1
+    scene = default_scene(Structure())
+    values = {
+        ("robot", "joint_damping"): np.array(damping),
+        ("world", "gravity"): np.zeros(3),
+        ("controller", "safety_damping"): np.zeros(3),
+    }
+    backend.build(scene.with_(parameters={**scene.parameters, **values}))
+    backend.step(ControlMode.JOINT_TORQUES, np.full(9, torque), 125)
+    np.testing.assert_allclose(backend.state().joint_velocities, torque / damping, rtol=0.02)
 
 
 # --- life -----------------------------------------------------------------------------------------

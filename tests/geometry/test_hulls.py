@@ -122,6 +122,20 @@ def test_points_within_do_not_count() -> None:
     assert len(hull.faces) == 12
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_rounding_of_a_file_makes_no_corners(seed: int) -> None:
+    """A turned grid and a turned cylinder in single precision have the sides they should."""
+    rng = np.random.default_rng(seed)
+    turn = rotation_matrix(rng.normal(size=4))
+    angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    ring = np.column_stack([np.cos(angles), np.sin(angles), np.ones(64)])
+    grid = np.array(list(product(range(5), repeat=3)), dtype=float)
+    cylinder = np.vstack([ring, ring * [1.0, 1.0, -1.0]])
+    for points, corners, sides in ((grid, 8, 6), (cylinder, 128, 66)):
+        hull = hull_of((points @ turn.T).astype(np.float32))
+        assert (len(hull.vertices), len(hull.planes)) == (corners, sides)
+
+
 @pytest.mark.parametrize(
     ("points", "problem"),
     [

@@ -12,27 +12,29 @@ from pathlib import Path
 from typing import Any
 
 from scm_world.backends.bullet.description import JOINTS, PARTS, link_index, robot_urdf
+from scm_world.geometry.hulls import Hull
 from scm_world.scene import trifinger
-from scm_world.scene.scene import (
-    SPINNING_FRICTION,
-    WALL_HEIGHT,
-    WALL_RADIUS,
-    WALL_SEGMENTS,
-    WALL_THICKNESS,
-)
+from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS, WALL_SEGMENTS, WALL_THICKNESS
+
+Shape = list[float] | Hull
+"""Full edge lengths of a box [m], or a polyhedron."""
 
 BLOCK, FLOOR, WALL, UPPER = 1, 2, 4, 8
 MIDDLE, LOWER = (16, 32, 64), (128, 256, 512)  # one for each finger; the tip counts as lower
+OBSTACLE = 1024
 
 FLOOR_MASK = BLOCK | sum(MIDDLE) | sum(LOWER)
 WALL_MASK = BLOCK | sum(LOWER)
+OBSTACLE_MASK = BLOCK | sum(MIDDLE) | sum(LOWER)
 
 FASTEST_JOINT = 1000.0  # [rad/s] the engine would cut at 100
 
-BLOCK_SPINNING = 0.5 * SPINNING_FRICTION
-OTHER_SPINNING = 0.75 * SPINNING_FRICTION
-"""The engine combines two bodies to ``s1 f2 + s2 f1`` with the frictions f; these two values give
-``SPINNING_FRICTION`` between a block and anything at the default frictions."""
+BLOCK_SPINNING, OTHER_SPINNING = 0.5, 0.75
+"""What a body gets of the spinning friction of the scene. The engine combines two bodies to
+``s1 f2 + s2 f1`` with the frictions f; with these two shares a contact between a block and
+anything else has the spinning friction of the scene at the default frictions."""
+
+HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much; the solver lets bodies sink in as much
 
 COLLIDING_LINKS = tuple(link_index(finger, part + 1) for finger in range(3) for part in range(4))
 
@@ -41,15 +43,15 @@ def groups(finger: int, part: str) -> tuple[int, int]:
     """Give the group and the mask of a link of the robot.
 
     A link never meets its own finger. Upper links meet blocks only; the middle ones also the
-    floor and the other fingers; the tips, which are the outermost points, also the wall.
+    floor, obstacles and the other fingers; the tips, which are the outermost points, also the wall.
     """
     others = sum(MIDDLE[k] | LOWER[k] for k in range(3) if k != finger)
     if part == "upper":
         return UPPER, BLOCK
     if part == "middle":
-        return MIDDLE[finger], BLOCK | FLOOR | others
+        return MIDDLE[finger], BLOCK | FLOOR | OBSTACLE | others
     wall = WALL if part == "tip" else 0
-    return LOWER[finger], BLOCK | FLOOR | wall | others
+    return LOWER[finger], BLOCK | FLOOR | OBSTACLE | wall | others
 
 
 LINK_GROUPS = tuple(
@@ -98,25 +100,42 @@ def _add_static(
         0, shape, useMaximalCoordinates=True, physicsClientId=client, **pose
     )
     engine.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=client)
-    engine.changeDynamics(body, -1, restitution=0, physicsClientId=client)
-    engine.changeDynamics(body, -1, spinningFriction=OTHER_SPINNING, physicsClientId=client)
     return body
 
 
-def add_block(engine: Any, client: int, size: list[float]) -> int:
-    """Add a block of full edge lengths ``size`` [m]; its mass is set afterwards.
+def add_obstacle(engine: Any, client: int, shape: Shape) -> int:
+    """Add a body that never moves; its pose, friction and so on are set afterwards."""
+    form = _form(engine, client, shape)
+    return _add_static(engine, client, form, group=OBSTACLE, mask=OBSTACLE_MASK)
+
+
+def _form(engine: Any, client: int, shape: Shape) -> int:
+    """Make a collision shape."""
+    form: int
+    if isinstance(shape, Hull):
+        corners = [list(corner) for corner in shape.vertices]
+        form = engine.createCollisionShape(
+            engine.GEOM_MESH, vertices=corners, physicsClientId=client
+        )
+    else:
+        form = engine.createCollisionShape(
+            engine.GEOM_BOX, halfExtents=[edge / 2 for edge in shape], physicsClientId=client
+        )
+    return form
+
+
+def add_block(engine: Any, client: int, shape: Shape) -> int:
+    """Add a block; its mass, friction and so on are set afterwards.
 
     Blocks are multibodies, not the engine's rigid bodies: those are faster in piles, but their
     friction is 12 % off, and they do not become canonical without being made anew.
     """
-    shape = engine.createCollisionShape(
-        engine.GEOM_BOX, halfExtents=[edge / 2 for edge in size], physicsClientId=client
-    )
-    block: int = engine.createMultiBody(1.0, shape, physicsClientId=client)
+    form = _form(engine, client, shape)
+    block: int = engine.createMultiBody(1.0, form, physicsClientId=client)
+    if isinstance(shape, Hull):
+        engine.changeDynamics(block, -1, collisionMargin=HULL_MARGIN, physicsClientId=client)
     engine.changeDynamics(block, -1, linearDamping=0, physicsClientId=client)
     engine.changeDynamics(block, -1, angularDamping=0, physicsClientId=client)
-    engine.changeDynamics(block, -1, restitution=0, physicsClientId=client)
-    engine.changeDynamics(block, -1, spinningFriction=BLOCK_SPINNING, physicsClientId=client)
     engine.changeDynamics(
         block, -1, activationState=engine.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
     )
@@ -140,9 +159,6 @@ def add_robot(engine: Any, client: int) -> int:
     engine.changeDynamics(robot, -1, maxJointVelocity=FASTEST_JOINT, physicsClientId=client)
     for link in range(link_index(3, 0)):
         engine.changeDynamics(robot, link, jointDamping=0, physicsClientId=client)
-    for link in COLLIDING_LINKS:
-        engine.changeDynamics(robot, link, restitution=0, physicsClientId=client)
-        engine.changeDynamics(robot, link, spinningFriction=OTHER_SPINNING, physicsClientId=client)
     engine.setJointMotorControlArray(
         robot, JOINTS, engine.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), physicsClientId=client
     )

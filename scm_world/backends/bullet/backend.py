@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
-from scm_world.backends.bullet import dynamics, touch, values
+from scm_world.backends.bullet import touch, values
 from scm_world.backends.bullet.client import Client
 from scm_world.backends.bullet.engine import load, version
 from scm_world.backends.bullet.history import History, Record, SavedState, relive
@@ -178,15 +178,14 @@ class BulletBackend(Backend):
             self._other().canonicalize(present)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
-        """Read parameters back from the engine itself.
+        """Read parameters back from the engine itself; see ``Client.parameter``.
 
         Raises:
             UnknownOption: The scene has no such parameter.
         """
         client = self._now()
         return {
-            key: dynamics.read(self._engine, client.handle, client.bodies, key)
-            for key in values.known(self._described().parameters, keys)
+            key: client.parameter(key) for key in values.known(self._described().parameters, keys)
         }
 
     def inertia(self, body: str) -> Floats:

@@ -8,14 +8,18 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, final
 
-from scm_world.backends.bullet import arena
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.backends.bullet import arena, dynamics
 from scm_world.backends.bullet.description import JOINTS
-from scm_world.backends.bullet.dynamics import Bodies, write
+from scm_world.backends.bullet.dynamics import Bodies
 from scm_world.backends.bullet.law import Law, compile_law
-from scm_world.backends.bullet.values import Instant, Values, number, numbers
+from scm_world.backends.bullet.passive import MASSES, Resistance, resistance
+from scm_world.backends.bullet.values import Instant, Values, arrays, heavy, number, numbers
 from scm_world.errors import EngineFailure
-from scm_world.scene.controller import ControllerSpec, ControlMode
-from scm_world.scene.scene import Structure
+from scm_world.scene.controller import ControlMode
+from scm_world.scene.scene import ParameterKey, Structure, controller_spec
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
@@ -43,7 +47,6 @@ class Client:
         self.applied: Values = {}
         self.generation = 0
         self._timestep = 0.0
-        self._spec: ControllerSpec | None = None
         self._laws: dict[ControlMode, Law] = {}
         self._untouched: list[float] | None = None
         self._saved: dict[int, int] = {}  # ticket to the engine's number, which it uses again
@@ -74,52 +77,67 @@ class Client:
     def canonicalize(self, instant: Instant) -> None:
         """Bring about the one world that has these parameters and this state, whatever was before.
 
-        Blocks keep their bodies where their sizes stay; all else that remembers the past, the
-        contact caches, goes when the collision objects are entered anew, always in one order.
+        Bodies stay where all their shapes stay; all else that remembers the past, the contact
+        caches, goes when the collision objects are entered anew, always in one order.
         """
         self.generation += 1
         self._doomed.extend(self._saved)
         self._bury()
         structure, parameters, state = instant.structure, instant.parameters, instant.state
-        self._configure(structure)
-        sizes = [numbers(parameters, (name, "size")) for name in structure.blocks]
-        if self.bodies.sizes != sizes or tuple(self.bodies.blocks) != structure.blocks:
-            self._remake(structure.blocks, sizes)
-        self._pose(number(parameters, ("robot", "height")), state)
-        self.applied["robot", "height"] = parameters["robot", "height"]
-        self.edit(parameters)
-        self._check(state)
-        self._untouched = state
-
-    def _configure(self, structure: Structure) -> None:
         timestep = structure.preset.timestep
         if timestep != self._timestep:
             self.engine.setPhysicsEngineParameter(
                 fixedTimeStep=timestep, physicsClientId=self.handle
             )
             self._timestep = timestep
-        if structure.controller != self._spec:
-            self._spec = structure.controller
-            self._laws = {mode: compile_law(self._spec, mode) for mode in ControlMode}
+        self._shape(structure, parameters)
+        self._place(parameters)
+        self._pose(number(parameters, ("robot", "height")), state)
+        self.applied.update((key, parameters[key]) for key in heavy(structure))
+        self.edit(parameters)
+        self._check(state)
+        self._untouched = state
 
-    def _remake(self, names: Sequence[str], sizes: list[list[float]]) -> None:
-        """Replace all blocks, so that their order in the engine is theirs in the structure."""
-        engine, handle = self.engine, self.handle
-        for body in reversed(self.bodies.blocks.values()):
-            engine.removeBody(body, physicsClientId=handle)
-        for name in self.bodies.blocks:
-            for key in [key for key in self.applied if key[0] == name]:
-                del self.applied[key]
-        blocks = {
-            name: arena.add_block(engine, handle, size)
-            for name, size in zip(names, sizes, strict=True)
+    def _shape(self, structure: Structure, parameters: Values) -> None:
+        """Make sure that the obstacles and blocks are there, with their shapes."""
+        hulls = dict(structure.hulls)
+        shapes = {
+            name: hulls.get(name) or numbers(parameters, (name, "size"))
+            for name in (*structure.obstacles, *structure.blocks)
         }
-        self.bodies = Bodies(self.bodies.robot, self.bodies.floor, self.bodies.stage, blocks, sizes)
-        for name, size in zip(blocks, sizes, strict=True):
-            self.applied[name, "size"] = size
+        same = list(self.bodies.shapes.items()) == list(shapes.items())
+        if not same or tuple(self.bodies.blocks) != structure.blocks:
+            self._remake(structure, shapes)
+
+    def _remake(self, structure: Structure, shapes: dict[str, arena.Shape]) -> None:
+        """Replace all obstacles and blocks: their order in the engine is that in the structure."""
+        engine, handle, was = self.engine, self.handle, self.bodies
+        for body in reversed((*was.obstacles.values(), *was.blocks.values())):
+            engine.removeBody(body, physicsClientId=handle)
+        gone = {*was.shapes, "world"}  # what holds for every contact is set on every body
+        self.applied = {key: v for key, v in self.applied.items() if key[0] not in gone}
+        obstacles = {
+            name: arena.add_obstacle(engine, handle, shapes[name]) for name in structure.obstacles
+        }
+        blocks = {name: arena.add_block(engine, handle, shapes[name]) for name in structure.blocks}
+        self.bodies = Bodies(was.robot, was.floor, was.stage, obstacles, blocks, shapes)
+
+    def _place(self, parameters: Values) -> None:
+        """Put the obstacles in their places, and enter them anew."""
+        engine, handle = self.engine, self.handle
+        group, mask = arena.OBSTACLE, arena.OBSTACLE_MASK
+        for name, body in self.bodies.obstacles.items():
+            position = numbers(parameters, (name, "position"))
+            turn = numbers(parameters, (name, "orientation"))
+            if not any(turn):
+                raise EngineFailure(
+                    f"{name}.orientation must be a quaternion, got {turn}", "bullet"
+                )
+            engine.resetBasePositionAndOrientation(body, position, turn, physicsClientId=handle)
+            engine.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=handle)
 
     def _pose(self, height: float, state: list[float]) -> None:
-        """Put everything in its place, and make the engine forget what touched what."""
+        """Put all that moves in its place, and make the engine forget what touched what."""
         engine, handle, robot = self.engine, self.handle, self.bodies.robot
         position, orientation = arena.robot_pose(height)
         engine.resetBasePositionAndOrientation(robot, position, orientation, physicsClientId=handle)
@@ -135,27 +153,57 @@ class Client:
 
     def edit(self, parameters: Values) -> None:
         """Change parameters that need no new bodies. What is in force already is left alone."""
+        other_law = False
         for key, value in parameters.items():
             if self.applied.get(key) != value:
                 self.applied.pop(key, None)  # unknown, should the engine fail
-                write(self.engine, self.handle, self.bodies, key, value)
+                dynamics.write(self.engine, self.handle, self.bodies, key, value)
                 self.applied[key] = value
+                other_law = other_law or key[0] == "controller"
+        if other_law:
+            told = {key: v for key, v in self.applied.items() if key[0] == "controller"}
+            spec = controller_spec(arrays(told))
+            self._laws = {mode: compile_law(spec, mode) for mode in ControlMode}
+
+    def parameter(self, key: ParameterKey) -> Floats:
+        """Ask the engine for a parameter, in the units of the scene.
+
+        Controller and joint damping are not in the engine, but in the torques it is given.
+        """
+        if key[0] == "controller" or key[1] == "joint_damping":
+            return np.array(self.applied[key])
+        value = dynamics.read(self.engine, self.handle, self.bodies, key)
+        if key[1] == "orientation" and np.dot(value, self.applied[key]) < 0.0:
+            return -value  # the same orientation
+        return value
 
     def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
         """Hold a command for some physics steps, and return the torques of the last one [N m].
 
-        Each physics step asks the engine once and tells it once.
+        Each physics step asks the engine once and tells it once. The torques are those of the
+        controller; the resistance of viscous joints comes on top.
         """
         engine, handle, robot = self.engine, self.handle, self.bodies.robot
         ask, step = engine.getJointStates, engine.stepSimulation
         tell, torque_control = engine.setJointMotorControlArray, engine.TORQUE_CONTROL
-        law, torques = self._laws[mode], []
+        law, resist, torques = self._laws[mode], self._resistance(), []
         self._untouched = None
         for _ in range(substeps):
-            torques = law(ask(robot, JOINTS, physicsClientId=handle), command)
-            tell(robot, JOINTS, torque_control, forces=torques, physicsClientId=handle)
+            joints = ask(robot, JOINTS, physicsClientId=handle)
+            torques = law(joints, command)
+            total = torques if resist is None else resist(joints, torques)
+            tell(robot, JOINTS, torque_control, forces=total, physicsClientId=handle)
             step(physicsClientId=handle)
         return torques
+
+    def _resistance(self) -> Resistance | None:
+        """Give what viscous joints add to torques; None where they are not viscous."""
+        damping = number(self.applied, ("robot", "joint_damping"))
+        if not damping:
+            return None
+        gravity = numbers(self.applied, ("world", "gravity"))
+        masses = [number(self.applied, key) for key in MASSES]
+        return resistance(damping, self._timestep, gravity, masses)
 
     def read(self, torques: list[float]) -> list[float]:
         """Read the present state as the numbers of a ``PhysicalState``.
@@ -183,7 +231,11 @@ class Client:
         return state
 
     def _check(self, state: list[float]) -> None:
-        """Make sure that the engine took the state, up to rounding and the sign of a quaternion."""
+        """Make sure that the engine took the state, up to rounding and the sign of a quaternion.
+
+        Raises:
+            EngineFailure: It did not.
+        """
         actual = self._ask(state[18:ROBOT_SIZE])
         for start in range(ROBOT_SIZE + 3, len(actual), BLOCK_SIZE):
             turn, wanted = actual[start : start + 4], state[start : start + 4]

@@ -37,4 +37,5 @@ def _name(bodies: Bodies, body: int, link: int) -> str:
         return trifinger.link_name(trifinger.FINGERS[finger], min(part, LOWER))
     if body == bodies.floor:
         return "floor"
-    return next((name for name, block in bodies.blocks.items() if block == body), "stage")
+    boxes = (*bodies.blocks.items(), *bodies.obstacles.items())
+    return next((name for name, number in boxes if number == body), "stage")

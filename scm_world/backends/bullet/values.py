@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -50,7 +50,7 @@ def numbers(parameters: Values, key: ParameterKey) -> list[float]:
     """Give a parameter that is several numbers."""
     value = parameters[key]
     if isinstance(value, float):
-        raise EngineFailure(f"{'.'.join(key)} must be three numbers, got {value}", "bullet")
+        raise EngineFailure(f"{'.'.join(key)} must be several numbers, got {value}", "bullet")
     return value
 
 
@@ -124,14 +124,19 @@ def light(here: Instant, there: Instant) -> bool:
         here.structure == there.structure
         and here.state[:18] == there.state[:18]
         and here.state[ROBOT_SIZE:] == there.state[ROBOT_SIZE:]
-        and all(here.parameters[key] == there.parameters[key] for key in _heavy(here.structure))
+        and all(here.parameters[key] == there.parameters[key] for key in heavy(here.structure))
     )
 
 
-def _heavy(structure: Structure) -> Iterable[ParameterKey]:
+def heavy(structure: Structure) -> Iterator[ParameterKey]:
+    """List the parameters that need new bodies, or new contacts."""
     yield ("robot", "height")
+    hulls = dict(structure.hulls)
     for name in structure.blocks:
-        yield (name, "size")
+        if name not in hulls:
+            yield (name, "size")
+    for name in structure.obstacles:
+        yield from ((name, quantity) for quantity in ("size", "position", "orientation"))
 
 
 def arrays(parameters: Values) -> Parameters:

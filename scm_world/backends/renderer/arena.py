@@ -135,9 +135,8 @@ def _paint_arena(view: View, light: Floats, colors: Floats, shadow: Floats, canv
                 rgb[i, v, u] = byte(255.0 * shade * colors[row, i])
 
 
-@lru_cache(maxsize=16)
-def empty_arena(camera: Camera, samples: int) -> Canvas:
-    """Show floor and wall to a camera, without colors. The arrays are shared: copy them."""
+def trace_arena(camera: Camera, samples: int) -> Canvas:
+    """Show floor and wall to a camera, without colors."""
     shape = camera.height * samples, camera.width * samples
     depth = np.full(shape, camera.far, dtype=np.float32)
     owners = np.full(shape, NOTHING, dtype=np.int32)
@@ -145,21 +144,25 @@ def empty_arena(camera: Camera, samples: int) -> Canvas:
     return Canvas(depth, owners, NO_COLORS)
 
 
-def painted_arena(
-    camera: Camera, samples: int, light: Light, colors: Palette, shadow: Floats = NO_SHADOW
+@lru_cache(maxsize=32)
+def empty_arena(camera: Camera) -> Canvas:
+    """Keep what ``trace_arena`` returns for one sample. The arrays are shared: copy them."""
+    return trace_arena(camera, 1)
+
+
+def paint_arena(
+    empty: Canvas, view: View, light: Light, colors: Palette, shadow: Floats = NO_SHADOW
 ) -> Colors:
-    """Show floor and wall to a camera in color, shape (3, h, w)."""
-    depth, owners, _ = empty_arena(camera, samples)
-    rgb = np.empty((3, *depth.shape), dtype=np.uint8)
-    view, canvas = camera_view(camera, samples), Canvas(depth, owners, rgb)
-    _paint_arena(view, lamp(light), np.array(colors), shadow, canvas)
+    """Color an empty arena, shape (3, h, w)."""
+    rgb = np.empty((3, *empty.depth.shape), dtype=np.uint8)
+    _paint_arena(view, lamp(light), np.array(colors), shadow, empty._replace(rgb=rgb))
     return rgb
 
 
 @lru_cache(maxsize=32)
 def lit_arena(camera: Camera, light: Light, colors: Palette) -> Colors:
     """Show the arena without shadows, shape (3, h, w). The array is shared: copy it."""
-    return painted_arena(camera, 1, light, colors)
+    return paint_arena(empty_arena(camera), camera_view(camera, 1), light, colors)
 
 
 def shadow_map(bodies: Bodies, light: Light) -> Floats:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.renderer.arena import (
-    empty_arena,
     lamp,
-    painted_arena,
+    paint_arena,
     palette,
     shadow_map,
+    trace_arena,
 )
 from scm_world.backends.renderer.bodies import Bodies, body_names, goal_bodies, solid_bodies
 from scm_world.backends.renderer.kernels import Canvas, draw
@@ -116,9 +116,9 @@ def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:
 def _render(
     scene: Scene, bodies: Bodies, shadow: Floats, camera: Camera, samples: int
 ) -> RenderedImage:
-    empty = empty_arena(camera, samples)
-    rgb = painted_arena(camera, samples, scene.light, palette(scene), shadow)
-    canvas = Canvas(empty.depth.copy(), empty.owners.copy(), rgb)
+    view, canvas = camera_view(camera, samples), trace_arena(camera, samples)
+    rgb = paint_arena(canvas, view, scene.light, palette(scene), shadow)
+    canvas = canvas._replace(rgb=rgb)
     draw_scene(scene, bodies, camera, samples, canvas)
     shown = np.ascontiguousarray(rgb.transpose(1, 2, 0))
     return RenderedImage(shown, canvas.depth, canvas.owners, body_names(scene.structure))

@@ -80,8 +80,8 @@ def now_pixels(
         >>> from scm_world.scene.camera import CAMERAS
         >>> out = np.empty((3, 3, 128, 128), dtype=np.uint8)
         >>> now_pixels(default_scene(Structure(blocks=("tool_block",))), CAMERAS, out)
-        >>> out[0, :, 64, 64].tolist()
-        [176, 0, 0]
+        >>> out[0, :, 127, 64].tolist()  # the floor
+        [74, 65, 60]
     """
     _draw_all(scene.with_(goals=()), cameras, out, convention)
 
@@ -174,7 +174,7 @@ def depth_and_segmentation(
     shape = len(cameras), cameras[0].height, cameras[0].width
     depths, owners = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int32)
     for i, camera in enumerate(cameras):
-        empty = empty_arena(camera, 1)
+        empty = empty_arena(camera)
         depths[i], owners[i] = empty.depth, empty.owners
         draw(bodies, camera_view(camera, 1), light, 1.0, Canvas(depths[i], owners[i], NO_COLORS))
     return _rows(depths, convention), _rows(owners, convention)
@@ -202,10 +202,9 @@ def _draw_all(scene: Scene, cameras: Sequence[Camera], out: Colors, convention: 
     """Draw a scene with all cameras in the layout that is asked for."""
     if out.dtype != np.uint8:
         raise ValueError(f"out: expected dtype uint8, got {out.dtype}")
-    for camera in cameras:
-        expected = len(cameras), *convention.shape(camera)
-        if out.shape != expected:
-            raise ValueError(f"out: expected shape {expected}, got {out.shape}")
+    for shape in {convention.shape(camera) for camera in cameras} or {(0, 0, 0)}:
+        if out.shape != (len(cameras), *shape):
+            raise ValueError(f"out: expected shape {(len(cameras), *shape)}, got {out.shape}")
     bodies = solid_bodies(scene)
     direct = out.flags.c_contiguous and not (convention.flipped or convention.channels_last)
     for picture, camera in zip(out, cameras, strict=True):
@@ -219,5 +218,5 @@ def _draw_all(scene: Scene, cameras: Sequence[Camera], out: Colors, convention: 
 def _draw_one(scene: Scene, bodies: Bodies, camera: Camera, rgb: Colors) -> None:
     """Draw a scene into a picture of shape (3, h, w)."""
     rgb[:] = lit_arena(camera, scene.light, palette(scene))
-    depth = empty_arena(camera, 1).depth.copy()
+    depth = empty_arena(camera).depth.copy()
     draw_scene(scene, bodies, camera, 1, Canvas(depth, NO_OWNERS, rgb))

@@ -15,22 +15,24 @@ from numba import njit
 
 from scm_world._types import Floats
 
+Triple = tuple[float, float, float]
 Hit = tuple[float, float, float, float]
 """The depth at which a ray is seen to meet a surface, and the normal towards the ray."""
 
 
 @njit(cache=True, error_model="numpy")
-def hit_box(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float) -> Hit:
+def hit_box(o: Triple, d: Triple, near: float) -> Hit:
     """Meet the cube from -1 to 1."""
+    (ox, oy, oz), (dx, dy, dz) = o, d
     enter, leave, enter_axis, leave_axis = -math.inf, math.inf, 0, 0
     for axis in range(3):
-        o, d = (ox, dx) if axis == 0 else ((oy, dy) if axis == 1 else (oz, dz))
-        if d == 0.0:
-            if abs(o) > 1.0:
+        a, b = (ox, dx) if axis == 0 else ((oy, dy) if axis == 1 else (oz, dz))
+        if b == 0.0:
+            if abs(a) > 1.0:
                 return math.inf, 0.0, 0.0, 0.0
             continue
-        inverse = 1.0 / d
-        middle, half = -o * inverse, abs(inverse)
+        inverse = 1.0 / b
+        middle, half = -a * inverse, abs(inverse)
         if middle - half > enter:
             enter, enter_axis = middle - half, axis
         if middle + half < leave:
@@ -47,8 +49,9 @@ def hit_box(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, ne
 
 
 @njit(cache=True, error_model="numpy")
-def hit_ball(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float) -> Hit:
+def hit_ball(o: Triple, d: Triple, near: float) -> Hit:
     """Meet the unit ball."""
+    (ox, oy, oz), (dx, dy, dz) = o, d
     a = dx * dx + dy * dy + dz * dz
     b = ox * dx + oy * dy + oz * dz
     discriminant = b * b - a * (ox * ox + oy * oy + oz * oz - 1.0)
@@ -64,9 +67,7 @@ def hit_ball(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, n
 
 
 @njit(cache=True, error_model="numpy")
-def _capsule_side(
-    o: tuple[float, float, float], d: tuple[float, float, float], half: float, side: float
-) -> float:
+def _capsule_side(o: Triple, d: Triple, half: float, side: float) -> float:
     """Find where a ray enters (side -1) or leaves (side 1) a capsule of radius 1 along z.
 
     Where the ray meets the endless cylinder beyond the end of the segment, it is the ball at that
@@ -91,9 +92,7 @@ def _capsule_side(
 
 
 @njit(cache=True, error_model="numpy")
-def hit_capsule(
-    o: tuple[float, float, float], d: tuple[float, float, float], half: float, near: float
-) -> Hit:
+def hit_capsule(o: Triple, d: Triple, half: float, near: float) -> Hit:
     """Meet the capsule of radius 1 around the segment from -half to half along z."""
     t, side = _capsule_side(o, d, half, -1.0), 1.0
     if t < near:
@@ -108,8 +107,8 @@ def hit_capsule(
 @njit(cache=True, error_model="numpy")
 def hit_hull(
     facets: Floats,
-    o: tuple[float, float, float],
-    d: tuple[float, float, float],
+    o: Triple,
+    d: Triple,
     near: float,
 ) -> Hit:
     """Meet the polyhedron behind all planes ``facets``, shape (p, 4)."""

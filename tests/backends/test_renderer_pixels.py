@@ -1,0 +1,279 @@
+"""Facts about the pixels that a policy sees."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scm_world.backends.renderer import (
+    ORIGINAL,
+    Convention,
+    depth_and_segmentation,
+    goal_pixels,
+    now_pixels,
+    pixels,
+    render,
+    render_views,
+    resized,
+)
+from scm_world.geometry.hulls import box_hull
+from scm_world.scene import Goal, Light, PhysicalState, Scene, Structure, default_scene
+from scm_world.scene.camera import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
+from scm_world.scene.trifinger import JOINT_LOW
+
+STRUCTURE = Structure(
+    blocks=("tool_block", "stone"),
+    obstacles=("barrier",),
+    hulls=(("stone", box_hull([0.05, 0.03, 0.04])),),
+)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """A box, a hull, an obstacle that can be seen, and a goal."""
+    scene = default_scene(STRUCTURE)
+    barrier = {"size": [0.1, 0.02, 0.05], "position": [0.0, -0.08, 0.025], "color": [1, 1, 0]}
+    changes = {("barrier", name): np.array(value, float) for name, value in barrier.items()}
+    green, upright = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    goal = Goal("goal", "box", np.full(3, 0.065), np.array([0.0, 0.08, 0.0325]), upright, green)
+    return scene.with_(parameters={**scene.parameters, **changes}, goals=(goal,))
+
+
+def parked(scene: Scene, *, obstacles: bool = True) -> Scene:
+    """Leave the goals and the obstacles, and a robot at the lower limits of its joints."""
+    state = PhysicalState(0)
+    state.joint_positions[:] = JOINT_LOW
+    kept = scene.structure.obstacles if obstacles else ()
+    return scene.with_(state=state, structure=Structure(obstacles=kept))
+
+
+def now(scene: Scene) -> np.ndarray:
+    """Draw what the three cameras see now."""
+    out = np.empty((3, 3, 128, 128), dtype=np.uint8)
+    now_pixels(scene, CAMERAS, out)
+    return out
+
+
+def test_pixels_are_those_of_render_but_for_shadows(scene: Scene) -> None:
+    """Colors differ only on the floor, where ``render`` is darker."""
+    pictures = now(scene)
+    for got, image in zip(pictures, render_views(scene.with_(goals=()), CAMERAS), strict=True):
+        quick, slow = got.transpose(1, 2, 0), image.rgb
+        unlike = (quick != slow).any(axis=2)
+        assert unlike.any()
+        assert not (unlike & ~image.shows("floor")).any()
+        assert (quick >= slow).all()
+
+
+def test_goal_pixels_are_those_of_render_but_for_shadows(scene: Scene) -> None:
+    """A goal picture shows goals, obstacles and a parked robot, and no blocks."""
+    out = np.empty((3, 3, 128, 128), dtype=np.uint8)
+    goal_pixels(scene, CAMERAS, out)
+    for got, image in zip(out, render_views(parked(scene), CAMERAS), strict=True):
+        unlike = (got.transpose(1, 2, 0) != image.rgb).any(axis=2)
+        assert not (unlike & ~image.shows("floor")).any()
+        assert image.shows("barrier").any()
+
+
+def test_without_shadows_pixels_are_those_of_render(scene: Scene) -> None:
+    """Under light from everywhere both halves equal what ``render`` makes, bit for bit."""
+    scene = scene.with_(light=Light(ambient=1.0))
+    expected = [
+        image.rgb.transpose(2, 0, 1)
+        for shown in (scene.with_(goals=()), parked(scene))
+        for image in render_views(shown, CAMERAS)
+    ]
+
+    np.testing.assert_array_equal(pixels(scene, CAMERAS), expected)
+
+
+def test_observation_is_now_and_then_the_goal(scene: Scene) -> None:
+    """The first half is ``now_pixels``, the second half ``goal_pixels``."""
+    both = pixels(scene, CAMERAS)
+    then = np.empty((3, 3, 128, 128), dtype=np.uint8)
+    goal_pixels(scene, CAMERAS, then)
+
+    assert both.shape == (6, 3, 128, 128)
+    assert both.dtype == np.uint8
+    np.testing.assert_array_equal(both[:3], now(scene))
+    np.testing.assert_array_equal(both[3:], then)
+
+
+def test_goals_are_not_seen_now(scene: Scene) -> None:
+    """What cameras see now does not depend on the goals."""
+    np.testing.assert_array_equal(now(scene), now(scene.with_(goals=())))
+
+
+def test_goals_of_another_scene(scene: Scene) -> None:
+    """The goal pictures can be those of another scene."""
+    other = scene.with_(goals=())
+    both = pixels(scene, CAMERAS, goals=other)
+
+    np.testing.assert_array_equal(both[3:], pixels(other, CAMERAS)[3:])
+    assert (both[3:] != pixels(scene, CAMERAS)[3:]).any()
+
+
+def test_goal_pictures_can_be_kept(scene: Scene) -> None:
+    """They do not depend on the state, nor on the looks of the blocks."""
+    later = scene.with_(
+        state=scene.state.copy(),
+        parameters={**scene.parameters, ("tool_block", "color"): np.array([0.0, 0.0, 1.0])},
+    )
+    later.state.vector[:9] += 0.1
+    later.state.positions[:] += 0.01
+    before, after = pixels(scene, CAMERAS), pixels(later, CAMERAS)
+
+    assert (before[:3] != after[:3]).any()
+    np.testing.assert_array_equal(before[3:], after[3:])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {("robot", "height"): np.array(0.36)},
+        {("floor", "color"): np.array([0.9, 0.9, 0.1])},
+        {("stage", "color"): np.array([0.9, 0.1, 0.1])},
+        {("barrier", "position"): np.array([0.05, -0.08, 0.025])},
+    ],
+    ids=lambda change: ".".join(next(iter(change))),
+)
+def test_what_both_pictures_depend_on(scene: Scene, change: dict) -> None:  # type: ignore[type-arg]
+    """Arena, obstacles and robot are the same in both halves."""
+    before = pixels(scene, CAMERAS)
+    after = pixels(scene.with_(parameters={**scene.parameters, **change}), CAMERAS)
+
+    assert (before[:3] != after[:3]).any()
+    assert (before[3:] != after[3:]).any()
+    np.testing.assert_array_equal(before, pixels(scene, CAMERAS))  # caches mix up nothing
+
+
+def test_light_is_seen_in_both_halves(scene: Scene) -> None:
+    """Another light changes what is seen now and the goal pictures."""
+    before = pixels(scene, CAMERAS)
+    after = pixels(scene.with_(light=Light((-1.0, 0.0, 1.0), 0.1)), CAMERAS)
+
+    assert (before[:3] != after[:3]).any()
+    assert (before[3:] != after[3:]).any()
+
+
+@pytest.mark.parametrize("size", [(64, 64), (48, 80), (200, 96)])
+def test_any_size(scene: Scene, size: tuple[int, int]) -> None:
+    """Pictures of any size are those of cameras of that size."""
+    both = pixels(scene, CAMERAS[:2], size=size)
+    cameras = [replace(camera, height=size[0], width=size[1]) for camera in CAMERAS[:2]]
+
+    assert both.shape == (4, 3, *size)
+    assert resized(CAMERAS[:2], *size) == tuple(cameras)
+    np.testing.assert_array_equal(both, pixels(scene, cameras))
+    inside = render(scene.with_(goals=()), cameras[0])
+    mask = ~inside.shows("floor")
+    np.testing.assert_array_equal(both[0].transpose(1, 2, 0)[mask], inside.rgb[mask])
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+@pytest.mark.parametrize("channels_last", [False, True])
+def test_conventions_move_pixels_only(scene: Scene, *, flipped: bool, channels_last: bool) -> None:
+    """Rows can be flipped and channels put last, without another change."""
+    plain = pixels(scene, CAMERAS, size=(60, 90))
+    other = pixels(
+        scene, CAMERAS, size=(60, 90),
+        convention=Convention(flipped=flipped, channels_last=channels_last),
+    )  # fmt: skip
+    expected = plain[:, :, ::-1] if flipped else plain
+
+    np.testing.assert_array_equal(
+        other, expected.transpose(0, 2, 3, 1) if channels_last else expected
+    )
+
+
+def test_convention_of_the_predecessor(scene: Scene) -> None:
+    """Its pictures are flipped, have their channels last, and no obstacles in the goal half."""
+    scene = scene.with_(light=Light(ambient=1.0))  # no shadows
+    both = pixels(scene, ORIGINAL_CAMERAS, convention=ORIGINAL)
+
+    assert both.shape == (6, 128, 128, 3)
+    for got, camera in zip(both[:3], ORIGINAL_CAMERAS, strict=True):
+        np.testing.assert_array_equal(got[::-1], render(scene.with_(goals=()), camera).rgb)
+    for got, camera in zip(both[3:], ORIGINAL_CAMERAS, strict=True):
+        np.testing.assert_array_equal(got[::-1], render(parked(scene, obstacles=False), camera).rgb)
+
+
+def test_any_array_can_be_written(scene: Scene) -> None:
+    """Arrays that are parts of others, or lie in memory in another order, are filled as well."""
+    expected = now(scene)
+    gaps = np.zeros((6, 3, 128, 128), dtype=np.uint8)
+    now_pixels(scene, CAMERAS, gaps[::2])
+    columns = np.zeros((3, 3, 128, 128), dtype=np.uint8, order="F")
+    now_pixels(scene, CAMERAS, columns)
+
+    np.testing.assert_array_equal(gaps[::2], expected)
+    np.testing.assert_array_equal(columns, expected)
+    assert not gaps[1::2].any()
+
+
+def test_arrays_that_do_not_fit_are_refused(scene: Scene) -> None:
+    """Wrong shapes and dtypes, mixed sizes and no cameras are answered."""
+    with pytest.raises(ValueError, match="out: expected dtype uint8, got float64"):
+        now_pixels(scene, CAMERAS, np.zeros((3, 3, 128, 128)))
+    with pytest.raises(ValueError, match=r"out: expected shape \(3, 3, 128, 128\)"):
+        now_pixels(scene, CAMERAS, np.zeros((3, 128, 128, 3), dtype=np.uint8))
+    with pytest.raises(ValueError, match="out: expected shape"):
+        pixels(scene, [CAMERAS[0], OVERVIEW])
+    with pytest.raises(ValueError, match="out: expected shape"):
+        now_pixels(scene, [], np.zeros((3, 3, 128, 128), dtype=np.uint8))
+    with pytest.raises(ValueError, match="cameras"):
+        pixels(scene, [])
+    with pytest.raises(ValueError, match="cameras"):
+        depth_and_segmentation(scene, [CAMERAS[0], OVERVIEW])
+
+
+def test_depth_and_segmentation_are_those_of_render(scene: Scene) -> None:
+    """They are equal bit for bit, goals or not."""
+    depths, owners = depth_and_segmentation(scene, CAMERAS)
+    flipped = depth_and_segmentation(scene, CAMERAS, convention=ORIGINAL)
+
+    assert depths.dtype == np.float32
+    assert owners.dtype == np.int32
+    for i, image in enumerate(render_views(scene, CAMERAS)):
+        np.testing.assert_array_equal(depths[i], image.depth)
+        np.testing.assert_array_equal(owners[i], image.segmentation)
+        np.testing.assert_array_equal(flipped[0][i], image.depth[::-1])
+        np.testing.assert_array_equal(flipped[1][i], image.segmentation[::-1])
+
+
+def test_scene_is_left_alone(scene: Scene) -> None:
+    """Drawing changes neither the scene nor what is drawn later."""
+    state, first = scene.state.copy(), pixels(scene, CAMERAS)
+    first[:] = 7
+    parameters = {key: value.copy() for key, value in scene.parameters.items()}
+    again = pixels(scene, CAMERAS)
+    again[:] = 9
+
+    assert scene.state == state
+    assert all((scene.parameters[key] == value).all() for key, value in parameters.items())
+    np.testing.assert_array_equal(pixels(scene, CAMERAS), pixels(scene, CAMERAS))
+    assert len(np.unique(pixels(scene, CAMERAS))) > 20
+
+
+SNIPPET = """
+import hashlib
+from scm_world.backends.renderer import pixels
+from scm_world.scene import Structure, default_scene
+from scm_world.scene.camera import CAMERAS
+print(hashlib.sha256(pixels(default_scene(Structure(("a", "b"))), CAMERAS).tobytes()).hexdigest())
+"""
+
+
+def test_pixels_are_equal_between_processes() -> None:
+    """Another process sees the same pixels, bit for bit."""
+    ours = pixels(default_scene(Structure(("a", "b"))), CAMERAS)
+    theirs = subprocess.run(  # noqa: S603 (our own interpreter and our own program)
+        [sys.executable, "-c", SNIPPET], capture_output=True, text=True, check=True
+    )
+
+    assert theirs.stdout.strip() == hashlib.sha256(ours.tobytes()).hexdigest()
