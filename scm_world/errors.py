@@ -23,7 +23,9 @@ allowed and what to do::
     │   ├── MissingEngine        it is not installed
     │   ├── MixedInstallation    two versions of it in one folder
     │   └── EngineFailure        it produced a state that is not finite
-    └── SnapshotMismatch         a snapshot of another scene
+    ├── SnapshotMismatch         a snapshot of another scene
+    ├── UnreadableFile           a file that is not what it should be
+    └── MissingExtra             an optional package that is not installed
 """
 
 from __future__ import annotations
@@ -343,6 +345,28 @@ class SnapshotMismatch(ScmWorldError, ValueError):
     """A snapshot of another scene cannot be restored here."""
 
 
+class UnreadableFile(ScmWorldError, ValueError):
+    """A file (``path``) that is not what it should be (``reason``)."""
+
+    def __init__(self, path: str, reason: str, advice: str) -> None:
+        self.path, self.reason = path, reason
+        super().__init__(f"{path!r} cannot be read: {reason}; {advice}")
+
+
+class MissingExtra(ScmWorldError, ImportError):
+    """An optional package that is not installed.
+
+    Attributes:
+        package: Its name.
+        extra: The extra of this package that brings it.
+    """
+
+    def __init__(self, package: str, extra: str) -> None:
+        self.package, self.extra = package, extra
+        install = f"pip install 'scm-world[{extra}]'"
+        super().__init__(f"this needs the package {package!r}; install it with: {install}")
+
+
 __all__ = [
     "ActionError",
     "ConflictingTargets",
@@ -351,6 +375,7 @@ __all__ = [
     "Infeasible",
     "InterventionError",
     "MissingEngine",
+    "MissingExtra",
     "MixedInstallation",
     "ModelError",
     "NotFinite",
@@ -363,6 +388,7 @@ __all__ = [
     "SnapshotMismatch",
     "UnknownOption",
     "UnknownVariable",
+    "UnreadableFile",
     "WrongShape",
     "WrongType",
     "nearest",

@@ -18,6 +18,7 @@ from scm_world.errors import (
     Infeasible,
     InterventionError,
     MissingEngine,
+    MissingExtra,
     MixedInstallation,
     ModelError,
     NotFinite,
@@ -30,6 +31,7 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
     UnknownVariable,
+    UnreadableFile,
     WrongShape,
     WrongType,
     nearest,
@@ -116,6 +118,16 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         UnknownOption("task", "pushin", ["reaching", "pushing"]),
         "no task is named 'pushin'; did you mean 'pushing'?; there are: reaching, pushing",
         {"option": "task", "value": "pushin", "choices": ("reaching", "pushing")},
+    ),
+    (
+        UnreadableFile("p.zip", "it is no zip archive", "give another one"),
+        "'p.zip' cannot be read: it is no zip archive; give another one",
+        {"path": "p.zip", "reason": "it is no zip archive"},
+    ),
+    (
+        MissingExtra("trimesh", "mesh"),
+        "this needs the package 'trimesh'; install it with: pip install 'scm-world[mesh]'",
+        {"package": "trimesh", "extra": "mesh"},
     ),
     (
         MissingEngine("bullet", "pip install pybullet", "no wheel"),

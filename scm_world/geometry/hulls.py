@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.errors import MissingEngine, ModelError, UnknownOption
+from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry.arrays import compact
 from scm_world.geometry.hull_kernels import Solid, hull_overlap_kernel
 
@@ -21,7 +21,6 @@ Vector = tuple[float, float, float]
 
 MOST_VERTICES = 256
 FORMATS = ("obj", "stl")
-INSTALL = "pip install 'scm-world[mesh]'"
 THINNEST = 1e-6  # of the greatest extent: what is thinner has no volume
 ROUGHNESS = 3e-7  # of the greatest extent: what sticks out less is the rounding of a file
 SAME_NORMAL = 1e-5  # [rad] sides that differ by less are one side
@@ -62,7 +61,7 @@ def hull_of(points: ArrayLike) -> Hull:
 
     Raises:
         ModelError: The points are not finite, lie in one plane, or have too many corners.
-        MissingEngine: The extra ``mesh`` is not installed.
+        MissingExtra: The extra ``mesh`` is not installed.
 
     Example:
         >>> from itertools import product
@@ -102,7 +101,7 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     Raises:
         ModelError: The file has no volume, too many corners, or cannot be read.
         UnknownOption: The file has another format.
-        MissingEngine: The extra ``mesh`` is not installed.
+        MissingExtra: The extra ``mesh`` is not installed.
     """
     file = Path(path)
     kind = file.suffix.lower().removeprefix(".")
@@ -113,7 +112,7 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     try:
         import trimesh
     except ImportError as error:
-        raise MissingEngine("trimesh", INSTALL) from error
+        raise MissingExtra("trimesh", "mesh") from error
     try:
         with file.open("rb") as stream:
             mesh: Any = trimesh.load(stream, file_type=kind, force="mesh", process=False)
@@ -222,7 +221,7 @@ def _wrap(cloud: Floats) -> Any:
     try:
         from scipy.spatial import ConvexHull, QhullError
     except ImportError as error:
-        raise MissingEngine("scipy", INSTALL) from error
+        raise MissingExtra("scipy", "mesh") from error
     thickness = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
     if thickness[2] <= THINNEST * thickness[0]:
         raise ModelError(["the points lie in one plane and have no volume"])

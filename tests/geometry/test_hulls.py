@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from scm_world._types import Floats
-from scm_world.errors import MissingEngine, ModelError, UnknownOption
+from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry import overlap_volume, rotation_matrix
 from scm_world.geometry.hulls import Hull, box_hull, extents, hull_of, hull_overlap, load_hull
 
@@ -217,7 +217,7 @@ def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     for package in ("trimesh", "scipy.spatial"):
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, package, None)
-            with pytest.raises(MissingEngine, match="mesh"):
+            with pytest.raises(MissingExtra, match="mesh"):
                 load_hull(file)
 
 
