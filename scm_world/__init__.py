@@ -13,7 +13,7 @@ import gymnasium
 
 if TYPE_CHECKING:
     from scm_world.discovery import discover
-    from scm_world.env import ScmWorldEnv
+    from scm_world.env import DeltaAction, MovingAverageAction, ObjectSelector, ScmWorldEnv
     from scm_world.errors import ScmWorldError
     from scm_world.graph import SCM
     from scm_world.tasks import Task, make_task
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "DeltaAction": "env",
+    "MovingAverageAction": "env",
+    "ObjectSelector": "env",
     "SCM": "graph",
     "ScmWorldEnv": "env",
     "ScmWorldError": "errors",
@@ -64,12 +67,15 @@ __all__ = [
     "SCM",
     "Action",
     "Box",
+    "DeltaAction",
     "Derived",
     "Draw",
     "Exogenous",
     "Fixed",
     "Linear",
     "Measured",
+    "MovingAverageAction",
+    "ObjectSelector",
     "Parent",
     "Scale",
     "ScmWorldEnv",
@@ -92,9 +98,17 @@ def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])
 
 
-for _task in ("Pushing", "Reaching"):
-    _id = f"scm_world/{_task}-v0"
+for _task in (
+    "reaching",
+    "pushing",
+    "picking",
+    "pick_and_place",
+    "stacking2",
+    "towers",
+    "stacked_blocks",
+    "creative_stacked_blocks",
+    "general",
+):
+    _id = f"scm_world/{''.join(part.capitalize() for part in _task.split('_'))}-v0"
     if _id not in gymnasium.registry:
-        gymnasium.register(
-            id=_id, entry_point="scm_world.env:ScmWorldEnv", kwargs={"task": _task.lower()}
-        )
+        gymnasium.register(id=_id, entry_point="scm_world.env:ScmWorldEnv", kwargs={"task": _task})

@@ -2,47 +2,69 @@
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
+import runpy
 import warnings
+from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
+from envs import ABSOLUTE, BACKENDS, MADE, PUSHING, REACHING, RELATIVE, make, roll
 from gymnasium.utils.env_checker import check_env
 
-import scm_world  # noqa: F401 # registers the environments
-from scm_world.env import ScmWorldEnv
+from scm_world.env import IDS, ScmWorldEnv
+from scm_world.env.window import Window
 from scm_world.errors import ActionError, InterventionError, UnknownOption
-
-BACKENDS = ["fake", "mujoco"] + (["bullet"] if importlib.util.find_spec("pybullet") else [])
-IDS = ["scm_world/Pushing-v0", "scm_world/Reaching-v0"]
-MODES = ["joint_positions", "joint_torques", "end_effector_positions"]
+from scm_world.tasks import TASKS
 
 
-def make(id_: str = IDS[0], **options: Any) -> Any:
-    """Make an environment without Gymnasium's own checker."""
-    options.setdefault("backend", "fake")
-    return gymnasium.make(id_, disable_env_checker=True, **options)
+def test_there_is_an_environment_for_every_task() -> None:
+    """Every registered task has one environment, named after it."""
+    assert sorted(IDS.values()) == sorted(TASKS)
+    assert "scm_world/CreativeStackedBlocks-v0" in IDS
 
 
-def roll(env: Any, steps: int, seed: int = 0) -> list[tuple[Any, ...]]:
-    """Take random actions and collect what comes back."""
-    actions = np.random.default_rng(seed)
-    first = env.reset(seed=seed)
-    taken = [env.step(actions.uniform(-1, 1, 9).astype(np.float32)) for _ in range(steps)]
-    return [(first[0], 0.0, False, False, first[1]), *taken]
-
-
-@pytest.mark.parametrize(("id_", "backend"), list(itertools.product(IDS, BACKENDS)))
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("id_", "backend"), list(itertools.product(MADE, BACKENDS)))
+@pytest.mark.parametrize("mode", ABSOLUTE)
 def test_checker_has_nothing_to_say(id_: str, backend: str, mode: str) -> None:
     """Gymnasium's checker passes every environment without a warning."""
-    env = make(id_, backend=backend, action_mode=mode, render_mode="rgb_array")
+    check(make(id_, backend=backend, action_mode=mode))
+
+
+@pytest.mark.parametrize("id_", MADE)
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"action_mode": mode} for mode in RELATIVE),
+        {"observation_mode": "full"},
+        {"observation_mode": "full", "normalize_observations": False},
+        {"observation_mode": "pixel", "cameras": ["60"], "image_size": 16},
+        {"observation_mode": "custom", "observe": ["joint_torques", "gravity", "success"]},
+        {"include": ["joint_torques"], "context": "observation"},
+        {"context": "privileged"},
+        {"goal_env": True, "context": "privileged"},
+        {"info_contacts": True, "info_state": True},
+        {"start": {"sensor_noise": 0.05}, "random_goal": "A"},
+    ],
+    ids=str,
+)
+def test_checker_has_nothing_to_say_about_options(id_: str, options: dict[str, Any]) -> None:
+    """Nor about what can be observed, done and told."""
+    check(make(id_, **options), skip_render_check=True)
+
+
+def test_checker_renders_all_that_needs_no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The checker's pictures pass too."""
+    monkeypatch.setattr(Window, "is_possible", staticmethod(lambda: False))
+    check(make(render_mode="rgb_array"), skip_render_check=False)
+
+
+def check(env: Any, *, skip_render_check: bool = True) -> None:
+    """Let the checker look for faults, with warnings as errors."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(env.unwrapped)
+        check_env(env.unwrapped, skip_render_check=skip_render_check)
 
 
 def test_raw_actions_bring_the_one_documented_warning() -> None:
@@ -64,7 +86,7 @@ def test_observation_stays_in_its_space(backend: str) -> None:
         assert env.observation_space.contains(observation)
 
 
-@pytest.mark.parametrize("id_", IDS)
+@pytest.mark.parametrize("id_", [PUSHING, REACHING])
 def test_layout_is_the_published_one(id_: str) -> None:
     """The observation has the published length, and its parts stand where they should."""
     env = make(id_, normalize_observations=False)
@@ -97,24 +119,24 @@ GOLDEN_TIPS = [
     -0.776549,
 ]
 GOLDEN = {
-    IDS[0]: [
+    PUSHING: [
         *GOLDEN_HEAD,
         *GOLDEN_TIPS,
         *[1.0, 0.0, 0.0, 0.0, 0.0, -0.16, -0.87, 0.0, 0.0, 0.0, 0.1, *[0.0] * 6],
         *[20.0, 0.0, 0.0, 0.0, 0.0, 0.16, -0.87, 0.0, 0.0, 0.0, 0.1],
     ],
-    IDS[1]: [*GOLDEN_HEAD, *GOLDEN_TIPS, 0.0, 0.0, -0.6, 0.0, 0.0, -0.48, 0.0, 0.0, -0.36],
+    REACHING: [*GOLDEN_HEAD, *GOLDEN_TIPS, 0.0, 0.0, -0.6, 0.0, 0.0, -0.48, 0.0, 0.0, -0.36],
 }
 
 
-@pytest.mark.parametrize("id_", IDS)
+@pytest.mark.parametrize("id_", [PUSHING, REACHING])
 def test_conventions_reproduce_the_published_observation(id_: str) -> None:
     """Under the predecessor's conventions the observation at reset is the published one."""
     env = make(id_, backend="mujoco", conventions="causal_world")
     np.testing.assert_allclose(env.reset(seed=0)[0], GOLDEN[id_], atol=2e-6)
 
 
-@pytest.mark.parametrize(("id_", "steps"), [(IDS[0], 250), (IDS[1], 125)])
+@pytest.mark.parametrize(("id_", "steps"), [(PUSHING, 250), (REACHING, 125)])
 def test_episode_is_truncated_at_its_length(id_: str, steps: int) -> None:
     """An episode ends after exactly its length, by truncation and never by termination."""
     taken = roll(make(id_), steps)[1:]
@@ -157,7 +179,7 @@ def test_info_has_the_same_keys_everywhere() -> None:
     }
 
 
-@pytest.mark.parametrize("id_", IDS)
+@pytest.mark.parametrize("id_", [PUSHING, REACHING])
 def test_reward_is_the_weighted_sum_of_its_terms(id_: str) -> None:
     """The reward is the weighted sum of the terms in info."""
     env = make(id_, backend="mujoco")
@@ -213,7 +235,21 @@ def test_observation_follows_an_intervention() -> None:
         ({"preset": "slow"}, UnknownOption),
         ({"action_mode": "telepathy"}, UnknownOption),
         ({"conventions": "other"}, UnknownOption),
-        ({"render_mode": "human"}, UnknownOption),
+        ({"render_mode": "hologram"}, UnknownOption),
+        ({"observation_mode": "radar"}, UnknownOption),
+        ({"observation_mode": "custom"}, UnknownOption),
+        ({"observe": ["gravity"]}, UnknownOption),
+        ({"observation_mode": "custom", "observe": ["gravitas"]}, InterventionError),
+        ({"observation_mode": "pixel", "keypoints": True}, UnknownOption),
+        ({"observation_mode": "pixel", "cameras": ["61"]}, UnknownOption),
+        ({"observation_mode": "pixel", "cameras": []}, UnknownOption),
+        ({"observation_mode": "pixel", "cameras": ["60", "overview"]}, UnknownOption),
+        ({"observation_mode": "pixel", "image_size": 0}, UnknownOption),
+        ({"cameras": ["60"]}, UnknownOption),
+        ({"context": "visible"}, UnknownOption),
+        ({"task": "reaching", "keypoints": True}, UnknownOption),
+        ({"random_goal": "C"}, UnknownOption),
+        ({"task_options": {"weights": "sparser"}}, UnknownOption),
         ({"frame_skip": 0}, UnknownOption),
         ({"max_episode_length": -3}, UnknownOption),
     ],
@@ -261,3 +297,12 @@ def test_control_period_is_the_same_in_both_presets() -> None:
             env.step(np.zeros(9))
         heights.append(float(env.world["tool_block.cartesian_position"][2]))
     np.testing.assert_allclose(heights, 0.2 - 0.5 * 9.81 * 0.12**2, atol=4e-3)
+
+
+def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """The example tells which observations notice a mass and a color."""
+    path = Path(__file__).parents[2] / "examples" / "environments.py"
+    runpy.run_path(str(path))["main"]("fake")
+    lines = capsys.readouterr().out.splitlines()
+    seen = [(" mass seen: True" in f" {line}", "color seen: True" in line) for line in lines[:3]]
+    assert seen == [(False, False), (True, True), (False, True)]

@@ -1,0 +1,379 @@
+"""The Gymnasium face of a world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scm_world._types import Values
+from scm_world.backends import Backend
+from scm_world.env.delta import PREFIX, Delta
+from scm_world.env.goals import GoalReward, Goals, reward_scale
+from scm_world.env.observer import Observation, Observer, Observing, observer
+from scm_world.env.start import SPACES, asked, begin, beginning_structure, merged
+from scm_world.env.vector import box
+from scm_world.env.window import Window
+from scm_world.errors import ActionError, UnknownOption
+from scm_world.scene.camera import OVERVIEW, Camera
+from scm_world.tasks import Task, make_task
+from scm_world.tasks.kernels import affine_into
+from scm_world.variables.kinds import SpaceName
+from scm_world.world import Audit, World
+from scm_world.world.declaration import Declaration
+from scm_world.world.start import whole_number
+
+RENDER_MODES = ("rgb_array", "human")
+
+
+class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """An environment whose every variable is a node of a causal graph.
+
+    Made by ``gymnasium.make("scm_world/Pushing-v0")``; ``scm_world.env.IDS`` lists the ids.
+
+    Every observation lies in ``observation_space``. Bounds are physical; a number beyond them (a
+    joint faster than 50 rad/s) saturates, like a sensor. An episode is truncated at its length
+    and never terminated. An intervention that changes which bodies exist changes what is
+    observed: ``observation_space`` is then the one of the new structure.
+
+    Args:
+        task: Name of a registered task, or a task.
+        task_options: Arguments of the constructor of a task that is given by its name.
+        backend: ``"mujoco"``, ``"bullet"`` or ``"fake"``.
+        preset: ``"fast"`` or ``"precise"``.
+        frame_skip: Length of a control step in units of 4 ms.
+        action_mode: ``"joint_positions"``, ``"joint_torques"`` or ``"end_effector_positions"``,
+            or one of them after ``"delta_"``: see ``DeltaAction``.
+        normalize_actions: Take actions in [-1, 1] instead of SI units.
+        observation_mode: ``"structured"``: the published layout; ``"full"``: that and every other
+            variable; ``"custom"``: the variables in ``observe``; ``"pixel"``: pictures.
+        observe: Names of variables, for ``"custom"``.
+        include: Names of variables to append to the vector.
+        context: Where the parameters that can be intervened on are: ``"none"``,
+            ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
+            it. The noise of the sensors does not reach them.
+        keypoints: Append the eight corners of every block and every goal.
+        cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
+            ``"pixel"``; the three of the robot if None.
+        image_size: Height and width of pictures, or both in one [pixels].
+        normalize_observations: Give numbers in [-1, 1] instead of SI units.
+        goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, and
+            have a method ``compute_reward``: see ``GoalReward``.
+        start: An intervention at every reset; a value may be the name of a space to draw from.
+        random_goal: Draw a new goal at every reset, from ``"A"``, ``"B"`` or ``"A|B"``.
+        attempts: How often a reset is tried if it draws bodies into one place; every attempt is
+            the beginning of the next episode.
+        variables_space: The space in which every target of an intervention must lie.
+        info_contacts: Whether ``info["contacts"]`` lists what touches.
+        info_state: Whether ``info["state"]`` has the values of all variables.
+        max_episode_length: In control steps; the task's own if None.
+        conventions: ``"scm_world"`` or ``"causal_world"``.
+        render_mode: None, ``"rgb_array"`` or ``"human"``.
+
+    Raises:
+        UnknownOption: An option does not exist, or does not go with the others.
+        EngineError: The engine is not installed, or there is no screen for ``"human"``.
+
+    Example:
+        >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
+        >>> observation, info = env.reset(seed=0, options={"do": {"tool_block.mass": 0.04}})
+        >>> observation.shape, info["is_success"]
+        ((56,), False)
+        >>> print(env.unwrapped.do({"floor_friction": 0.4}))
+        floor_friction = 0.4, engine reports 0.4
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 # declared by Gymnasium as an instance variable
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 25,
+    }
+
+    def __init__(
+        self,
+        task: Task | str = "pushing",
+        *,
+        task_options: Mapping[str, Any] | None = None,
+        backend: str = "mujoco",
+        preset: str = "fast",
+        frame_skip: int = 10,
+        action_mode: str = "joint_positions",
+        normalize_actions: bool = True,
+        observation_mode: str = "structured",
+        observe: Sequence[str] = (),
+        include: Sequence[str] = (),
+        context: str = "none",
+        keypoints: bool = False,
+        cameras: Sequence[str | Camera] | None = None,
+        image_size: int | tuple[int, int] | None = None,
+        normalize_observations: bool = True,
+        goal_env: bool = False,
+        start: Mapping[str, Any] | None = None,
+        random_goal: SpaceName | None = None,
+        attempts: int = 1,
+        variables_space: SpaceName | None = None,
+        info_contacts: bool = False,
+        info_state: bool = False,
+        max_episode_length: int | None = None,
+        conventions: str = "scm_world",
+        render_mode: str | None = None,
+    ) -> None:
+        self._how = Observing(
+            mode=observation_mode,
+            names=tuple(observe),
+            include=tuple(include),
+            context=context,
+            keypoints=keypoints,
+            cameras=cameras,
+            image_size=image_size,
+            normalize=normalize_observations,
+            goals=goal_env,
+        )
+        self.world = World(
+            _made(task, task_options),
+            backend=backend,
+            preset=preset,
+            action_mode=action_mode.removeprefix(PREFIX),
+            frame_skip=frame_skip,
+            max_episode_length=max_episode_length,
+            conventions=conventions,
+            variables_space=variables_space,
+        )
+        self.observation_mode, self.action_mode = observation_mode, action_mode
+        self._rich = (info_contacts, info_state)
+        self._begin_with(start, random_goal, attempts)
+        self._open(render_mode)
+        self._act(normalize=normalize_actions, relative=action_mode.startswith(PREFIX))
+        extra = int(self.world.conventions.extra_step)
+        self._limit = self.world.max_episode_length + extra
+        self._scale = reward_scale(self.world)
+        self._terms = tuple(self.world.task.weights)
+        self._version = -1
+        self._observers: WeakKeyDictionary[Declaration, tuple[Observer, tuple[str, ...]]]
+        self._observers = WeakKeyDictionary()
+        if goal_env:
+            self.compute_reward = GoalReward(self.world)
+        self._arrange(beginning_structure(self.world, self._start))
+
+    def _open(self, render_mode: str | None) -> None:
+        """Choose how pictures are shown."""
+        if render_mode not in (None, *RENDER_MODES):
+            raise UnknownOption("render_mode", render_mode, RENDER_MODES)
+        self.render_mode = render_mode
+        self._window = Window() if render_mode == "human" else None
+        modes = [mode for mode in RENDER_MODES if mode != "human" or Window.is_possible()]
+        self.metadata = {
+            **type(self).metadata,
+            "render_modes": modes,
+            "render_fps": round(1 / self.world.control_period),
+        }
+
+    def _begin_with(
+        self, start: Mapping[str, Any] | None, random_goal: str | None, attempts: int
+    ) -> None:
+        if random_goal not in (None, *SPACES):
+            raise UnknownOption("random_goal", random_goal, SPACES)
+        self._start, self._random_goal = asked(start), random_goal
+        self._attempts = whole_number("attempts", attempts, least=1)
+
+    def _act(self, *, normalize: bool, relative: bool) -> None:
+        """Choose what an action means."""
+        low, high = self.world.action_low, self.world.action_high
+        self._middle, self._half = (low + high) / 2.0, (high - low) / 2.0
+        if not normalize:
+            self._middle, self._half = np.zeros(9), np.ones(9)
+        bounds = (-np.ones(9), np.ones(9)) if normalize else (low, high)
+        self._delta = self.relative() if relative else None
+        self.action_space = self._delta.space() if self._delta else box(*bounds)
+
+    def relative(self) -> Delta:
+        """Give what turns relative actions into those that this environment would take."""
+        return Delta(self.world, self._middle, self._half)
+
+    def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Give the (absolute) action that stands for a command in SI units, shape (9,)."""
+        found: NDArray[np.float64] = (np.asarray(command) - self._middle) / self._half
+        return found
+
+    def _arrange(self, declaration: Declaration) -> None:
+        """Observe the structure that there is."""
+        found = self._observers.get(declaration)
+        if found is None:
+            goals = Goals(declaration)
+            made = observer(self.world, declaration, self._how, goals)
+            needed = (*made.names, *goals.names, *self._terms, "success", "reward")
+            found = self._observers[declaration] = made, tuple(dict.fromkeys(needed))
+        self._declaration = declaration
+        self._observer, self._needed = found
+        self.observation_space = self._observer.space
+
+    def _look(self) -> Values:
+        """Compute what is needed of the present."""
+        if self._version != self.world.version:
+            self._version = self.world.version
+            if self.world.declaration is not self._declaration:
+                self._arrange(self.world.declaration)
+        return self.world.evaluate(self._needed)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: Of the noise.
+            options: ``{"do": {…}}``: an intervention that holds for the whole episode. Where it
+                sets what ``start`` or a random goal sets too, it counts.
+
+        Raises:
+            UnknownOption: Another key than ``"do"``.
+            InterventionError: The intervention was refused.
+        """
+        super().reset(seed=seed)
+        unknown = set(options or {}) - {"do"}
+        if unknown:
+            raise UnknownOption("reset option", min(unknown), ("do",))
+        begin(self.world, seed, self._acts((options or {}).get("do")), self._attempts)
+        now = self._look()
+        self._show()
+        return self._observer.observe(now), self._info(now)
+
+    def _acts(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Put together what is done at a reset."""
+        mine = asked(do)
+        if not (self._start or self._random_goal):
+            return mine
+        structure = beginning_structure(self.world, {**self._start, **mine})
+        goal: dict[str, Any] = {}
+        if self._random_goal:
+            goal = structure.task.sample_goal(self._random_goal)  # type: ignore[arg-type]
+        return merged(structure, goal, self._start, mine)
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Advance one control step.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite.
+        """
+        given = np.array(action, dtype=np.float64)
+        if given.shape != (9,):
+            raise ActionError(f"an action has shape (9,), got {given.shape}", action)
+        if self._delta is not None:
+            given = self._delta.absolute(given)
+        affine_into(given, self._middle, self._half, given)
+        self.world.step(given)
+        now = self._look()
+        reward = self._scale * float(now["reward"])
+        truncated = self.world.index >= self._limit
+        self._show()
+        return self._observer.observe(now), reward, False, truncated, self._info(now)
+
+    def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
+        """Intervene now; see ``World.do``. ``observe`` gives the observation afterwards.
+
+        Args:
+            request: As in ``World.do``; ``"A"``, ``"B"`` and ``"A|B"`` stand for draws.
+            space: In which every target must lie.
+
+        Raises:
+            InterventionError: The intervention was refused; nothing has changed.
+        """
+        audit = self.world.do(asked(request), space=space)
+        self._look()
+        return audit
+
+    def observe(self) -> Observation:
+        """Give the observation of the present."""
+        now = self._look()
+        found: Observation = self._observer.observe(now)
+        return found
+
+    @property
+    def layout(self) -> dict[str, slice]:
+        """Where each variable stands in the vector that is observed; empty for pictures."""
+        return dict(self._observer.layouts.get("observation", {}))
+
+    @property
+    def context_layout(self) -> dict[str, slice]:
+        """Where each variable stands in the privileged context; empty without one."""
+        return dict(self._observer.layouts.get("context", {}))
+
+    def _info(self, now: Values) -> dict[str, Any]:
+        achieved, desired = self.world.task.goals(now)
+        success = bool(now["success"])
+        info = {
+            "is_success": success,
+            "success": success,
+            "fractional_success": float(now["fractional_success"]),
+            "achieved_goal": achieved,
+            "desired_goal": desired,
+            "reward_terms": {name: float(now[name]) for name in self._terms},
+        }
+        contacts, state = self._rich
+        if contacts:
+            info["contacts"] = _touches(self.world.backend)
+        if state:
+            info["state"] = self.world.values()
+        return info
+
+    def _show(self) -> None:
+        if self._window is not None:
+            self._window.show(self.world.scene())
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the scene, shape (480, 640, 3); None without ``render_mode="rgb_array"``.
+
+        With ``render_mode="human"`` the window shows every step by itself.
+        """
+        if self.render_mode != "rgb_array":
+            self._show()
+            return None
+        from scm_world.backends.renderer import render
+
+        return render(self.world.scene(), OVERVIEW).rgb
+
+    def depth(self, camera: Camera = OVERVIEW) -> NDArray[np.float32]:
+        """Measure how far away everything is, shape (h, w) [m]."""
+        from scm_world.backends.renderer import depth_and_segmentation
+
+        found: NDArray[np.float32] = depth_and_segmentation(self.world.scene(), (camera,))[0][0]
+        return found
+
+    def segmentation(self, camera: Camera = OVERVIEW) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+        """Tell which body every pixel shows.
+
+        Returns:
+            Shape (h, w): an index into the names of the bodies, -1 where there is nothing; and
+            these names.
+        """
+        from scm_world.backends.renderer import body_names, depth_and_segmentation
+
+        scene = self.world.scene()
+        return depth_and_segmentation(scene, (camera,))[1][0], body_names(scene.structure)
+
+    def close(self) -> None:
+        """Free the engine and the window."""
+        if self._window is not None:
+            self._window.close()
+        self.world.close()
+
+
+def _touches(backend: Backend) -> tuple[dict[str, Any], ...]:
+    """Copy what the engine says about contacts."""
+    return tuple(
+        {name: np.copy(value) if isinstance(value, np.ndarray) else value for name, value in fields}
+        for fields in (vars(touch).items() for touch in backend.contacts())
+    )
+
+
+def _made(task: Task | str, options: Mapping[str, Any] | None) -> Task:
+    if isinstance(task, str):
+        return make_task(task, **(options or {}))
+    if options:
+        raise UnknownOption("task_options", dict(options), ("none, with a task that is made",))
+    return task

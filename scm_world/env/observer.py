@@ -1,0 +1,192 @@
+"""What is observed: a choice of parts, put together for the structure that there is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, final
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Values
+from scm_world.env.bounds import bounds, spread
+from scm_world.env.goals import Goals
+from scm_world.env.keypoints import CORNERS, KEYPOINTS, Keypoints
+from scm_world.env.vector import Layouts, Part, Vector
+from scm_world.errors import UnknownOption
+from scm_world.scene.camera import Camera
+from scm_world.tasks import HEAD, TIME, Building, Observed
+from scm_world.world import World
+from scm_world.world.declaration import Declaration
+
+MODES = ("structured", "full", "pixel", "custom")
+CONTEXTS = ("none", "observation", "privileged")
+
+Observation = NDArray[Any] | dict[str, NDArray[Any]]
+
+
+class Observer(Protocol):
+    """Something that looks at a world.
+
+    Attributes:
+        names: The variables that have to be computed before it looks.
+        space: In which all observations lie.
+        layouts: Where each variable stands, in every vector that is observed.
+    """
+
+    names: tuple[str, ...]
+    space: gymnasium.Space[Any]
+    layouts: Layouts
+
+    def observe(self, now: Values) -> Any:
+        """Give the observation of the present values."""
+
+
+@final
+@dataclass(frozen=True)
+class Observing:
+    """How a world is observed; see ``ScmWorldEnv`` for the fields.
+
+    Raises:
+        UnknownOption: Something does not exist, or does not go together.
+    """
+
+    mode: str = "structured"
+    names: Sequence[str] = ()
+    include: Sequence[str] = ()
+    context: str = "none"
+    keypoints: bool = False
+    cameras: Sequence[str | Camera] | None = None
+    image_size: int | tuple[int, int] | None = None
+    normalize: bool = True
+    goals: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise UnknownOption("observation_mode", self.mode, MODES)
+        if self.context not in CONTEXTS:
+            raise UnknownOption("context", self.context, CONTEXTS)
+        if bool(self.names) != (self.mode == "custom"):
+            allowed = ("names with observation_mode='custom'", "nothing in the other modes")
+            raise UnknownOption("observe", list(self.names), allowed)
+        pictures = self.mode == "pixel"
+        appended = self.include or self.keypoints or self.context == "observation"
+        if pictures and appended:
+            raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
+        if not pictures and (self.cameras is not None or self.image_size is not None):
+            raise UnknownOption("camera", self.mode, ("any, with observation_mode='pixel'",))
+
+
+@final
+class Together:
+    """Several observations in a dictionary.
+
+    Args:
+        parts: By name.
+        goals: What is achieved and what is desired, if that is asked for.
+    """
+
+    def __init__(self, parts: dict[str, Observer], goals: Goals | None) -> None:
+        self._parts, self._goals = parts, goals
+        self.names = tuple(name for part in parts.values() for name in part.names)
+        self.layouts: Layouts = {
+            name: layout for name, part in parts.items() for layout in part.layouts.values()
+        }
+        spaces = {name: part.space for name, part in parts.items()}
+        self.space: gymnasium.Space[Any] = gymnasium.spaces.Dict(
+            spaces | (goals.spaces if goals else {})
+        )
+
+    def observe(self, now: Values) -> dict[str, NDArray[Any]]:
+        """Give all of them."""
+        found = {name: part.observe(now) for name, part in self._parts.items()}
+        return found if self._goals is None else found | self._goals.observe(now)
+
+
+def observer(world: World, declaration: Declaration, how: Observing, goals: Goals) -> Observer:
+    """Put together what is asked for.
+
+    Args:
+        world: That is observed.
+        declaration: Of the structure; the observer holds for that one only.
+        how: What is asked for.
+        goals: Of the structure.
+
+    Raises:
+        UnknownOption: The task has no boxes, or there is no such camera.
+        UnknownVariable: There is no such variable.
+    """
+    main: Observer
+    if how.mode == "pixel":
+        from scm_world.env.pixels import Pixels, chosen
+
+        original = world.conventions.published_observation
+        main = Pixels(world, chosen(how.cameras, how.image_size, original=original))
+    else:
+        main = _vector(world, declaration, how)
+    parts: dict[str, Observer] = {"observation": main}
+    if how.context == "privileged":
+        about = _quiet(_parts(world, declaration, context(declaration)))
+        parts["context"] = Vector(world, declaration, about, normalize=how.normalize)
+    return Together(parts, goals if how.goals else None) if len(parts) > 1 or how.goals else main
+
+
+def context(declaration: Declaration) -> tuple[str, ...]:
+    """Name every parameter that an intervention can set: masses, frictions, sizes and goals."""
+    model = declaration.model
+    return tuple(name for name in declaration.static_names if model.declared(name).settable)
+
+
+def published(world: World, declaration: Declaration) -> dict[str, Observed]:
+    """List the parts of the structured observation, by variable."""
+    length = world.max_episode_length * world.control_period
+    end = length if world.given_length is None else float(world.given_length)
+    parts = (Observed(TIME, (0.0, end)), *HEAD, *declaration.task.observed())
+    return {part.variable: part for part in parts}
+
+
+def _vector(world: World, declaration: Declaration, how: Observing) -> Vector:
+    names = list(how.names if how.mode == "custom" else published(world, declaration))
+    if how.mode == "full":
+        names += list(declaration.model)
+    names = list(dict.fromkeys((*names, *how.include)))
+    parts = _parts(world, declaration, names)
+    corners = _keypoints(declaration) if how.keypoints else None
+    if corners is not None:
+        parts.append(Part(KEYPOINTS, -np.ones(corners.size), np.ones(corners.size)))  # [m]
+    if how.context == "observation":
+        rest = [name for name in context(declaration) if name not in names]
+        parts += _quiet(_parts(world, declaration, rest))
+    return Vector(world, declaration, parts, normalize=how.normalize, keypoints=corners)
+
+
+def _parts(world: World, declaration: Declaration, names: Iterable[str]) -> list[Part]:
+    """Give variables the bounds of the structured observation, or those they declare."""
+    known = published(world, declaration)
+    as_published = world.conventions.published_observation
+    parts = []
+    for name in names:
+        low, high = bounds(declaration.model, name)
+        observed, shape = known.get(name), declaration.model.declared(name).shape
+        if observed is not None and as_published:
+            low, high = (spread(side, shape) for side in observed.published)
+        elif observed is not None and observed.low is not None:
+            low, high = spread(observed.low, shape), spread(observed.high, shape)
+        parts.append(Part(name, low, high))
+    return parts
+
+
+def _quiet(parts: Iterable[Part]) -> list[Part]:
+    return [Part(part.name, part.low, part.high, sensed=False) for part in parts]
+
+
+def _keypoints(declaration: Declaration) -> Keypoints:
+    task = declaration.task
+    if not isinstance(task, Building):
+        raise UnknownOption("keypoints", True, ("False: the task has no blocks",))
+    return Keypoints((*task.tools(), *task.targets()))
+
+
+__all__ = ["CORNERS", "Observation", "Observer", "Observing", "context", "observer", "published"]

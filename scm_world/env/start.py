@@ -1,0 +1,84 @@
+"""How episodes begin: the interventions of the environment, of the goal and of the user."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from scm_world.errors import Infeasible, InterventionError
+from scm_world.graph import flatten
+from scm_world.variables import Draw
+from scm_world.world import World
+from scm_world.world.declaration import Declaration
+
+SPACES = ("A", "B", "A|B")
+
+
+def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Read an intervention; the name of a space stands for a draw from it.
+
+    Example:
+        >>> asked({"tool_block": {"mass": "A", "friction": 0.7}})
+        {'tool_block.mass': Draw(kind='draw', source='A'), 'tool_block.friction': 0.7}
+    """
+    return {
+        name: Draw(value) if isinstance(value, str) and value in SPACES else value
+        for name, value in flatten(given or {}).items()
+    }
+
+
+def merged(declaration: Declaration, *requests: Mapping[str, Any]) -> dict[str, Any]:
+    """Put interventions over one another; the last one that sets a quantity counts.
+
+    Args:
+        declaration: Knows which names are coordinates of one quantity.
+        requests: With dotted names.
+    """
+    merged_acts: dict[str, Any] = {}
+    for acts in requests:
+        mine = {_target(declaration, name) for name in acts}
+        kept = {n: act for n, act in merged_acts.items() if _target(declaration, n) not in mine}
+        merged_acts = {**kept, **acts}
+    return merged_acts
+
+
+def begin(world: World, seed: int | None, acts: Mapping[str, Any], attempts: int) -> None:
+    """Reset a world, with an intervention that may draw something impossible.
+
+    Args:
+        world: To reset.
+        seed: Of the noise.
+        acts: What is done at the reset.
+        attempts: How often bodies may be drawn into one place until that is an error. Every
+            attempt is the beginning of the next episode, so it draws anew.
+
+    Raises:
+        InterventionError: The intervention was refused, at the last attempt.
+    """
+    for left in reversed(range(attempts)):
+        try:
+            world.reset(seed=seed, do=acts)
+        except Infeasible:
+            if not left:
+                raise
+            seed = None
+        else:
+            return
+
+
+def _target(declaration: Declaration, name: str) -> str:
+    return declaration.model.target(name) if name in declaration.model else name
+
+
+def beginning_structure(world: World, acts: Mapping[str, Any]) -> Declaration:
+    """Give the structure in which an episode begins after an intervention at its reset."""
+    family = world.family
+    mine: dict[str, Any] = {}
+    for name, value in acts.items():
+        if name in family.head:
+            try:
+                mine[name] = family.head.accept(name, value)
+            except InterventionError:  # the reset will say so
+                continue
+    found = family.after(mine, family.head, family.head.solve(), world.moment(0))
+    return found or family.natural(None)

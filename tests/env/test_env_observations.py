@@ -1,0 +1,243 @@
+"""What an environment lets one observe."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from envs import MADE, PUSHING, REACHING, make, roll
+
+from scm_world.backends.renderer import goal_pixels
+from scm_world.env.bounds import WIDE, bounds
+from scm_world.env.keypoints import corners
+from scm_world.geometry import from_rotation_vector, rotation_matrix
+from scm_world.graph import SCM
+from scm_world.scene.camera import CAMERAS
+from scm_world.variables import Box, Derived, Exogenous, Linear
+from scm_world.variables.spaces import Affine, Switch
+
+
+def values(env: Any, observation: Any) -> dict[str, Any]:
+    """Cut a vector into its parts."""
+    return {name: observation[where] for name, where in env.unwrapped.layout.items()}
+
+
+@pytest.mark.parametrize("id_", MADE)
+def test_full_mode_shows_every_variable(id_: str) -> None:
+    """The full observation begins with the structured one and has all variables, in SI units."""
+    env = make(id_, observation_mode="full", normalize_observations=False)
+    roll(env, 3)
+    observation, world = env.unwrapped.observe(), env.unwrapped.world
+    plain = make(id_, normalize_observations=False)
+    roll(plain, 3)
+    structured = plain.unwrapped.observe()
+    np.testing.assert_array_equal(observation[: structured.size], structured)
+    found = values(env, observation)
+    assert set(found) == set(world.model)
+    for name, value in world.values().items():
+        np.testing.assert_allclose(found[name], value.ravel(), rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+def test_custom_mode_is_scaled_by_declared_bounds() -> None:
+    """A chosen variable goes from -1 at its lower bound to 1 at its upper one."""
+    names = ["gravity", "tool_block.friction", "tool_block.mass"]
+    env = make(observation_mode="custom", observe=names)
+    env.reset(seed=0, options={"do": {"gravity": [-30.0, 0.0, 30.0], "tool_block.friction": 0.5}})
+    found = values(env, env.unwrapped.observe())
+    assert list(found) == names
+    np.testing.assert_allclose(found["gravity"], [-1.0, 0.0, 1.0])
+    np.testing.assert_allclose(found["tool_block.friction"], [-0.5])
+
+
+def test_what_has_no_bounds_is_given_as_it_is() -> None:
+    """A reward term declares no bounds: it is not scaled, and its space is as wide as can be."""
+    env = make(observation_mode="custom", observe=["success", "reward.block_to_goal"])
+    env.reset(seed=0)
+    env.unwrapped.do({"tool_block.cartesian_position": [0.0, 0.0, 0.0325]})
+    env.step(np.zeros(9))
+    env.unwrapped.do({"tool_block.cartesian_position": [0.0, 0.05, 0.0325]})
+    world = env.unwrapped.world
+    expected = float(world["reward.block_to_goal"])
+    assert expected == pytest.approx(0.05)
+    np.testing.assert_allclose(env.unwrapped.observe(), [-1.0, expected], rtol=1e-6)
+    assert env.observation_space.high.tolist() == [1.0, WIDE]
+
+
+def test_bounds_that_follow_a_variable_are_as_wide_as_it_makes_them() -> None:
+    """A bound that follows another variable is taken at its widest."""
+    model = SCM(
+        [
+            Exogenous(name="n", dtype="integer", bounds={"kind": "integers", "low": 0, "high": 3}),
+            Exogenous(name="size", shape=(2,), default=(0.1, 0.1), bounds=Box((0.0, 0.2), 0.4)),
+            Exogenous(
+                name="place",
+                shape=(2,),
+                default=(0.0, 0.5),
+                bounds=Box(
+                    (Affine(parent="size", index=1, scale=-0.5), 0.0),
+                    (0.3, Switch(parent="n", below=1.0, above=2.0)),
+                ),
+            ),
+            Derived(name="sum", parents=("n",), mechanism=Linear(weights=(1.0,))),
+        ]
+    )
+    np.testing.assert_allclose(bounds(model, "place"), [[-0.2, 0.0], [0.3, 2.0]])
+    assert bounds(model, "n") == ([0.0], [3.0])
+    assert bounds(model, "sum") == ([-WIDE], [WIDE])
+
+
+def test_appended_parts_follow_the_structured_ones() -> None:
+    """What is included, the corners and the context stand behind the layout in this order."""
+    env = make(include=["joint_torques"], keypoints=True, context="observation")
+    env.reset(seed=0)
+    names = list(env.unwrapped.layout)
+    assert env.unwrapped.layout["joint_torques"] == slice(56, 65)
+    assert env.unwrapped.layout["keypoints"] == slice(65, 65 + 48)
+    rest = names[names.index("keypoints") + 1 :]
+    model = env.unwrapped.world.model
+    assert {"gravity", "tool_block.mass", "block.size", "goal_block.polar"} <= set(rest)
+    assert all(model.declared(name).settable for name in rest)
+    assert len(set(names)) == len(names)
+
+
+def test_privileged_context_is_told_apart() -> None:
+    """The privileged context stands beside the observation and follows interventions."""
+    env = make(context="privileged")
+    first, _ = env.reset(seed=0)
+    then, _ = env.reset(seed=0, options={"do": {"tool_block.mass": 0.09}})
+    np.testing.assert_array_equal(first["observation"], then["observation"])
+    where = env.unwrapped.context_layout["tool_block.mass"]
+    changed = np.flatnonzero(first["context"] != then["context"])
+    assert changed.tolist() == [where.start]
+    assert env.observation_space.contains(then)
+
+
+def test_corners_are_those_of_the_box() -> None:
+    """In the frame of the box its corners are at plus and minus half its edges, each once."""
+    size, place = np.array([0.1, 0.2, 0.3]), np.array([1.0, -2.0, 0.5])
+    turn = from_rotation_vector(np.array([0.3, -0.7, 1.1]))
+    found = (corners(size, place, turn) - place) @ rotation_matrix(turn)
+    np.testing.assert_allclose(np.abs(found), np.broadcast_to(size / 2, (8, 3)))
+    assert len({tuple(row) for row in np.sign(found)}) == 8
+
+
+def test_keypoints_follow_block_and_goal() -> None:
+    """The first eight corners are those of the block, the others those of the goal."""
+    env = make(keypoints=True, normalize_observations=False)
+    env.reset(seed=0, options={"do": {"tool_block.cylindrical_position": [0.1, 0.0, 0.0325]}})
+    found = env.unwrapped.observe()[env.unwrapped.layout["keypoints"]].reshape(2, 8, 3)
+    np.testing.assert_allclose(found.mean(axis=1), [[0.1, 0, 0.0325], [0, 0.08, 0.0325]], atol=1e-7)
+
+
+def test_no_sensor_noise_costs_no_bit() -> None:
+    """With the noise set to zero an observation is bit-identical to one without any."""
+    env = make(start={"sensor_noise": 0.0})
+    for mine, plain in zip(roll(env, 5), roll(make(), 5), strict=True):
+        np.testing.assert_array_equal(mine[0], plain[0])
+
+
+def test_sensor_noise_is_a_function_of_the_instant() -> None:
+    """Noise is the same for one seed and however often one looks, and differs between steps."""
+    noisy = {"start": {"sensor_noise": 0.01}}
+    one, two, other = roll(make(**noisy), 3), roll(make(**noisy), 3), roll(make(**noisy), 3, seed=1)
+    clean = roll(make(), 3)
+    assert all(np.array_equal(a[0], b[0]) for a, b in zip(one, two, strict=True))
+    first, second = (one[i][0] - clean[i][0] for i in (0, 1))
+    assert not np.array_equal(first, second)
+    assert not np.array_equal(first, other[0][0] - clean[0][0])
+    env = make(**noisy)
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(env.unwrapped.observe(), observation)
+
+
+def test_sensor_noise_has_the_declared_strength() -> None:
+    """Its deviation is the fraction of half the range, and it reaches neither world nor context."""
+    env = make(context="privileged", start={"sensor_noise": 0.02})
+    clean = make(context="privileged")
+    noise = []
+    for _ in range(40):
+        mine, plain = env.reset()[0], clean.reset()[0]
+        inside = np.abs(plain["observation"]) < 0.9
+        noise.extend((mine["observation"] - plain["observation"])[inside])
+        changed = np.flatnonzero(mine["context"] != plain["context"])
+        assert changed.size == 1  # the strength of the noise itself
+    assert np.std(noise) == pytest.approx(0.02, rel=0.1)
+    assert abs(np.mean(noise)) < 0.002
+
+
+def test_noisy_numbers_saturate() -> None:
+    """Strong noise leaves no number outside of the space."""
+    env = make(start={"sensor_noise": 1.0})
+    for observation, *_ in roll(env, 20):
+        assert env.observation_space.contains(observation)
+
+
+def test_pixels_show_now_and_then_the_goal() -> None:
+    """The second half is the picture of the goals; it stays until someone intervenes."""
+    env = make(observation_mode="pixel", image_size=(24, 32), cameras=["300", CAMERAS[0]])
+    first, _ = env.reset(seed=0)
+    assert first.shape == (4, 3, 24, 32)
+    assert first.dtype == np.uint8
+    expected = np.empty((2, 3, 24, 32), np.uint8)
+    cameras = env.unwrapped._observer._cameras
+    assert [camera.name for camera in cameras] == ["300", "60"]
+    goal_pixels(env.unwrapped.world.scene(), cameras, expected)
+    np.testing.assert_array_equal(first[2:], expected)
+    moved = env.step(np.ones(9))[0]
+    assert not np.array_equal(moved[:2], first[:2])
+    np.testing.assert_array_equal(moved[2:], first[2:])
+    env.unwrapped.do({"goal_block.polar": [0.0, 0.0]})
+    assert not np.array_equal(env.unwrapped.observe()[2:], first[2:])
+    assert env.unwrapped.layout == {}
+
+
+def test_the_predecessors_pictures_have_their_channels_last() -> None:
+    """Under its conventions a picture has shape (128, 128, 3)."""
+    env = make(observation_mode="pixel", conventions="causal_world")
+    assert env.reset(seed=0)[0].shape == env.observation_space.shape == (6, 128, 128, 3)
+
+
+def test_bodies_that_come_are_observed() -> None:
+    """An intervention that changes which bodies exist changes the space; a reset undoes it."""
+    env = make(REACHING)
+    assert env.reset(seed=0)[0].shape == (37,)
+    env.unwrapped.do({"number_of_obstacles": 2})
+    assert env.observation_space.shape == (37 + 22,)
+    observation = env.step(np.zeros(9))[0]
+    assert env.observation_space.contains(observation)
+    assert list(env.unwrapped.layout)[-1].startswith("obstacle_1.")
+    assert env.reset()[0].shape == env.observation_space.shape == (37,)
+
+
+def test_bodies_that_are_there_from_the_start_are_in_the_space() -> None:
+    """A start with other bodies is known to the space before the first reset."""
+    env = make(REACHING, start={"number_of_obstacles": 3})
+    assert env.observation_space.shape == (37 + 33,)
+    assert env.reset(seed=0)[0].shape == (37 + 33,)
+    shape = env.reset(options={"do": {"number_of_obstacles": 1}})[0].shape
+    assert shape == env.observation_space.shape == (37 + 11,)
+
+
+def test_info_tells_state_and_contacts() -> None:
+    """On request info lists the contacts of the engine and the values of all variables."""
+    env = make(backend="mujoco", info_contacts=True, info_state=True)
+    taken = roll(env, 3)
+    world = env.unwrapped.world
+    kinds = [{n: (v.shape, v.dtype) for n, v in step[4]["state"].items()} for step in taken]
+    assert all(kind == kinds[0] for kind in kinds)
+    assert set(kinds[0]) == set(world.model)
+    touching = taken[-1][4]["contacts"]
+    assert len(touching) == len(world.backend.contacts()) > 0
+    assert {frozenset(touch["bodies"]) for touch in touching} == {
+        frozenset({"floor", "tool_block"})
+    }
+    assert taken[0][4]["contacts"] == ()
+
+
+def test_layout_names_what_stands_where() -> None:
+    """The layout of the structured observation is the documented one."""
+    layout = make(PUSHING).unwrapped.layout
+    assert layout["time_left_for_task"] == slice(0, 1)
+    assert layout["tool_block.orientation"] == slice(35, 39)
+    assert layout["goal_block.size"] == slice(46, 49)

@@ -1,0 +1,124 @@
+"""Pictures and windows."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from envs import BACKENDS, REACHING, make
+
+from scm_world.env.window import Window
+from scm_world.errors import EngineError
+from scm_world.scene.camera import CAMERAS
+
+
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Pretend that there is a screen; give the windows that were opened."""
+    import mujoco.viewer
+
+    windows: list[Any] = []
+
+    class Handle:
+        def __init__(self, model: Any, data: Any, **_: Any) -> None:
+            self.model, self.data, self.synced, self.open = model, data, 0, True
+            self.user_scn = mujoco.MjvScene(model, maxgeom=50)
+            windows.append(self)
+
+        def is_running(self) -> bool:
+            return self.open
+
+        def lock(self) -> Any:
+            return np.errstate()  # any context will do
+
+        def sync(self) -> None:
+            self.synced += 1
+
+        def close(self) -> None:
+            self.open = False
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", Handle)
+    return windows
+
+
+def test_without_a_screen_a_window_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is no screen, the error says so when the environment is made."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    assert not Window.is_possible()
+    with pytest.raises(EngineError, match="rgb_array"):
+        make(render_mode="human")
+    assert make().unwrapped.metadata["render_modes"] == ["rgb_array"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_window_shows_every_step(backend: str, screen: list[Any]) -> None:
+    """Whatever the engine, MuJoCo's window shows where things are, goals included."""
+    env = make(backend=backend, render_mode="human")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.ones(9))
+    env.unwrapped.do({"block.size": [0.08, 0.08, 0.08]})
+    assert env.render() is None
+    (window,) = screen
+    assert window.synced == 5
+    world = env.unwrapped.world
+    np.testing.assert_allclose(window.data.qpos[:9], world["joint_positions"], atol=1e-6)
+    np.testing.assert_allclose(window.model.geom("tool_block").size, 0.04)
+    goal = window.user_scn.geoms[0]
+    np.testing.assert_allclose(goal.pos, world["goal_block.cartesian_position"], atol=1e-6)
+    np.testing.assert_allclose(goal.size, 0.04, atol=1e-6)
+    env.close()
+    assert not window.open
+
+
+def test_a_window_for_other_bodies_is_a_new_one(screen: list[Any]) -> None:
+    """When bodies come, another window opens; what someone has closed stays closed."""
+    env = make(REACHING, render_mode="human")
+    env.reset(seed=0)
+    env.unwrapped.do({"number_of_obstacles": 1})
+    env.render()
+    first, second = screen
+    assert (first.open, second.open) == (False, True)
+    second.open = False
+    env.render()
+    assert second.synced == 1
+
+
+def test_depth_and_segmentation_agree() -> None:
+    """What shows the block is nearer than the floor behind it."""
+    env = make().unwrapped
+    env.reset(seed=0)
+    numbers, names = env.segmentation(CAMERAS[1])
+    depth = env.depth(CAMERAS[1])
+    assert numbers.shape == depth.shape == (128, 128)
+    assert {"floor", "tool_block"} <= {names[i] for i in np.unique(numbers[numbers >= 0])}
+    assert 0.2 < depth[numbers == names.index("tool_block")].mean() < 0.8
+
+
+@pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="needs moviepy")
+def test_videos_are_recorded(tmp_path: Path) -> None:
+    """Gymnasium's wrapper records an episode."""
+    env = gymnasium.wrappers.RecordVideo(make(render_mode="rgb_array"), str(tmp_path / "new"))
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    env.close()
+    assert list(tmp_path.glob("new/*.mp4"))
+
+
+def test_frames_can_be_collected() -> None:
+    """Gymnasium's wrapper collects a picture of every step."""
+    env = gymnasium.wrappers.RenderCollection(make(render_mode="rgb_array"))
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    frames = env.render()
+    assert [frame.shape for frame in frames] == [(480, 640, 3)] * 2
+    assert SimpleNamespace(**env.metadata).render_fps == 25
