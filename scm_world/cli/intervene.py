@@ -10,7 +10,7 @@ from typing import Any, final
 from scm_world._types import Floats, Value, Values
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import PAGE, RESULTS, check_writable, console
-from scm_world.discovery.paired import gap
+from scm_world.discovery.effects import gap
 from scm_world.errors import UnknownOption
 from scm_world.scene import Scene
 from scm_world.world import Audit, World

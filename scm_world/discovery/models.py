@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.discovery.paired import Effects, gap
+from scm_world.discovery.effects import Effects, gap
 from scm_world.graph import SCM, Moment
 from scm_world.variables import Box, Categories, Integers, Noise, Variable
 

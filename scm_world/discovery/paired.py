@@ -13,14 +13,14 @@ computed variable has a lagged cause if it still differs while all present value
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.discovery.probes import Probe, another_count
-from scm_world.discovery.scores import EdgeKey
+from scm_world.discovery.effects import Effects, gap
+from scm_world.discovery.mechanisms import see_mechanisms
+from scm_world.discovery.probes import Probe
 from scm_world.errors import InterventionError
 from scm_world.variables import Box, Categories, Integers, Measured, Noise, Rotations, Variable
 from scm_world.world import World
@@ -28,38 +28,12 @@ from scm_world.world import World
 STEPS = (0.05, -0.05, 0.02, -0.02, 0.005, -0.005, 0.001, -0.001)
 """How far to move a variable, as a fraction of its bounds; smaller until it is feasible."""
 
-
-@final
-@dataclass
-class Effects:
-    """The largest effect seen so far on each ordered pair.
-
-    Attributes:
-        largest: By cause, effect and lag.
-        floor: Largest difference after something was done and undone.
-        rollouts: Control steps simulated in an experiment of their own.
-        refused: Targets for which no feasible value was found, with how often.
-    """
-
-    largest: dict[EdgeKey, float] = field(default_factory=dict)
-    floor: float = 0.0
-    rollouts: int = 0
-    refused: dict[str, int] = field(default_factory=dict)
-
-    def see(self, cause: str, effect: str, lag: int, size: float) -> None:
-        """Remember an effect if it is the largest of its pair."""
-        key = (cause, effect, lag)
-        self.largest[key] = max(size, self.largest.get(key, 0.0))
-
-    def found(self, threshold: float) -> set[EdgeKey]:
-        """List the pairs whose effect exceeds a threshold."""
-        return {key for key, size in self.largest.items() if size > threshold}
+FAR = (0.4, -0.4, 0.2, -0.2)
+"""How far to move it first, in some of the probes: what has a threshold shows there."""
 
 
-def gap(a: Value, b: Value) -> float:
-    """Compute the largest difference of two values; NaN counts as infinite."""
-    size = float(np.max(np.abs(np.asarray(a, dtype=float) - np.asarray(b, dtype=float))))
-    return size if size == size else np.inf
+SOLVED_ALONE = 8
+"""In how many probes the mechanisms of what does not move are tried on their own."""
 
 
 @final
@@ -103,6 +77,8 @@ class Paired:
         for target in self.targets:
             self._experiment(target)
         self._vary_action()
+        if number < SOLVED_ALONE:
+            see_mechanisms(self._world, self.effects, self._noise, number)
         for name in self._readouts:
             self._vary_readout(name)
             self._pool[name] = [*self._pool[name], self._at_once[name], self._later[name]][-8:]
@@ -120,8 +96,9 @@ class Paired:
         return self._world.values(), self._world.previous()
 
     def _experiment(self, target: str) -> None:
-        for attempt, step in enumerate(STEPS):
-            value = self._another(self._world.model.declared(target), step, attempt)
+        steps = (*FAR, *STEPS) if self._number % 4 == 3 else STEPS
+        for attempt, step in enumerate(steps):
+            value = self._other(target, step, attempt)
             if value is None:
                 return
             self._world.restore(self._probe.snapshot)
@@ -138,6 +115,13 @@ class Paired:
                 return
         self.effects.refused[target] = self.effects.refused.get(target, 0) + 1
 
+    def _other(self, target: str, step: float, attempt: int) -> Value | None:
+        """Choose another value; of what decides the structure, one that changes it a little."""
+        if target not in self._world.task.decided_by:
+            return self._another(self._world.model.declared(target), step, attempt)
+        nearby = [r[target] for r in self._world.task.nearby(self._at_once) if target in r]
+        return nearby[attempt % len(nearby)] if nearby else None
+
     def _another(self, variable: Variable, step: float, attempt: int) -> Value | None:
         """Choose another value than the present one."""
         present = self._at_once[variable.name]
@@ -153,7 +137,8 @@ class Paired:
             case Rotations():
                 return variable.bounds.nearest(present + 4 * step * direction)
             case Integers():
-                return another_count(variable, present, attempt)
+                full = present >= variable.bounds.high
+                return np.asarray(present + np.where(full, -1, 1))
             case Categories(members=members):
                 others = [member for member in members if member != present]
                 return np.asarray(others[attempt % len(others)]) if others else None
@@ -179,13 +164,12 @@ class Paired:
 
     def _in_another_structure(self, target: str, value: Value) -> bool:
         """Find the effects of a change of structure, on what there is before and after it."""
-        world = self._world
-        reached = world.values()
-        both = [n for n in reached if n != target and self._alike(n)]
-        moved = [n for n in both if gap(reached[n], self._at_once[n]) > 0.0]
+        moved: list[str] = []
         try:
-            self._see_settable(target, value, moved)
-            self._hold(target, value, moved)
+            while further := self._differing(target, moved):
+                moved += further
+                self._see_settable(target, value, moved)
+                self._hold(target, value, moved)
         except InterventionError:
             return False
         after, _ = self._advanced(self._probe.action)
@@ -193,6 +177,18 @@ class Paired:
             self.effects.see(target, name, 1, gap(after[name], self._later[name]))
         self._undo(target, value)
         return True
+
+    def _differing(self, target: str, held: list[str]) -> list[str]:
+        """Name what is not as it was, although it could be."""
+        now = self._world.values()
+        return [
+            name
+            for name in now
+            if name != target
+            and name not in held
+            and self._alike(name)
+            and gap(now[name], self._at_once[name]) > 0.0
+        ]
 
     def _alike(self, name: str) -> bool:
         """Tell whether something can be held that is there before and after a new structure."""

@@ -18,7 +18,7 @@ from scm_world.errors import InterventionError
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
 from scm_world.scene.scene import WALL_RADIUS
-from scm_world.variables import Integers, Noise, Variable
+from scm_world.variables import Noise
 from scm_world.world import World, WorldSnapshot
 
 TIP = trifinger.COLLISION["tip"].radius  # [m]
@@ -67,17 +67,6 @@ class Probe:
     action: Floats
 
 
-def another_count(variable: Variable, present: Value, attempt: int) -> Value:
-    """Change one whole number, the last one first, and by one where there are several."""
-    highest = variable.bounds.high if isinstance(variable.bounds, Integers) else 2**31
-    other = np.array(present)
-    flat = other.reshape(-1)
-    index = (-1 - attempt) % flat.size
-    step = 1 + attempt // flat.size
-    flat[index] += step if flat[index] + step <= highest else -step
-    return other
-
-
 Setting = tuple[dict[str, Value], Floats]
 """States to set, and the fingertip positions that the robot then drives at, shape (9,) [m]."""
 
@@ -124,25 +113,24 @@ def tower(world: World, dice: Dice) -> Setting:
 
 def on_newcomer(world: World, dice: Dice) -> Setting:
     """Stand the blocks where a further one would come into being, as if it were there already."""
-    place = _newcomer(world, dice)
+    place = _newcomer(world)
     return tower(world, dice) if place is None else _pressed(world, dice, place[:2], place[2])
 
 
-def _newcomer(world: World, dice: Dice) -> Floats | None:
+def _newcomer(world: World) -> Floats | None:
     """Find where a further block or obstacle would be: its middle and its top, shape (3,) [m]."""
     start = world.snapshot()
-    names = world.task.decided_by
-    name = names[min(int(dice.between(0.0, len(names))), len(names) - 1)]
-    try:
-        came = world.do({name: another_count(world.model.declared(name), world[name], 0)}).came
-        if not came:
-            return None
-        center, size = world[f"{came[-1]}.cartesian_position"], world[f"{came[-1]}.size"]
-        return np.array([center[0], center[1], center[2] + size[2] / 2])
-    except InterventionError:
-        return None
-    finally:
+    for request in world.task.nearby(world.values()):
+        try:
+            came = world.do(request).came
+        except InterventionError:
+            continue
+        if came:
+            center, size = world[f"{came[-1]}.cartesian_position"], world[f"{came[-1]}.size"]
+            world.restore(start)
+            return np.array([center[0], center[1], center[2] + size[2] / 2])
         world.restore(start)
+    return None
 
 
 def _pressed(world: World, dice: Dice, middle: Floats, bottom: float) -> Setting:
@@ -255,6 +243,15 @@ def solved(world: World, dice: Dice) -> Setting:
     return world.task.solution(world.values()), _rest_tips(world)
 
 
+def leaving(world: World, dice: Dice) -> Setting:
+    """Begin where the goal is fulfilled, with the blocks on their way up."""
+    states = world.task.solution(world.values())
+    for name in world.composition.blocks:
+        up = dice.between(0.4, 0.7)
+        states[f"{name}.linear_velocity"] = np.array([*dice.between(-0.3, 0.3, 2), up])
+    return states, _rest_tips(world)
+
+
 def free(world: World, dice: Dice) -> Setting:
     """Change nothing; the robot drives somewhere."""
     tips = np.array(world["end_effector_positions"])
@@ -271,6 +268,8 @@ def _joints(world: World, tips: Floats) -> Floats:
 
 
 def _out_of_the_way(world: World, dice: Dice) -> dict[str, Value]:
+    if world.composition.obstacles:
+        return {}  # one of them may stand in the middle
     return {
         f"{name}.cartesian_position": np.array([0.0, 0.0, size[2] / 2])
         for name, size in zip(world.composition.blocks[:1], _sizes(world), strict=False)
@@ -286,6 +285,7 @@ _WITH_BLOCKS: tuple[Callable[[World, Dice], Setting], ...] = (
     block_in_air,
     finger_at_wall,
     solved,
+    leaving,
 )
 _WITHOUT_BLOCKS: tuple[Callable[[World, Dice], Setting], ...] = (
     free,
@@ -308,11 +308,14 @@ def _scenarios(world: World) -> tuple[Callable[[World, Dice], Setting], ...]:
     return (*found, obstacle_ahead) if "obstacle_places" in world.model else found
 
 
-_AT_ONCE = frozenset(
-    scenario.__name__
-    for scenario in (solved, block_at_wall, block_in_air, obstacle_ahead, on_newcomer)
-)
-"""Settings whose moment passes: a block hits the wall once, a goal is fulfilled until one moves."""
+_STEPS = {
+    **dict.fromkeys(
+        (s.__name__ for s in (solved, block_at_wall, block_in_air, obstacle_ahead, on_newcomer)), 0
+    ),
+    leaving.__name__: 1,
+}
+"""How many steps to take where that matters: a block hits the wall once, and a goal that is
+fulfilled is left in one step."""
 
 
 def probes(world: World, n: int, seed: int) -> Iterator[Probe]:
@@ -349,7 +352,9 @@ def _prepare(
 def _settle(world: World, kind: str, drive: Floats, dice: Dice) -> Probe:
     action = _command(world, drive, dice)
     steps = round(dice.between(0.0, 2.0))
-    for _ in range(0 if kind in _AT_ONCE else steps):
+    if kind in _STEPS:
+        steps = _STEPS[kind]
+    for _ in range(steps):
         world.step(action)
     return Probe(kind, world.snapshot(), _command(world, drive, dice))
 

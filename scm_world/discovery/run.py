@@ -7,8 +7,9 @@ from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
+from scm_world.discovery.effects import Effects
 from scm_world.discovery.models import paired_effects
-from scm_world.discovery.paired import Effects, Paired
+from scm_world.discovery.paired import Paired
 from scm_world.discovery.probes import probes as probe_states
 from scm_world.discovery.report import DiscoveryReport, versions
 from scm_world.discovery.scores import score
