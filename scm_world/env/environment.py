@@ -152,7 +152,7 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._scale = reward_scale(self.world)
         self._terms = tuple(self.world.task.weights)
         self._version = -1
-        self._observers: WeakKeyDictionary[Declaration, tuple[Observer, tuple[str, ...]]]
+        self._observers: WeakKeyDictionary[Declaration, tuple[Observer, Goals, tuple[str, ...]]]
         self._observers = WeakKeyDictionary()
         if goal_env:
             self.compute_reward = GoalReward(self.world)
@@ -205,9 +205,9 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             goals = Goals(declaration)
             made = observer(self.world, declaration, self._how, goals)
             needed = (*made.names, *goals.names, *self._terms, "success", "reward")
-            found = self._observers[declaration] = made, tuple(dict.fromkeys(needed))
+            found = self._observers[declaration] = made, goals, tuple(dict.fromkeys(needed))
         self._declaration = declaration
-        self._observer, self._needed = found
+        self._observer, self._goals, self._needed = found
         self.observation_space = self._observer.space
 
     def _look(self) -> Values:
@@ -304,7 +304,7 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return dict(self._observer.layouts.get("context", {}))
 
     def _info(self, now: Values) -> dict[str, Any]:
-        achieved, desired = self.world.task.goals(now)
+        achieved, desired = self._goals.read(self.world, now)
         success = bool(now["success"])
         info = {
             "is_success": success,

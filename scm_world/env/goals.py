@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scm_world._types import Floats, Values
-from scm_world.entities import CONTROL_INDEX
+from scm_world.geometry.gather import gather_into, places
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
-from scm_world.world.start import beginning
 
 BOUND = 10.0
 """Goals are positions [m], sizes [m] and unit quaternions; what lies beyond saturates."""
@@ -26,18 +25,6 @@ TERMS: dict[str, Callable[[Task, Floats, Floats], Any]] = {
     "reach_error": lambda task, have, want: np.abs(have - want).mean(axis=-1),
 }
 """The reward terms that goals alone decide."""
-
-
-class _Read(dict[str, Any]):
-    """Values that remember which of them were looked at."""
-
-    def __init__(self, values: Values) -> None:
-        super().__init__(values)
-        self.names: dict[str, None] = {}
-
-    def __getitem__(self, name: str) -> Any:
-        self.names[name] = None
-        return super().__getitem__(name)
 
 
 @final
@@ -54,27 +41,63 @@ class Goals:
     """
 
     def __init__(self, declaration: Declaration) -> None:
-        self._task = declaration.task
-        values = _Read(example(declaration))
-        pair = zip(("achieved_goal", "desired_goal"), self._task.goals(values), strict=True)
-        self.names = tuple(values.names)
+        sides = declaration.task.goal_names()
+        self._sides = [Collected(declaration, names) for names in sides]
+        self.names = (*sides[0], *sides[1])
         self.spaces: dict[str, gymnasium.Space[Any]] = {
-            name: gymnasium.spaces.Box(-BOUND, BOUND, np.shape(goal), np.float64)
-            for name, goal in pair
+            name: gymnasium.spaces.Box(-BOUND, BOUND, (side.size,), np.float64)
+            for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
 
-    def observe(self, now: Values) -> dict[str, Floats]:
+    def read(self, world: World, now: Values) -> tuple[Floats, Floats]:
+        """Give what is achieved and what is desired."""
+        achieved, desired = self._sides
+        return achieved.read(world, now), desired.read(world, now)
+
+    def observe(self, world: World, now: Values) -> dict[str, Floats]:
         """Give both vectors, by name."""
-        pair = zip(self.spaces, self._task.goals(now), strict=True)
+        pair = zip(self.spaces, self.read(world, now), strict=True)
         return {name: np.clip(goal, -BOUND, BOUND) for name, goal in pair}
 
 
-def example(declaration: Declaration) -> Values:
-    """Give every variable the value that it has when an episode begins by default."""
-    static, state = beginning(declaration, None)
-    known = {**static, **declaration.states(state), "action": np.zeros(9)}
-    known[CONTROL_INDEX] = np.zeros((), dtype=np.int64)
-    return declaration.model.solve(known)
+@final
+class Collected:
+    """The numbers of some variables, one after another.
+
+    Args:
+        declaration: Of the structure.
+        names: The variables.
+
+    Attributes:
+        size: How many numbers there are.
+    """
+
+    def __init__(self, declaration: Declaration, names: tuple[str, ...]) -> None:
+        sizes = [int(np.prod(declaration.model.declared(name).shape)) for name in names]
+        ends = np.cumsum(sizes).tolist()
+        where = {n: slice(e - s, e) for n, e, s in zip(names, ends, sizes, strict=True)}
+        self.size = ends[-1] if ends else 0
+        still, states = frozenset(declaration.static_names), declaration.slices
+        self._still = [(n, place) for n, place in where.items() if n in still]
+        self._targets = places(place for n, place in where.items() if n in states)
+        self._sources = places(states[n] for n in where if n in states)
+        rest = [n for n in where if n not in states and n not in still]
+        self._computed = [(n, where[n]) for n in rest]
+        self._numbers = np.empty(self.size)
+        self._version = -1
+
+    def read(self, world: World, now: Values) -> Floats:
+        """Copy the present numbers, shape (n,)."""
+        numbers = self._numbers
+        if self._version != world.version:
+            self._version = world.version
+            for name, place in self._still:
+                numbers[place] = np.ravel(now[name])
+        for name, place in self._computed:
+            numbers[place] = np.ravel(now[name])
+        if self._sources.size:
+            gather_into(world.current()[1].vector, self._sources, self._targets, numbers)
+        return numbers.copy()
 
 
 @final

@@ -84,12 +84,13 @@ class Together:
     """Several observations in a dictionary.
 
     Args:
+        world: That is observed.
         parts: By name.
         goals: What is achieved and what is desired, if that is asked for.
     """
 
-    def __init__(self, parts: dict[str, Observer], goals: Goals | None) -> None:
-        self._parts, self._goals = parts, goals
+    def __init__(self, world: World, parts: dict[str, Observer], goals: Goals | None) -> None:
+        self._world, self._parts, self._goals = world, parts, goals
         self.names = tuple(name for part in parts.values() for name in part.names)
         self.layouts: Layouts = {
             name: layout for name, part in parts.items() for layout in part.layouts.values()
@@ -102,7 +103,7 @@ class Together:
     def observe(self, now: Values) -> dict[str, NDArray[Any]]:
         """Give all of them."""
         found = {name: part.observe(now) for name, part in self._parts.items()}
-        return found if self._goals is None else found | self._goals.observe(now)
+        return found if self._goals is None else found | self._goals.observe(self._world, now)
 
 
 def observer(world: World, declaration: Declaration, how: Observing, goals: Goals) -> Observer:
@@ -130,7 +131,11 @@ def observer(world: World, declaration: Declaration, how: Observing, goals: Goal
     if how.context == "privileged":
         about = _quiet(_parts(world, declaration, context(declaration)))
         parts["context"] = Vector(world, declaration, about, normalize=how.normalize)
-    return Together(parts, goals if how.goals else None) if len(parts) > 1 or how.goals else main
+    return (
+        Together(world, parts, goals if how.goals else None)
+        if len(parts) > 1 or how.goals
+        else main
+    )
 
 
 def context(declaration: Declaration) -> tuple[str, ...]:

@@ -14,14 +14,16 @@ from scm_world._types import Floats, Value
 from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.env.bounds import WIDE
 from scm_world.env.keypoints import KEYPOINTS, Keypoints
+from scm_world.geometry.gather import gather_scaled, places
 from scm_world.tasks import TIME
-from scm_world.tasks.kernels import scale_into
 from scm_world.variables import Normal
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
 
 Layouts = Mapping[str, Mapping[str, slice]]
 """Where each variable stands, for every vector by its name."""
+
+NOTHING = places(())
 
 STREAM = "observation"
 """The stream of the noise of the sensors; draws of ``sensor_noise`` itself have another one."""
@@ -92,7 +94,9 @@ class Vector:
         """Sort the parts by how they are read."""
         still, states = set(declaration.static_names), declaration.slices
         fields = [(n, where) for n, where in self._slices.items() if n != KEYPOINTS]
-        self._blocks = _merge([(where, states[n]) for n, where in fields if n in states])
+        read = [(where, states[n]) for n, where in fields if n in states]
+        self._targets = places(where for where, _ in read)
+        self._sources = places(source for _, source in read)
         views = [
             (n, self._raw[where].reshape(declaration.model.declared(n).shape))
             for n, where in fields
@@ -103,12 +107,13 @@ class Vector:
 
     def _scale(self, low: Floats, high: Floats, scaled: NDArray[np.bool_]) -> None:
         width = np.where(scaled, high - low, 2.0)
-        self._gain = np.where(scaled, 2.0 / width, 1.0)
-        self._offset = np.where(scaled, -low * self._gain - 1.0, 0.0)
+        gain = np.where(scaled, 2.0 / width, 1.0)
+        offset = np.where(scaled, -low * gain - 1.0, 0.0)
         everything = np.full(low.size, np.inf)
-        self._limits = (-everything, everything) if self._published else (low, high)
+        limits = (-everything, everything) if self._published else (low, high)
+        self._scales = np.stack([*limits, gain, offset])
         inside = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
-        self.space = box(*(self._limits if self._published else inside))
+        self.space = box(*(limits if self._published else inside))
         world = self._world
         self._shift = 0.0
         if self._published and TIME in self._slices and world.given_length is not None:
@@ -125,18 +130,15 @@ class Vector:
                 place[...] = now[name]
         for name, place in self._computed:
             place[...] = now[name]
-        vector = self._world.current()[1].vector
-        for where, source in self._blocks:
-            raw[where] = vector[source]
         if self._keypoints is not None:
             raw[self._slices[KEYPOINTS]] = self._keypoints.observe(now)
         if self._shift:
             raw[self._slices[TIME]] += self._shift
-        if self._noise:
-            raw = self._sensed(raw)
+        vector = self._world.current()[1].vector
         observation = np.empty(raw.size, dtype=np.float32)
-        low, high = self._limits
-        scale_into(raw, low, high, self._gain, self._offset, observation)
+        gather_scaled(vector, self._sources, self._targets, raw, self._scales, observation)
+        if self._noise:
+            gather_scaled(vector, NOTHING, NOTHING, self._sensed(raw), self._scales, observation)
         return observation
 
     def _sensed(self, raw: Floats) -> Floats:
@@ -157,16 +159,3 @@ def _places(parts: Sequence[Part]) -> dict[str, slice]:
     ends = np.cumsum([part.low.size for part in parts])
     pairs = zip(parts, ends, strict=True)
     return {part.name: slice(int(end) - part.low.size, int(end)) for part, end in pairs}
-
-
-def _merge(pairs: list[tuple[slice, slice]]) -> list[tuple[slice, slice]]:
-    """Join copies whose source and target both lie side by side."""
-    merged: list[tuple[slice, slice]] = []
-    for target, source in pairs:
-        if merged and (merged[-1][0].stop, merged[-1][1].stop) == (target.start, source.start):
-            before = merged.pop()
-            joined = slice(before[0].start, target.stop), slice(before[1].start, source.stop)
-            merged.append(joined)
-        else:
-            merged.append((target, source))
-    return merged

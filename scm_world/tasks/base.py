@@ -16,7 +16,7 @@ from scm_world.scene import trifinger
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import Common, resolve
-from scm_world.variables import Draw, Variable
+from scm_world.variables import Draw, Integers, Variable
 from scm_world.variables.kinds import SpaceName
 
 
@@ -91,8 +91,16 @@ class Task(ABC):
         """List what follows the 28 common numbers of the observation."""
 
     @abstractmethod
+    def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Name the variables that say what is achieved, and those that say what is desired."""
+
     def goals(self, values: Values) -> tuple[Floats, Floats]:
         """Give what is achieved and what is desired, two vectors of one shape."""
+        achieved, desired = (
+            np.concatenate([np.ravel(values[name]) for name in names])
+            for names in self.goal_names()
+        )
+        return achieved, desired
 
     @abstractmethod
     def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
@@ -114,6 +122,17 @@ class Task(ABC):
     def solution(self, values: Values) -> dict[str, Value]:
         """Give an intervention after which the goal is fulfilled."""
 
+    def nearby(self, values: Values) -> Iterable[dict[str, Value]]:
+        """List interventions that change what stands in the world a little: one more, one fewer.
+
+        Experiments use them. Here each whole number of ``decided_by`` is changed by one.
+        """
+        declared = {variable.name: variable for variable in self.shared()}
+        for name in self.decided_by:
+            bounds = declared[name].bounds
+            if isinstance(bounds, Integers):
+                yield from ({name: other} for other in _counts(values[name], bounds))
+
     def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
         """Give the intervention that draws a new goal, for ``reset(do=…)`` or ``do``.
 
@@ -121,3 +140,13 @@ class Task(ABC):
             space: Where from: ``"A"``, ``"B"`` or ``"A|B"``.
         """
         return {name: Draw(space) for name in self.goal_causes}
+
+
+def _counts(present: Value, bounds: Integers) -> Iterable[Value]:
+    """Change one whole number by one, upward first, the last component first."""
+    for step in (1, -1):
+        for index in reversed(range(np.size(present))):
+            other = np.array(present)
+            other.reshape(-1)[index] += step
+            if bounds.contains(other):
+                yield other

@@ -128,13 +128,13 @@ class Building(Task):
         for obstacle in self.obstacles():
             yield from observe_obstacle(obstacle)
 
-    def goals(self, values: Values) -> tuple[Floats, Floats]:
-        """Give size, position and quaternion of each goal and of its block, shape (10 n,)."""
+    def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Name size, position and quaternion of each goal's block and of each goal."""
+
+        def boxes(names: Iterable[str]) -> tuple[str, ...]:
+            return tuple(f"{name}.{part}" for name in names for part in _POSE)
+
         targets = self.targets()
-
-        def boxes(names: Iterable[str]) -> Floats:
-            return np.concatenate([values[f"{name}.{part}"] for name in names for part in _POSE])
-
         return boxes(targets.values()), boxes(targets)
 
     def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:

@@ -171,10 +171,9 @@ class Reaching(Task):
         for name in obstacle_names(self._obstacles()):
             yield from observe_obstacle(name)
 
-    def goals(self, values: Values) -> tuple[Floats, Floats]:
-        """Give the tips and their goals, shape (9,) each [m]."""
-        desired = np.concatenate([values[name] for name in _positions()])
-        return np.array(values["end_effector_positions"]), desired
+    def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Name the tips and their goals, nine numbers each [m]."""
+        return ("end_effector_positions",), _positions()
 
     def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute how near tips are to their goals, shape (...)."""
