@@ -10,18 +10,18 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._types import Values
+from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.delta import PREFIX, Delta
-from scm_world.env.goals import GoalReward, Goals, reward_scale
+from scm_world.env.goals import GoalReward, Goals, reader, reward_scale
 from scm_world.env.observer import Observation, Observer, Observing, observer
 from scm_world.env.start import SPACES, asked, begin, beginning_structure, merged
 from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.scene.camera import OVERVIEW, Camera
+from scm_world.scene.kinematics import scaled_clip_kernel
 from scm_world.tasks import Task, make_task
-from scm_world.tasks.kernels import affine_into
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import Audit, World
 from scm_world.world.declaration import Declaration
@@ -151,6 +151,7 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._limit = self.world.max_episode_length + extra
         self._scale = reward_scale(self.world)
         self._terms = tuple(self.world.task.weights)
+        self._read_terms = reader(self._terms)
         self._version = -1
         self._observers: WeakKeyDictionary[Declaration, tuple[Observer, Goals, tuple[str, ...]]]
         self._observers = WeakKeyDictionary()
@@ -260,18 +261,27 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        given = np.array(action, dtype=np.float64)
-        if given.shape != (9,):
-            raise ActionError(f"an action has shape (9,), got {given.shape}", action)
-        if self._delta is not None:
-            given = self._delta.absolute(given)
-        affine_into(given, self._middle, self._half, given)
-        self.world.step(given)
+        self.world.advance(self._command(action))
         now = self._look()
         reward = self._scale * float(now["reward"])
         truncated = self.world.index >= self._limit
         self._show()
         return self._observer.observe(now), reward, False, truncated, self._info(now)
+
+    def _command(self, action: NDArray[np.float32]) -> Floats:
+        """Turn an action into what the world takes, shape (9,)."""
+        given: Any = np.asarray(action)
+        if given.dtype != np.float32:
+            given = np.asarray(given, dtype=np.float64)
+        if given.shape != (9,):
+            raise ActionError(f"an action has shape (9,), got {given.shape}", action)
+        if self._delta is not None:
+            given = self._delta.absolute(np.array(given, dtype=np.float64))
+        command = np.empty(9)
+        low, high = self.world.declaration.action_bounds
+        if not scaled_clip_kernel(given, self._middle, self._half, low, high, command):
+            raise ActionError(f"an action is nine finite numbers, got {action!r}", action)
+        return command
 
     def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
         """Intervene now; see ``World.do``. ``observe`` gives the observation afterwards.
@@ -312,7 +322,7 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "fractional_success": float(now["fractional_success"]),
             "achieved_goal": achieved,
             "desired_goal": desired,
-            "reward_terms": {name: float(now[name]) for name in self._terms},
+            "reward_terms": dict(zip(self._terms, map(float, self._read_terms(now)), strict=True)),
         }
         contacts, state = self._rich
         if contacts:

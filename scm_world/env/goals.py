@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Any, final
 
 import gymnasium
@@ -134,6 +135,13 @@ class GoalReward:
             if name in TERMS:
                 total = total + weight * TERMS[name](self._world.task, have, want)
         return reward_scale(self._world) * total
+
+
+def reader(names: tuple[str, ...]) -> Callable[[Values], tuple[Any, ...]]:
+    """Give what picks some values out of all of them, as a tuple."""
+    if len(names) == 1:
+        return lambda now: (now[names[0]],)
+    return itemgetter(*names) if names else lambda now: ()
 
 
 def reward_scale(world: World) -> float:

@@ -19,7 +19,18 @@ from scm_world.variables import (
 )
 from scm_world.world import World
 
-BAD: tuple[Any, ...] = (None, "x", float("nan"), float("inf"), [], [1.0, 2.0], {"x": 1.0}, 1e300, -1e300, True)
+BAD: tuple[Any, ...] = (
+    None,
+    "x",
+    float("nan"),
+    float("inf"),
+    [],
+    [1.0, 2.0],
+    {"x": 1.0},
+    1e300,
+    -1e300,
+    True,
+)
 """Values that no variable can have."""
 
 

@@ -60,7 +60,7 @@ class MlpPolicy:
         Raises:
             ValueError: The observation has another number of components.
         """
-        x: Weights = np.asarray(observation, dtype=np.float32)
+        x: Any = np.asarray(observation, dtype=np.float32)
         if x.ndim == 0 or x.shape[-1] != self.n_observed:
             raise ValueError(
                 f"the policy observes {self.n_observed} numbers, got the shape {x.shape}; "
@@ -68,7 +68,8 @@ class MlpPolicy:
             )
         for layer in self.hidden:
             x = np.tanh(layer(x))
-        return x
+        found: Weights = x
+        return found
 
     def __call__(
         self, observation: ArrayLike, generator: np.random.Generator | None = None
@@ -85,11 +86,12 @@ class MlpPolicy:
         Raises:
             ValueError: The observation has another number of components.
         """
-        action = self.mean(self.features(observation))
+        action: Any = self.mean(self.features(observation))
         if generator is not None:
             noise = generator.standard_normal(action.shape, dtype=np.float32)
             action = action + np.exp(self.log_std) * noise
-        return np.clip(action, np.float32(-1.0), np.float32(1.0))
+        clipped: Weights = np.clip(action, np.float32(-1.0), np.float32(1.0))
+        return clipped
 
     def predict(
         self,

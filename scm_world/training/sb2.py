@@ -37,7 +37,7 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     """
     name = fspath(path)
     tensors = _tensors(name)
-    hidden = []
+    hidden: list[Layer] = []
     while (f"model/shared_fc{len(hidden)}/w:0") in tensors:
         hidden.append(_layer(name, tensors, f"model/shared_fc{len(hidden)}"))
     mean = _layer(name, tensors, "model/pi")

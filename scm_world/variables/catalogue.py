@@ -80,7 +80,7 @@ def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
     return Box((radii[0], -math.pi, low), (radii[1], math.pi, high))
 
 
-# --- goal families whose blocks follow from a few numbers ------------------------------------------
+# --- goal families whose blocks follow from a few numbers -----------------------------------------
 PART_SIZE_BOUNDS = Box(0.005, 0.3)  # [m] edges of a block that is a part of something
 BLOCKS_MASS_A = Box(0.02, 0.06)  # [kg]
 BLOCKS_MASS_B = Box(0.06, 0.08)

@@ -19,7 +19,7 @@ from scm_world.scene import (
     Scene,
 )
 from scm_world.scene.camera import Camera
-from scm_world.scene.kinematics import clip_kernel, inverse_kernel
+from scm_world.scene.kinematics import inverse_kernel
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Noise
 from scm_world.variables.catalogue import PRESET
@@ -237,7 +237,15 @@ class World(Declared):
         """
         if self._instant is None and not self._started:
             raise NotReset
-        command = self._checked(action)
+        self.advance(clipped(action, *self.declaration.action_bounds, self._action_unit))
+
+    def advance(self, command: Floats) -> None:
+        """Advance one control step with an action that is nine finite numbers in its range.
+
+        For loops that cannot wait; ``step`` checks and clips.
+        """
+        if self._action_is_held:
+            command = self._held_action(command)
         self._readouts.remember()
         self._now["action"] = command
         if self._noisy:
@@ -256,15 +264,11 @@ class World(Declared):
         self._readouts.stale()
         self._instant = None
 
-    def _checked(self, action: ArrayLike) -> Floats:
-        low, high = self.declaration.action_bounds
-        command = clipped(action, low, high, self._action_unit)
-        if self._action_is_held:
-            known = {**self._now, "action": command}
-            moment = self.moment(self._index)
-            held = self._held.solve(known, moment=moment, only=("action",))["action"]
-            clip_kernel(np.array(held), low, high, command)
-        return command
+    def _held_action(self, command: Floats) -> Floats:
+        known = {**self._now, "action": command}
+        moment = self.moment(self._index)
+        held = self._held.solve(known, moment=moment, only=("action",))["action"]
+        return clipped(np.array(held), *self.declaration.action_bounds, self._action_unit)
 
     def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.

@@ -1,77 +1,77 @@
 """Every task passes the same suite on every engine."""
 
+from __future__ import annotations
+
 import importlib.util
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import pytest
 
-from scm_world.tasks import TASKS
+from scm_world.geometry.hulls import Hull, hull_of
+from scm_world.tasks import TASKS, Task
 from scm_world.testing.task import TaskConformance
 from scm_world.world import World
 
-needs_bullet = pytest.mark.skipif(
-    importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
-)
+SMALLER: Mapping[str, Mapping[str, Any]] = {
+    "towers": {"number_of_blocks_in_tower": (1, 2, 2)},
+    "stacked_blocks": {"num_of_levels": 2, "max_level_width": 0.075},
+    "creative_stacked_blocks": {"num_of_levels": 3, "max_level_width": 0.075},
+    "general": {"nums_objects": 2},
+}
+"""Options that keep a suite short in which every quantity of every block is set."""
 
 
-class Pushing(TaskConformance):
-    """Pushing, on one of the engines."""
+SHAPED = {f"{name}_of_a_wedge": TASKS[name] for name in ("pushing", "picking", "pick_and_place")}
+"""Tasks whose block and goal may be a convex shape."""
+
+
+def wedge() -> Hull:
+    """Give half a cuboid of 7 x 6 x 6 cm, cut along a diagonal."""
+    return hull_of([(x, y, z) for y in (0.0, 0.06) for x, z in ((0, 0), (0.07, 0), (0, 0.06))])
+
+
+def make_case(name: str) -> Task:
+    """Create a registered task, or one of them with a shape."""
+    if name in SHAPED:
+        return SHAPED[name](shape=wedge())  # type: ignore[call-arg] # these have it
+    return TASKS[name](**SMALLER.get(name, {}))
+
+
+class OnEveryTask(TaskConformance):
+    """All tasks, on one of the engines."""
 
     backend: ClassVar[str]
+    task: str
+    awake: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "obstacle_places": {"number_of_obstacles": 2},
+        "wall_noise": {"wall_pattern": 1},
+        "max_level_width": {"wall_pattern": 1},
+    }
+
+    @pytest.fixture(params=(*TASKS, *SHAPED), autouse=True)
+    def _choose(self, request: pytest.FixtureRequest) -> None:
+        self.task = request.param
 
     def make(self) -> World:
         """Create a world."""
-        return World("pushing", backend=self.backend)
+        return World(make_case(self.task), backend=self.backend)
 
 
-class Reaching(TaskConformance):
-    """Reaching, on one of the engines."""
-
-    backend: ClassVar[str]
-
-    def make(self) -> World:
-        """Create a world."""
-        return World("reaching", backend=self.backend)
-
-
-class TestPushingFake(Pushing):
-    """Pushing without physics."""
+class TestFake(OnEveryTask):
+    """Without physics."""
 
     backend = "fake"
 
 
-class TestPushingMujoco(Pushing):
-    """Pushing on MuJoCo."""
+class TestMujoco(OnEveryTask):
+    """On MuJoCo."""
 
     backend = "mujoco"
 
 
-@needs_bullet
-class TestPushingBullet(Pushing):
-    """Pushing on Bullet."""
+@pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="needs pybullet")
+class TestBullet(OnEveryTask):
+    """On Bullet."""
 
     backend = "bullet"
-
-
-class TestReachingFake(Reaching):
-    """Reaching without physics."""
-
-    backend = "fake"
-
-
-class TestReachingMujoco(Reaching):
-    """Reaching on MuJoCo."""
-
-    backend = "mujoco"
-
-
-@needs_bullet
-class TestReachingBullet(Reaching):
-    """Reaching on Bullet."""
-
-    backend = "bullet"
-
-
-def test_every_task_is_here() -> None:
-    """A new task is tested by being added above."""
-    assert {suite.__name__.lower() for suite in TaskConformance.__subclasses__()} == set(TASKS)

@@ -40,7 +40,7 @@ def compiled(structure: Structure) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.modelname = "scm_world"
     spec.compiler.degree = False
-    write_options(spec, structure.preset)
+    write_options(spec, structure.preset, len(structure.blocks))
     _add_arena(spec)
     for name in structure.obstacles:
         _add_obstacle(spec, name)

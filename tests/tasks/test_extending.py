@@ -1,0 +1,61 @@
+"""The family that the documents show keeps the promises of a task."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from scm_world.testing.task import TaskConformance
+from scm_world.world import World
+
+ROOT = Path(__file__).parent.parent.parent
+EXAMPLE = ROOT / "examples" / "new_family.py"
+
+
+def _load(name: str) -> ModuleType:
+    """Import the example under a name, as a package of the user's would be."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+family = _load("new_family")
+
+
+class TestPyramid(TaskConformance):
+    """The pyramid of the documents."""
+
+    def make(self) -> World:
+        """Create a world."""
+        return World(family.Pyramid(), backend="fake")
+
+
+def test_the_document_shows_the_example() -> None:
+    """The text of the file stands in the document, word for word."""
+    assert EXAMPLE.read_text() in (ROOT / "docs" / "extending.md").read_text()
+
+
+@pytest.mark.parametrize("backend", ["fake", "mujoco"])
+def test_levels_come_and_go(backend: str) -> None:
+    """A level more is as many blocks more, in mid-episode too, and they do not collide."""
+    world = World(family.Pyramid(), backend=backend)
+    world.reset(seed=0)
+    world.step(np.array(world.task.start))
+    assert world.do({"pyramid_levels": 3}).came == ("tool_0_2", "tool_1_1", "tool_2_0")
+    world.step(np.array(world.task.start))
+    world.do(world.task.solution(world.values()))
+    assert world["success"] == 1
+
+
+def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """It says what it built."""
+    family.main("fake")
+    assert "6 blocks fill 0.50" in capsys.readouterr().out
