@@ -34,6 +34,11 @@ def standing(size: Floats, orientation: Floats, *, place: Floats) -> Floats:
     return np.array([place[0], place[1], place[2] + lowest_point(size, orientation)])
 
 
+def constantly(*_: Floats, value: Floats) -> Floats:
+    """Give a constant, whatever the parents."""
+    return value
+
+
 def keep_lowest_point(position: Floats, *parents: Floats) -> Floats:
     """Raise or lower the center so that the lowest point stays where it was.
 
@@ -125,6 +130,7 @@ class ToolBlock(Entity):
         self._spawn = spawn or Function(standing, constants={"place": place})
         self._spawn_from = spawn_from
         self._restart = (*spawn_from, self._v("size")) if spawn_again else spawn_from
+        self._again = self._restart if spawn_again else ()
         self._a, self._b = a, b
         self._hull = hull
 
@@ -181,6 +187,7 @@ class ToolBlock(Entity):
             numbers.IDENTITY,
             "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
             always=(orientation, angular, numbers.PRESET),
+            **self._respawn(numbers.IDENTITY),
         )
         yield State(
             linear,
@@ -190,6 +197,7 @@ class ToolBlock(Entity):
             (0.0, 0.0, 0.0),
             "Velocity of the center.",
             always=(linear, *always),
+            **self._respawn((0.0, 0.0, 0.0)),
         )
         yield State(
             angular,
@@ -199,7 +207,15 @@ class ToolBlock(Entity):
             (0.0, 0.0, 0.0),
             "Angular velocity in the world frame.",
             always=(angular, numbers.PRESET),
+            **self._respawn((0.0, 0.0, 0.0)),
         )
+
+    def _respawn(self, value: tuple[float, ...]) -> dict[str, Any]:
+        """Say that a state is as it was at the start when the block is put there again."""
+        if not self._again:
+            return {}
+        start = Function(constantly, constants={"value": value})
+        return {"on_set": self._again, "start": start, "restart": self._again}
 
     def inputs(self) -> Iterable[str]:
         """Pose, velocities, mass, size and friction matter to physics; the color does not."""

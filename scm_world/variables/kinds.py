@@ -80,6 +80,8 @@ def _without(space: Space | None, other: Space | None) -> Space | None:
 def _as_parents(value: Any) -> Any:
     if isinstance(value, str):
         raise ValueError(f"parents must be a sequence of names, got the text {value!r}")
+    if isinstance(value, tuple) and set(map(type, value)) <= {Parent}:
+        return value
     return tuple(Parent(p) if isinstance(p, str) else p for p in value)
 
 

@@ -118,9 +118,8 @@ class Declaration:
         self.model = SCM(options.conventions.adapt(variables))
         self.slices = self.composition.slices()
         self.parameter_keys = self.composition.parameters()
-        self.carried = tuple(
-            v for v in self.model.variables if isinstance(v, Measured) and v.set_parents()
-        )
+        ordered = map(self.model.declared, self.model.structure.order)
+        self.carried = tuple(v for v in ordered if isinstance(v, Measured) and v.set_parents())
         self.computed = computed_order(self.model)
         self.static_names = static_order(self.model, self.computed)
         self.random = tuple(

@@ -14,10 +14,7 @@ from scm_world.backends.base import EngineSnapshot
 from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX, cameras
 from scm_world.errors import NotReset, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, Moment
-from scm_world.scene import (
-    PhysicalState,
-    Scene,
-)
+from scm_world.scene import PhysicalState, Scene
 from scm_world.scene.camera import Camera
 from scm_world.scene.kinematics import inverse_kernel
 from scm_world.tasks import Task, make_task
@@ -94,12 +91,10 @@ class World(Declared):
         self._action_unit = ACTIONS[action_mode][0]
         self.backend = make_backend(backend) if isinstance(backend, str) else backend
         self._started = False
-        self.noise = Noise(0)
-        self.episode = 0
+        self.noise, self.episode = Noise(0), 0
         self.version = 0  # counts changes of anything but what physics moves
         self._static: Values = {}
-        self._action_is_held = False
-        self._noisy = False
+        self._action_is_held = self._noisy = False
         self._index = 0
         self._clock = np.zeros((), dtype=np.int64)
         self._instant: Instant | None = None
