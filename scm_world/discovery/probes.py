@@ -268,12 +268,10 @@ def _joints(world: World, tips: Floats) -> Floats:
 
 
 def _out_of_the_way(world: World, dice: Dice) -> dict[str, Value]:
+    """Stack the blocks in the middle, unless an obstacle may stand there."""
     if world.composition.obstacles:
-        return {}  # one of them may stand in the middle
-    return {
-        f"{name}.cartesian_position": np.array([0.0, 0.0, size[2] / 2])
-        for name, size in zip(world.composition.blocks[:1], _sizes(world), strict=False)
-    }
+        return {}
+    return _stacked(world, dice, np.zeros(2), 0.0)
 
 
 _WITH_BLOCKS: tuple[Callable[[World, Dice], Setting], ...] = (

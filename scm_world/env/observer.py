@@ -121,10 +121,11 @@ def observer(world: World, declaration: Declaration, how: Observing, goals: Goal
     """
     main: Observer
     if how.mode == "pixel":
-        from scm_world.env.pixels import Pixels, chosen
+        from scm_world.env.pixels import Pixels, chosen, followed
 
         original = world.conventions.published_observation
-        main = Pixels(world, chosen(how.cameras, how.image_size, original=original))
+        cameras = chosen(how.cameras, how.image_size, original=original)
+        main = Pixels(world, cameras, followed(how.cameras, original=original))
     else:
         main = _vector(world, declaration, how)
     parts: dict[str, Observer] = {"observation": main}

@@ -57,6 +57,7 @@ class Pixels:
     Args:
         world: That is observed.
         cameras: With pictures of one size.
+        followed: Names of those that stand where their variables say.
 
     Attributes:
         names: The variables that have to be computed: none.
@@ -66,8 +67,10 @@ class Pixels:
 
     names: tuple[str, ...] = ()
 
-    def __init__(self, world: World, cameras: tuple[Camera, ...]) -> None:
-        self._world, self._cameras = world, cameras
+    def __init__(
+        self, world: World, cameras: tuple[Camera, ...], followed: frozenset[str] = frozenset()
+    ) -> None:
+        self._world, self._cameras, self._followed = world, cameras, followed
         self.layouts: Layouts = {}
         self._convention = ORIGINAL if world.conventions.published_observation else PLAIN
         self._shape = (2 * len(cameras), *self._convention.shape(cameras[0]))
@@ -82,6 +85,7 @@ class Pixels:
         scene, layout = self._world.scene(), self._convention
         if self._version != self._world.version:
             self._version = self._world.version
+            self._cameras = self._present_cameras()
             goal_pixels(scene, self._cameras, self._goals, convention=layout)
         pictures: Any = np.empty(self._shape, dtype=np.uint8)
         half = len(self._cameras)
@@ -89,3 +93,26 @@ class Pixels:
         pictures[half:] = self._goals
         found: NDArray[np.uint8] = pictures
         return found
+
+    def _present_cameras(self) -> tuple[Camera, ...]:
+        """Put the cameras of the robot where their variables say."""
+        present = {camera.name: camera for camera in self._world.cameras()}
+        return tuple(
+            replace(present[camera.name], height=camera.height, width=camera.width)
+            if camera.name in self._followed
+            else camera
+            for camera in self._cameras
+        )
+
+
+def followed(cameras: Sequence[str | Camera] | None, *, original: bool) -> frozenset[str]:
+    """Name the cameras that are asked for by name: they are nodes of the graph.
+
+    Args:
+        cameras: As in ``chosen``.
+        original: Whether they are as the predecessor realises them, and fixed.
+    """
+    if original:
+        return frozenset()
+    own = frozenset(camera.name for camera in CAMERAS)
+    return own if cameras is None else own.intersection(c for c in cameras if isinstance(c, str))
