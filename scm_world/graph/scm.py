@@ -351,6 +351,14 @@ class SCM:
             values[name] = evaluate(name, self._acts.get(name), values, previous or {}, moment)
         return values
 
+    def evaluate(self, name: str, values: Values, moment: Moment | None = None) -> Value:
+        """Compute one variable from the values of all its parents.
+
+        Raises:
+            ModelError: It is measured, and has no value.
+        """
+        return self._evaluator.evaluate(name, self._acts.get(name), values, {}, moment)
+
     def sample(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None
     ) -> dict[str, Value]:

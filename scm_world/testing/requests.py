@@ -62,9 +62,18 @@ def random_request(
         generator: Of the choices.
         most: How many targets it has at most.
     """
+    request: dict[str, Any] = {}
+    match generator.integers(12):
+        case 0:
+            request = world.task.sample_goal(("A", "B", "A|B")[generator.integers(3)])
+        case 1:
+            nearby = list(world.task.nearby(world.values()))
+            request = dict(nearby[generator.integers(len(nearby))]) if nearby else {}
     names = list(world.model)
     chosen = generator.choice(names, size=int(generator.integers(1, most + 1)), replace=True)
-    return {str(name): _value(world, str(name), generator) for name in chosen}
+    if request and generator.random() < 0.7:  # mostly what changes the goal or the structure alone
+        return request
+    return request | {str(name): _value(world, str(name), generator) for name in chosen}
 
 
 def _value(world: World, name: str, generator: np.random.Generator) -> Any:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats
-from scm_world.entities import ACTUATOR_NOISE
 from scm_world.errors import ActionError
 from scm_world.graph import Moment
 from scm_world.scene.kinematics import clip_kernel
 from scm_world.variables import Normal
+
+STREAM = "actuators"
+"""The stream of the noise; draws of the variable that scales it have another one."""
 
 
 def clipped(action: ArrayLike, low: Floats, high: Floats, unit: str) -> Floats:
@@ -38,5 +40,5 @@ def disturbed(command: Floats, low: Floats, high: Floats, noise: float, moment: 
         noise: Standard deviation as a fraction of half the range.
         moment: Where to draw.
     """
-    drawn = moment.draw(Normal(), ACTUATOR_NOISE, (9,), {})
+    drawn = moment.draw(Normal(), STREAM, (9,), {})
     return command + noise * (high - low) / 2.0 * drawn

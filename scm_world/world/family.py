@@ -6,6 +6,8 @@ from collections import OrderedDict
 from collections.abc import Hashable, Iterable
 from typing import Any, final
 
+import numpy as np
+
 from scm_world._types import Values
 from scm_world.errors import ModelError
 from scm_world.graph import SCM, Moment
@@ -79,7 +81,16 @@ class Family:
             for v in self.head.variables
             if v.kind == "exogenous" and v.name not in targets  # type: ignore[attr-defined]
         }
-        return self.declaration(self.plan(model.solve(known, moment=moment)))
+        values = model.solve(known, moment=moment)
+        if not all(_possible(variable, values) for variable in self.head.variables):
+            return None  # the intervention will be refused, with the reason
+        return self.declaration(self.plan(values))
+
+
+def _possible(variable: Variable, values: Values) -> bool:
+    value = values[variable.name]
+    bounds = variable.bounds
+    return bool(np.isfinite(value).all()) and (bounds is None or bounds.contains(value, values))
 
 
 def _head(task: Task) -> SCM:

@@ -143,6 +143,7 @@ class _Draft:
         self.state = instant.state
         self.index = instant.index
         self._moment = moment
+        self._problems: list[InterventionError] = []
 
     def _is_state(self, target: str) -> bool:
         return self._world.model.declared(target).role == "state"
@@ -163,11 +164,31 @@ class _Draft:
             follow = frozenset(order)
             order = [name for name in self.model.structure.order if name in follow]
             known |= self._world.states(self._instant.state)
-        solved = self.model.solve(known, moment=self._moment, only=order)
-        self.static.update({name: solved[name] for name in order})
+        self._solve(order, known)
         if draws:
             held = {target: Hard(self.static[target].tolist()) for target in draws}
             self.model = self.model.with_interventions(held)
+
+    def _solve(self, order: Iterable[str], known: dict[str, Value]) -> None:
+        """Compute variables one after another, and stop where one is impossible.
+
+        A mechanism never meets values that its parents cannot have.
+        """
+        impossible: set[str] = set()
+        for name in order:
+            variable = self._world.model.declared(name)
+            if impossible and not impossible.isdisjoint(p.name for p in variable.all_parents):
+                impossible.add(name)
+                continue
+            known[name] = value = self.model.evaluate(name, known, self._moment)
+            follows = variable.bounds is not None and variable.bounds.parents()
+            try:
+                check_bounds(variable, value, self._context() if follows else {})
+            except InterventionError as problem:
+                self._problems.append(problem)
+                impossible.add(name)
+            else:
+                self.static[name] = value
 
     def _coordinates(self, target: str, name: str) -> Value:
         """Give the value of a target in the coordinates that were asked for."""
@@ -269,8 +290,8 @@ class _Draft:
 
     def check(self, accepted: Requests, space: SpaceName | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
-        problems = self._check_parameters()
-        if space is None:
+        problems = self._problems
+        if space is None or problems:
             return problems
         context = self._context()
         for target, (name, act) in accepted.items():
@@ -286,20 +307,6 @@ class _Draft:
 
     def _context(self) -> Values:
         return {**self.static, **self._world.states(self.state)}
-
-    def _check_parameters(self) -> list[InterventionError]:
-        """Check the bounds of everything that changes: targets and what follows them."""
-        problems: list[InterventionError] = []
-        for name, value in self.static.items():
-            if value is self._instant.static[name]:
-                continue
-            variable = self._world.model.declared(name)
-            follows = variable.bounds is not None and variable.bounds.parents()
-            try:
-                check_bounds(variable, value, self._context() if follows else {})
-            except InterventionError as problem:
-                problems.append(problem)
-        return problems
 
     def _held_action(self, act: Intervention) -> Value:
         return np.array(act.value) if isinstance(act, Hard) else np.full(9, np.nan)
