@@ -30,6 +30,9 @@ from scm_world.world.start import whole_number
 RENDER_MODES = ("rgb_array", "human")
 
 
+SINGLE = np.dtype(np.float32)
+
+
 class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """An environment whose every variable is a node of a causal graph.
 
@@ -265,13 +268,14 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         now = self._look()
         reward = self._scale * float(now["reward"])
         truncated = self.world.index >= self._limit
-        self._show()
+        if self._window is not None:
+            self._show()
         return self._observer.observe(now), reward, False, truncated, self._info(now)
 
     def _command(self, action: NDArray[np.float32]) -> Floats:
         """Turn an action into what the world takes, shape (9,)."""
         given: Any = np.asarray(action)
-        if given.dtype != np.float32:
+        if given.dtype is not SINGLE:
             given = np.asarray(given, dtype=np.float64)
         if given.shape != (9,):
             raise ActionError(f"an action has shape (9,), got {given.shape}", action)

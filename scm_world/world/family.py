@@ -15,7 +15,7 @@ from scm_world.tasks import Task
 from scm_world.variables import Intervention, Variable
 from scm_world.world.declaration import Declaration, Options
 
-KEPT = 8  # declarations that are kept for structures that come again
+KEPT = 4  # declarations that are kept for structures that come again
 
 
 @final

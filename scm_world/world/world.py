@@ -88,6 +88,7 @@ class World(Declared):
         made = make_task(task) if isinstance(task, str) else task
         self.family = Family(made, self.options)
         self._mode = self.options.mode
+        self._by_tips = action_mode == "end_effector_positions"
         self._action_unit = ACTIONS[action_mode][0]
         self.backend = make_backend(backend) if isinstance(backend, str) else backend
         self._started = False
@@ -247,7 +248,7 @@ class World(Declared):
             bounds = self.declaration.action_bounds
             noise = float(self._now[ACTUATOR_NOISE])
             command = disturbed(command, *bounds, noise, self.moment(self._index))
-        if self.action_mode == "end_effector_positions":
+        if self._by_tips:
             height = float(self._now["robot_height"])
             joints = self._state.joint_positions
             inverse_kernel(command, height, joints, self._command, self._reached)
