@@ -22,6 +22,7 @@ from scm_world.tasks import TASKS
 from scm_world.testing.requests import random_request
 from scm_world.world import World
 
+
 def memory() -> float:
     """Read the resident memory of this process [MiB]."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])

@@ -18,11 +18,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 import scm_world as sw
+from scm_world.backends.renderer import now_pixels
 from scm_world.discovery.report import versions
+from scm_world.env import ScmWorldEnv
+from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
+from scm_world.scene import Structure, default_scene
+from scm_world.scene.camera import CAMERAS
+from scm_world.scene.kinematics import forward, inverse_kernel
+from scm_world.scene.trifinger import REST
 from scm_world.variables import Normal
 
 REPEATS = 9
@@ -62,37 +68,92 @@ def graph() -> dict[str, float]:
     }
 
 
-def stepping(backend: str) -> dict[str, float]:
-    """Compare a step of the environment with the raw physics of the same scene and actions."""
-    env: Any = gymnasium.make(
-        "scm_world/Pushing-v0", backend=backend, disable_env_checker=True
-    ).unwrapped
+def stepping(backend: str, task: str) -> dict[str, float]:
+    """Compare a step of the environment with the raw physics of the same scene and actions.
+
+    Times are those of the processor, so that other programs do not count.
+    """
+    env = ScmWorldEnv(task, backend=backend)
+    env.reset(seed=0)
     world = env.world
     actions = np.random.default_rng(0).uniform(-1, 1, (250, 9)).astype(np.float32)
-    commands = [world._checked(env._middle + env._half * a) for a in actions]
+    commands = [np.array(env._command(action)) for action in actions]
     mode, substeps, engine = world._mode, world._substeps, world.backend
 
     def whole() -> float:
         env.reset(seed=0)
-        started = time.perf_counter()
+        started = time.process_time()
         for action in actions:
             env.step(action)
-        return (time.perf_counter() - started) / len(actions) * 1e6
+        return (time.process_time() - started) / len(actions) * 1e6
 
     def raw() -> float:
         env.reset(seed=0)
-        started = time.perf_counter()
+        started = time.process_time()
         for command in commands:
             engine.step(mode, command, substeps)
-        return (time.perf_counter() - started) / len(commands) * 1e6
+        return (time.process_time() - started) / len(commands) * 1e6
 
     whole(), raw()
     pairs = [(whole(), raw()) for _ in range(3 * REPEATS)]
     return {
-        "env.step [µs]": statistics.median(w for w, _ in pairs),
-        "raw physics [µs]": statistics.median(r for _, r in pairs),
-        "share of the raw rate": statistics.median(r / w for w, r in pairs),
+        f"{task}: env.step [µs]": statistics.median(w for w, _ in pairs),
+        f"{task}: raw physics [µs]": statistics.median(r for _, r in pairs),
+        f"{task}: share of the raw rate": statistics.median(r / w for w, r in pairs),
     }
+
+
+def seeing(backend: str) -> dict[str, float]:
+    """Step with pictures: three cameras now and three of the goal, 128 x 128."""
+    found = {}
+    for task in ("pushing", "general"):
+        env = ScmWorldEnv(task, backend=backend, observation_mode="pixel")
+        env.reset(seed=0)
+        action = np.zeros(9, dtype=np.float32)
+        step = median(lambda: env.step(action), 50)  # noqa: B023 # called at once
+        found[f"{task}: pixel steps per second"] = 1e6 / step
+    return found
+
+
+def building(backend: str) -> dict[str, float]:
+    """Step the walls: how much faster than real time, as they begin and once they are built."""
+    found = {}
+    for task in ("stacked_blocks", "creative_stacked_blocks"):
+        world = sw.World(task, backend=backend)
+        for title in ("begin", "built"):
+            world.reset(seed=0)
+            if title == "built":
+                world.do(world.task.solution(world.values()))
+            rest = np.array(world["joint_positions"])
+            step = micros(lambda: world.step(rest), 25)  # noqa: B023 # called at once
+            found[f"{task}, {title}: times real time"] = world.control_period / step * 1e6
+        world.close()
+    return found
+
+
+def drawing() -> dict[str, float]:
+    """Draw three cameras, compute an overlap and an inverse kinematics."""
+    scene = _scene(1)
+    out = np.empty((3, 3, 128, 128), dtype=np.uint8)
+    found = {"three-camera sets per second": 1e6 / median(lambda: now_pixels(scene, CAMERAS, out))}
+    generator = np.random.default_rng(0)
+    turn = generator.normal(size=4)
+    size, place, work = np.full(3, 0.065), np.zeros(3), np.empty(WORKSPACE)
+    box = (size, place + 0.01, turn / np.linalg.norm(turn))
+    found["overlap of two boxes [µs]"] = median(
+        lambda: overlap_kernel(size, place, np.array([0.0, 0.0, 0.0, 1.0]), *box, work), 2000
+    )
+    tips, joints = forward(np.array(REST), 0.34) + 0.01, np.array(REST)
+    solved, reached = np.empty(9), np.empty(3, dtype=np.bool_)
+    found["inverse kinematics [µs]"] = median(
+        lambda: inverse_kernel(tips, 0.34, joints, solved, reached), 2000
+    )
+    found["error of the inverse kinematics [m]"] = float(np.abs(forward(solved, 0.34) - tips).max())
+    return found
+
+
+def _scene(n_blocks: int) -> Any:
+    return default_scene(Structure(blocks=tuple(f"block_{i}" for i in range(n_blocks))))
 
 
 def resetting(backend: str) -> dict[str, float]:
@@ -175,11 +236,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("results.json"))
     out: Path = parser.parse_args().out
-    results: dict[str, dict[str, float]] = {"graph": graph(), "import": importing()}
+    results: dict[str, dict[str, float]] = {
+        "graph": graph(),
+        "import": importing(),
+        "drawing and geometry": drawing(),
+    }
     for backend in ("mujoco", "bullet"):
         try:
             results[backend] = {
-                **stepping(backend),
+                **stepping(backend, "pushing"),
+                **stepping(backend, "general"),
+                **seeing(backend),
+                **building(backend),
                 **resetting(backend),
                 **intervening(backend),
                 **discovering(backend),
