@@ -33,7 +33,14 @@ def test_links_lead_somewhere(path: Path) -> None:
             assert (path.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("name", ["interventions", "discovery"])
+def test_the_tables_of_variables_are_up_to_date() -> None:
+    """``docs/variables.md`` is what ``scm-world variables all --markdown`` writes."""
+    from scm_world.cli.variables import markdown
+
+    assert (ROOT / "docs" / "variables.md").read_text() == markdown()
+
+
+@pytest.mark.parametrize("name", ["interventions", "discovery", "environments", "new_family"])
 def test_examples_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Every example runs and prints something."""
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"))["main"]()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+import typer
 from rich.text import Text
 
 from scm_world.cli.console import console, table
@@ -61,7 +62,7 @@ def rows(variables: Iterable[Variable]) -> list[Row]:
 def _pattern(text: str) -> str:
     text = re.sub(r"(finger_|goal_)(60|120|300)\b", r"\1F", text)
     text = re.sub(r"finger_(60|120|300)_", "finger_F_", text)
-    return re.sub(r"(link|level|col|row|num|tool|goal|block|obstacle)_\d+", r"\1_N", text)
+    return re.sub(r"(level|col|row|num|tool|goal|block|obstacle)_\d+", r"\1_N", text)
 
 
 def _cells(variable: Variable) -> tuple[str, ...]:
@@ -175,7 +176,7 @@ def markdown() -> str:
         "",
         "What `do` means depends on the role:",
         "",
-        *(f"* a **{role}**: {meaning}." for role, meaning in DO.items()),
+        *(f"* **{role}**: {meaning}." for role, meaning in DO.items()),
         "",
     ]
     for title, found in sections(TASKS):
@@ -183,13 +184,13 @@ def markdown() -> str:
         lines += ["|" + "---|" * len(HEADINGS)]
         lines += ["| " + " | ".join((f"`{row.name}`", *row.cells)) + " |" for row in found]
         lines.append("")
-    return "\n".join(lines)
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def run(task: str, *, as_markdown: bool) -> None:
     """Print the tables."""
     if as_markdown:
-        console().print(markdown(), markup=False, soft_wrap=True, highlight=False)
+        typer.echo(markdown(), nl=False)
         return
     for title, found in sections(TASKS if task == "all" else (task,)):
         made = table(*HEADINGS[:5], "A", "B", title=title)
