@@ -10,54 +10,39 @@ Subclass it in a test file, say how to make a world of the task, and pytest runs
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
-from scm_world._types import Floats, Value
-from scm_world.entities import CONTROL_INDEX, SENSOR_NOISE
-from scm_world.errors import Infeasible, OutOfBounds, SeveralProblems
+from scm_world._types import Floats
+from scm_world.entities import SENSOR_NOISE
+from scm_world.errors import Infeasible
 from scm_world.graph import from_json, to_json
-from scm_world.scene import Scene, trifinger
-from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Variable
+from scm_world.scene import Scene
+from scm_world.testing.dynamics import SEED, WorldConformance
+from scm_world.testing.values import command, moved, quantities
+from scm_world.variables import Draw, Noise, Variable
 from scm_world.variables.kinds import SpaceName
-from scm_world.world import Audit, World, WorldSnapshot
+from scm_world.world import World, WorldSnapshot
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
 _SPACES: tuple[SpaceName, ...] = ("A", "B")
-_SEED = 20_26
 
 
-class TaskConformance(ABC):
-    """Every promise that a task makes, as a test.
+class TaskConformance(WorldConformance):
+    """Every promise that a task makes, as a test; those of a world are among them.
 
     Attributes:
         fulfilled: The fractional success that its own solution reaches at least.
-        awake: Interventions without which a variable has no effect: where obstacles are does not
-            matter as long as there are none.
         episodes: How many random episodes the suite plays.
         steps: How many control steps of each.
     """
 
     fulfilled: ClassVar[float] = 0.99
-    awake: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     episodes: ClassVar[int] = 3
     steps: ClassVar[int] = 40
-
-    @abstractmethod
-    def make(self) -> World:
-        """Create a world of the task."""
-
-    @pytest.fixture
-    def world(self) -> Iterator[World]:
-        """Provide a world at the start of an episode."""
-        world = self.make()
-        world.reset(seed=_SEED)
-        yield world
-        world.close()
 
     # --- declarations ---------------------------------------------------------------------------
 
@@ -92,7 +77,7 @@ class TaskConformance(ABC):
     @pytest.mark.parametrize("space", _SPACES)
     def test_spaces_lie_within_bounds(self, world: World, space: SpaceName) -> None:
         """Whatever is drawn from A or B, in any coordinates, is possible."""
-        values, noise = world.values(), Noise(_SEED)
+        values, noise = world.values(), Noise(SEED)
         for variable in world.model.variables:
             source = variable.space(space)
             if source is None:
@@ -130,10 +115,10 @@ class TaskConformance(ABC):
 
         Only the noise of sensors does not: it acts where observations are made.
         """
-        for name in _quantities(world):
+        for name in quantities(world):
             if name == SENSOR_NOISE:
                 continue
-            self._prepare(world, name)
+            self.prepare(world, name)
             before = world.scene(), world.cameras(), world.snapshot()
             moved(world, name)
             differ = _differ(before[0], world.scene()) or before[1] != world.cameras()
@@ -141,8 +126,8 @@ class TaskConformance(ABC):
 
     def test_every_quantity_is_read_back(self, world: World) -> None:
         """What the engine knows it reports as it was given, and the model agrees."""
-        for name in _quantities(world):
-            self._prepare(world, name)
+        for name in quantities(world):
+            self.prepare(world, name)
             wanted, audit = moved(world, name)
             entry = audit.targets[name]
             np.testing.assert_array_equal(entry.applied, world[name])
@@ -197,62 +182,20 @@ class TaskConformance(ABC):
         world.do(world.task.solution(world.values()))
         np.testing.assert_allclose(*world.task.goals(world.values()), atol=0.02)
 
-    def _prepare(self, world: World, name: str) -> None:
-        """Begin an episode in which a variable matters."""
-        world.reset(seed=_SEED, do=self.awake.get(name))
-
     def _random(self, world: World) -> Iterator[int]:
         """Play random episodes, each with interventions drawn from A at its start."""
-        generator = np.random.default_rng(_SEED)
+        generator = np.random.default_rng(SEED)
         for episode in range(self.episodes):
             world.reset(seed=episode)
-            for name in _quantities(world):
+            for name in quantities(world):
                 if name in world.static_names and world.model.declared(name).a is not None:
                     try:
                         world.do({name: Draw("A")})
                     except Infeasible:  # a large block where a finger is
                         continue
             for step in range(self.steps):
-                world.step(_command(world, generator))
+                world.step(command(world, generator))
                 yield step
-
-
-def nearby(world: World, name: str) -> Iterator[Value]:
-    """Give other possible values of a variable, near the present one."""
-    variable, value = world.model.declared(name), world[name]
-    match variable.bounds:
-        case Box() as box:
-            low, high = box.bounds(variable.shape, world.values())
-            inwards = 0.02 * (low + 0.37 * (high - low) - value)
-            yield value + inwards
-            yield value + 0.02 * (low - value)
-            first = np.zeros(variable.shape)
-            first.flat[0] = inwards.flat[0]
-            yield from (value + first, value - first)
-        case Integers(high=most):
-            yield np.where(value < most, value + 1, value - 1)
-        case Categories(members=members):
-            yield np.asarray(next(member for member in members if member != value))
-        case Rotations():
-            for angle in (0.1, 0.02):  # [rad]
-                yield np.array([0.0, 0.0, np.sin(angle / 2.0), np.cos(angle / 2.0)])
-        case _:
-            raise ValueError(f"{name} has no bounds to choose from")
-
-
-def moved(world: World, name: str) -> tuple[Value, Audit]:
-    """Give a variable the first nearby value that is feasible: blocks may touch one another.
-
-    Returns:
-        The value, and what became of it.
-    """
-    *others, last = nearby(world, name)
-    for value in others:
-        try:
-            return value, world.do({name: value})
-        except (Infeasible, OutOfBounds, SeveralProblems):
-            continue
-    return last, world.do({name: last})
 
 
 def out_of_bounds(world: World) -> list[str]:
@@ -271,18 +214,6 @@ def _declared(world: World) -> list[Variable]:
     return [
         *world.composition.variables(),
         *world.task.readouts(),
-    ]
-
-
-def _quantities(world: World) -> list[str]:
-    """Name every parameter and state that can be set, each in its own coordinates."""
-    model = world.model
-    return [
-        name
-        for name in model
-        if model.declared(name).settable
-        and model.target(name) == name
-        and name not in ("action", CONTROL_INDEX)
     ]
 
 
@@ -326,15 +257,3 @@ def _moves_differently(world: World, before: WorldSnapshot) -> bool:
 def _inverse(variable: Variable) -> Any:
     inverse: Any = getattr(variable, "inverse", None)
     return inverse.bind()
-
-
-def _command(world: World, generator: np.random.Generator) -> Floats:
-    """Draw an action: anywhere in its range, now and then at its ends, or near the rest pose."""
-    low, high = world.action_low, world.action_high
-    match generator.integers(4):
-        case 0:
-            return np.asarray(np.where(generator.random(9) < 0.5, low, high))
-        case 1 if world.action_mode == "joint_positions":
-            return np.asarray(np.array(trifinger.REST) + generator.uniform(-0.8, 0.8, 9))
-        case _:
-            return np.asarray(generator.uniform(low, high))
