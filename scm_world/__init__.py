@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from scm_world.discovery import discover
     from scm_world.env import DeltaAction, MovingAverageAction, ObjectSelector, ScmWorldEnv
     from scm_world.errors import ScmWorldError
+    from scm_world.geometry import load_hull
     from scm_world.graph import SCM
     from scm_world.tasks import Task, make_task
     from scm_world.variables import (
@@ -44,6 +45,7 @@ _HOMES = {
     "Task": "tasks",
     "World": "world",
     "discover": "discovery",
+    "load_hull": "geometry",
     "make_task": "tasks",
     **dict.fromkeys(
         (
@@ -84,6 +86,7 @@ __all__ = [
     "Task",
     "World",
     "discover",
+    "load_hull",
     "make_task",
 ]
 

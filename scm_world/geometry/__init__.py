@@ -1,6 +1,7 @@
 """Rotations, coordinates, and how boxes and capsules lie in one another: numbers only."""
 
 from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
+from scm_world.geometry.hulls import Hull, box_hull, extents, hull_of, hull_overlap, load_hull
 from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_fraction, overlap_volume
 from scm_world.geometry.penetration import (
     box_box,
@@ -24,18 +25,24 @@ from scm_world.geometry.sweep import Found, sweep
 
 __all__ = [
     "Found",
+    "Hull",
     "aabb_overlap_fraction",
     "angle_between",
     "box_box",
     "box_capsule",
     "box_floor",
+    "box_hull",
     "box_wall",
     "canonical",
     "capsule_capsule",
     "capsule_floor",
     "capsule_wall",
+    "extents",
     "from_cylindrical",
     "from_rotation_vector",
+    "hull_of",
+    "hull_overlap",
+    "load_hull",
     "overlap_fraction",
     "overlap_volume",
     "quaternion_inverse",
