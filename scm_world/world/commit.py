@@ -269,7 +269,9 @@ def _report(
     followed = {
         name: (before[name], value)
         for name, value in proposal.static.items()
-        if name in before and name not in entries and not _same(value, before[name])
+        if value is not before.get(name, value)
+        and name not in entries
+        and not _same(value, before[name])
     }
     for name, old in moved_before.items():
         if name in now and name not in entries and not same(old, now[name]):
@@ -284,4 +286,4 @@ def _report(
 
 
 def _same(a: Value, b: Value) -> bool:
-    return a is b or (np.shape(a) == np.shape(b) and same(a, b))
+    return np.shape(a) == np.shape(b) and same(a, b)

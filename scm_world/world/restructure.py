@@ -27,9 +27,11 @@ def restructured(
     What exists before and after keeps its values, its state and the interventions on it; what is
     new begins as at the start of an episode. Where the structure stays, so does the instant.
     """
+    if not len(family.head):
+        return instant
     acts = dict(instant.requests.values())
     acts |= _structural(family, instant, request)
-    declaration = family.after(acts, instant.model, dict(instant.static), moment)
+    declaration = family.after(acts, instant.model, instant.static, moment)
     if declaration is None or declaration is instant.declaration:
         return instant
     model = _held(instant.model, declaration)
