@@ -12,6 +12,7 @@ from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import PAGE, RESULTS, check_writable, console
 from scm_world.discovery.effects import gap
 from scm_world.errors import UnknownOption
+from scm_world.graph import SCM
 from scm_world.scene import Scene
 from scm_world.world import Audit, World
 
@@ -130,12 +131,12 @@ def paired(request: dict[str, Any], options: Options) -> Outcome:
         hold = before["joint_positions"]
         space: Any = options.space
         audit = world.do(request, space=space)
-        at_once = world.values()
+        at_once, models = world.values(), (world.model,)
         after = _advance(world, hold, options.steps)
         last = world.scene()
         world.restore(start)
         alone = _advance(world, hold, options.steps)
-        rows = _rows(world, audit, (before, at_once, after, alone))
+        rows = _rows((*models, world.model), audit, (before, at_once, after, alone))
         engine = f"{world.backend.name} {world.backend.version}"
         return Outcome(options, engine, audit, rows, scene, last)
     finally:
@@ -148,12 +149,18 @@ def _advance(world: World, action: Floats, steps: int) -> dict[str, Value]:
     return world.values()
 
 
-def _rows(world: World, audit: Audit, values: tuple[Values, ...]) -> tuple[Row, ...]:
-    model = world.model
-    targets = {model.target(name) for name in audit.targets}
-    follow = frozenset[str]().union(*(model.descendants(name) for name in targets))
+def _rows(models: tuple[SCM, ...], audit: Audit, values: tuple[Values, ...]) -> tuple[Row, ...]:
+    """Compare what there is with and without the intervention, which may change what there is."""
+    after, before = models
+    targets = {after.target(name) for name in audit.targets}
+    follow = {
+        name
+        for model in models
+        for target in targets & {*model}
+        for name in model.descendants(target)
+    }
     return tuple(
-        Row(name, model.declared(name).unit, name in follow, *(v[name] for v in values))
-        for name in model
-        if name not in targets or name in follow
+        Row(name, before.declared(name).unit, name in follow, *(v[name] for v in values))
+        for name in before
+        if all(name in v for v in values) and (name not in targets or name in follow)
     )

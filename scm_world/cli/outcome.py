@@ -60,6 +60,8 @@ def as_dict(outcome: Outcome) -> dict[str, Any]:
             "audit": targets,
             "followed": _changes(audit.followed),
             "engine": _changes(audit.engine),
+            "came": list(audit.came),
+            "went": list(audit.went),
             "variables": {row.name: _row(row) for row in outcome.rows},
             "moved_without_a_path": list(outcome.astray),
             "versions": versions(outcome.engine),
@@ -118,6 +120,9 @@ def _print_audit(terminal: Console, outcome: Outcome) -> None:
         for name, (old, new) in changes.items():
             values = (show(value, per_line=9) for value in (old, new))
             terminal.print(Text.assemble((f"{label}: ", "bold"), name, " ", " -> ".join(values)))
+    for label, names in (("new", outcome.audit.came), ("gone", outcome.audit.went)):
+        if names:
+            terminal.print(Text.assemble((f"{label}: ", "bold"), ", ".join(names)))
     terminal.print()
 
 
