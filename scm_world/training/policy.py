@@ -72,22 +72,36 @@ class MlpPolicy:
         return found
 
     def __call__(
-        self, observation: ArrayLike, generator: np.random.Generator | None = None
+        self,
+        observation: ArrayLike,
+        *,
+        deterministic: bool = True,
+        generator: np.random.Generator | None = None,
     ) -> Weights:
         """Choose an action.
 
         Args:
             observation: Shape (..., n).
-            generator: Of the noise of the policy; without it, the mean is taken.
+            deterministic: Take the mean instead of a draw.
+            generator: What draws are made with; the mean leaves it alone.
 
         Returns:
-            Shape (..., actions), in [-1, 1].
+            Shape (..., actions), clipped to [-1, 1].
 
         Raises:
-            ValueError: The observation has another number of components.
+            ValueError: The observation has another number of components, or there is no
+                generator to draw with.
+
+        Source:
+            Stable-Baselines 2.10, ``common/base_class.py``, ``ActorCriticRLModel.predict``.
         """
         action: Any = self.mean(self.features(observation))
-        if generator is not None:
+        if not deterministic:
+            if generator is None:
+                raise ValueError(
+                    "a draw needs a generator, got None; call policy(observation, "
+                    "deterministic=False, generator=numpy.random.default_rng(0))"
+                )
             noise = generator.standard_normal(action.shape, dtype=np.float32)
             action = action + np.exp(self.log_std) * noise
         clipped: Weights = np.clip(action, np.float32(-1.0), np.float32(1.0))
@@ -102,10 +116,17 @@ class MlpPolicy:
     ) -> tuple[Weights, None]:
         """Choose an action, as Stable-Baselines3 asks for one.
 
+        Args:
+            observation: Shape (..., n).
+            state: Not used: the policy has no memory.
+            episode_start: Not used either.
+            deterministic: It must be true.
+
+        Returns:
+            The action, shape (..., actions), and no state.
+
         Raises:
-            ValueError: ``deterministic`` is false: a policy has no generator of its own; call it
-                with one instead.
+            ValueError: ``deterministic`` is false, as there is no generator to draw with, or the
+                observation has another number of components.
         """
-        if not deterministic:
-            raise ValueError("noise needs a generator: policy(observation, generator)")
-        return self(observation), None
+        return self(observation, deterministic=deterministic), None

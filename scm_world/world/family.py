@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Hashable, Iterable
 from typing import Any, final
@@ -38,7 +39,8 @@ class Family:
         self._declarations: OrderedDict[Hashable, Declaration] = OrderedDict()
         first = self._task.at(self.plan(self.head.solve()), options.conventions)
         seconds = first.seconds
-        self.steps = options.given_length or round(seconds / options.control_period)
+        whole = math.floor(seconds / options.control_period + 1e-9)
+        self.steps = options.given_length or max(whole, 1)
 
     def plan(self, values: Values) -> Hashable:
         """Say what stands in the world, given the values of the head."""

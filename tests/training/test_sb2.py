@@ -5,50 +5,142 @@ from __future__ import annotations
 import io
 import json
 import os
+import pickle
 import zipfile
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import pytest
 
 from scm_world.errors import UnreadableFile
-from scm_world.training import load_sb2
+from scm_world.training import load_sb2, sb2
 
-GOLDEN: dict[str, tuple[float, list[float], float, list[float]]] = {
-    "reaching_ppo_curr1.zip": (
-        37,
-        [-1.1971, -0.4105, -2.9751, -2.0924, -0.9688, -4.1334, -2.878, -0.2502, -4.4673],
-        106.825,
-        [-0.3, 1.342, -1.231, 0.353, -1.013, -1.233, -0.309, 0.849, 0.187],
-    ),
-    "pushing_ppo_curr1.zip": (
-        56,
-        [8.2181, -13.8183, -12.5696, -15.2828, -8.8798, -4.9008, 18.004, -43.9157, -13.6006],
-        3.11942,
-        [1.123, 2.649, -0.653, -2.007, 4.831, -1.269, -0.962, 7.967, -2.182],
-    ),
-    "picking_ppo_curr1.zip": (
-        56,
-        [-10.2063, -34.3096, -6.6974, -11.863, -31.2926, -6.3192, -12.8778, -32.2954, -4.541],
-        2.67351,
-        [-0.231, -1.933, 0.683, -0.029, -4.108, 0.157, -0.793, -1.556, -0.52],
-    ),
-    "pick_and_place_ppo_curr0.zip": (
-        67,
-        [-9.5555, -25.5714, -15.6383, -10.1954, -1.4352, 6.2151, 7.6467, -34.6115, -11.3867],
-        2.54372,
-        [0.67, 2.753, -0.122, 1.598, -1.678, -0.544, -0.493, -0.642, -0.591],
-    ),
-    "stacking2_ppo_curr1.zip": (
-        84,
-        [-2.9266, -23.0091, -19.9542, -14.9895, -27.2184, -16.0165, -10.0254, -5.9751, -18.601],
-        2.96593,
-        [-1.082, 0.558, -0.222, 0.96, 0.164, 0.26, -0.398, 0.153, -1.206],
-    ),
-}
-"""Observed numbers; mean action and value at the default start; mean action for zeros."""
 
+class Golden(NamedTuple):
+    """What a published actor answers, without clipping, to five decimals.
+
+    ``start`` and ``value`` are the mean action and the value at the beginning of the default
+    episode, ``zeros`` the mean action for an observation of zeros.
+    """
+
+    file: str
+    task: str
+    start: list[float]
+    value: float
+    zeros: list[float]
+
+
+GOLDEN = [
+    Golden(
+        file="reaching_ppo_curr1.zip",
+        task="Reaching",
+        start=[
+            -1.19713,
+            -0.41048,
+            -2.9751,
+            -2.09243,
+            -0.96876,
+            -4.13343,
+            -2.878,
+            -0.25019,
+            -4.46735,
+        ],
+        value=106.825,
+        zeros=[-0.29993, 1.3424, -1.23127, 0.35336, -1.01278, -1.23323, -0.30887, 0.84923, 0.18667],
+    ),
+    Golden(
+        file="pushing_ppo_curr1.zip",
+        task="Pushing",
+        start=[
+            8.21811,
+            -13.81834,
+            -12.56961,
+            -15.28277,
+            -8.87979,
+            -4.90083,
+            18.00404,
+            -43.91566,
+            -13.60064,
+        ],
+        value=3.11942,
+        zeros=[1.123, 2.64885, -0.6535, -2.00652, 4.83134, -1.26885, -0.96207, 7.96673, -2.18227],
+    ),
+    Golden(
+        file="picking_ppo_curr1.zip",
+        task="Picking",
+        start=[
+            -10.20625,
+            -34.30957,
+            -6.69743,
+            -11.86302,
+            -31.29261,
+            -6.31918,
+            -12.8778,
+            -32.29537,
+            -4.541,
+        ],
+        value=2.67351,
+        zeros=[
+            -0.23119,
+            -1.9332,
+            0.68287,
+            -0.02934,
+            -4.10836,
+            0.15653,
+            -0.79263,
+            -1.55587,
+            -0.52014,
+        ],
+    ),
+    Golden(
+        file="pick_and_place_ppo_curr0.zip",
+        task="PickAndPlace",
+        start=[
+            -9.5555,
+            -25.57136,
+            -15.63826,
+            -10.19541,
+            -1.43522,
+            6.21512,
+            7.64673,
+            -34.61153,
+            -11.3867,
+        ],
+        value=2.54372,
+        zeros=[
+            0.67041,
+            2.75262,
+            -0.1218,
+            1.59799,
+            -1.67784,
+            -0.54375,
+            -0.49318,
+            -0.64226,
+            -0.59129,
+        ],
+    ),
+    Golden(
+        file="stacking2_ppo_curr1.zip",
+        task="Stacking2",
+        start=[
+            -2.92663,
+            -23.00911,
+            -19.95421,
+            -14.98953,
+            -27.2184,
+            -16.01649,
+            -10.02536,
+            -5.9751,
+            -18.60104,
+        ],
+        value=2.96593,
+        zeros=[-1.0817, 0.55802, -0.22245, 0.95954, 0.16421, 0.25979, -0.39767, 0.15276, -1.20638],
+    ),
+]
+ROUNDING = 6e-6  # half of the last digit, and some for single precision
 FOLDER = os.environ.get("CAUSAL_WORLD_ACTORS", "")
 
 
@@ -99,10 +191,20 @@ def test_noise_comes_from_the_generator_alone(tmp_path: Path) -> None:
     """The same generator gives the same actions; another one gives others."""
     policy = load_sb2(archive(tmp_path / "p.zip", tensors()))
     x = np.zeros(5)
-    drawn = [policy(x, np.random.default_rng(seed)) for seed in (3, 3, 4)]
+    drawn = [
+        policy(x, deterministic=False, generator=np.random.default_rng(seed)) for seed in (3, 3, 4)
+    ]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert not np.array_equal(drawn[0], drawn[2])
     assert (np.abs(drawn) <= 1.0).all()
+    many = policy(np.zeros((20_000, 5)), deterministic=False, generator=np.random.default_rng(0))
+    mean = policy.mean(policy.features(x))
+    inside = np.clip(mean + np.exp(-1.0) * np.random.default_rng(1).normal(size=(20_000, 9)), -1, 1)
+    np.testing.assert_allclose(many.mean(axis=0), inside.mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(many.std(axis=0), inside.std(axis=0), atol=0.02)
+    untouched = np.random.default_rng(3)
+    policy(x, generator=untouched)
+    assert untouched.random() == np.random.default_rng(3).random()
     with pytest.raises(ValueError, match="generator"):
         policy.predict(x, deterministic=False)
 
@@ -131,6 +233,9 @@ def test_nothing_is_unpickled(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ("change", "match"),
     [
         ({"model/pi/w:0": np.zeros((7, 9), np.float32)}, "do not fit"),
+        ({"model/vf/w:0": np.zeros((7, 1), np.float32)}, "do not fit"),
+        ({"model/pi/b:0": np.full(9, np.nan, np.float32)}, "of no use"),
+        ({"model/pi/w:0": np.full((6, 9), "text")}, "plain arrays"),
         ({"model/pi/b:0": np.zeros(8, np.float32)}, "of no use"),
         ({"model/shared_fc1/b:0": None}, "no layer 'model/shared_fc1'"),
         ({"model/pi/logstd:0": np.zeros(3, np.float32)}, "standard deviations"),
@@ -147,20 +252,62 @@ def test_what_is_no_such_policy_is_named(tmp_path: Path, change: Any, match: str
 def test_what_is_no_archive_is_named(tmp_path: Path) -> None:
     """A text file, an archive without weights, and no file at all."""
     (tmp_path / "text.zip").write_text("no")
-    with pytest.raises(UnreadableFile, match="no zip"):
+    with pytest.raises(UnreadableFile, match="no zip") as caught:
         load_sb2(tmp_path / "text.zip")
+    assert caught.value.path.endswith("text.zip")
+    assert "only multilayer perceptrons" in str(caught.value)
     with pytest.raises(UnreadableFile, match="no member"):
         load_sb2(archive(tmp_path / "p.zip", tensors(), member="other"))
     with pytest.raises(FileNotFoundError):
         load_sb2(tmp_path / "none.zip")
 
 
+@pytest.mark.parametrize("content", [pickle.dumps({"model/pi/w:0": 1}), b"", b"PK", b"\x93NUMPY"])
+def test_weights_that_are_no_numpy_archive_are_refused(tmp_path: Path, content: bytes) -> None:
+    """A pickle, nothing, the beginning of a zip, and a single array in place of the weights."""
+    with zipfile.ZipFile(tmp_path / "p.zip", "w") as written:
+        written.writestr("parameters", content)
+    with pytest.raises(UnreadableFile, match="no zip archive"):
+        load_sb2(tmp_path / "p.zip")
+
+
+def test_a_huge_archive_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Outside and inside: a small file may hold arrays that fill the memory."""
+    path = archive(tmp_path / "p.zip", tensors())
+    monkeypatch.setattr(sb2, "LARGEST", 1_000)
+    with pytest.raises(UnreadableFile, match="more than 1000 bytes"):
+        load_sb2(path)
+    monkeypatch.setattr(sb2, "LARGEST", 50_000)
+    raw = io.BytesIO()
+    np.savez_compressed(raw, **{**tensors(), "model/q/w:0": np.zeros(100_000)})
+    assert len(raw.getvalue()) < 50_000
+    with zipfile.ZipFile(path, "w") as written:
+        written.writestr("parameters", raw.getvalue())
+    with pytest.raises(UnreadableFile, match="more than 50000 bytes"):
+        load_sb2(path)
+
+
 @pytest.mark.skipif(not FOLDER, reason="needs CAUSAL_WORLD_ACTORS, a folder with the actors")
-@pytest.mark.parametrize("name", GOLDEN)
-def test_the_published_actors_say_what_they_said(name: str) -> None:
-    """For an observation of zeros, to the digits that are published."""
-    policy = load_sb2(Path(FOLDER) / name)
-    n, _, _, zeros = GOLDEN[name]
-    assert policy.n_observed == n
-    mean = policy.mean(policy.features(np.zeros(int(n))))
-    np.testing.assert_allclose(mean, zeros, atol=6e-4)
+@pytest.mark.parametrize("golden", GOLDEN, ids=lambda golden: golden.task)
+def test_the_published_actors_say_what_they_said(golden: Golden) -> None:
+    """For zeros, and for what our own environment shows at the start under the conventions."""
+    policy = load_sb2(Path(FOLDER) / golden.file)
+    close = partial(np.testing.assert_allclose, rtol=1e-4, atol=ROUNDING)
+    close(policy.mean(policy.features(np.zeros(policy.n_observed))), golden.zeros)
+
+    env = gymnasium.make(
+        f"scm_world/{golden.task}-v0",
+        backend="fake",
+        conventions="causal_world",
+        frame_skip=3,
+        disable_env_checker=True,
+    )
+    observation, _ = env.reset(seed=0)
+    env.close()
+    features = policy.features(observation)
+    close(policy.mean(features), golden.start)
+    assert policy.value is not None
+    close(policy.value(features), [golden.value])
+    close(policy(observation), np.clip(golden.start, -1, 1))
