@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import final
 
 from scm_world.discovery.scores import EdgeKey
@@ -61,24 +62,77 @@ def by_entity(names: Iterable[str]) -> list[str]:
 
 @final
 class Families:
-    """Variables that differ in numbers only and have the same declared edges, taken as one.
+    """Variables that differ in numbers only and play the same part in a graph, taken as one.
+
+    Two of them play the same part if their edges lead to as many variables of each family, with
+    the same lags, and to those of the same number (the same block, say) alike.
 
     Args:
         names: The variables.
         edges: The declared edges.
+
+    Source:
+        Color refinement: Weisfeiler and Leman, *The reduction of a graph to canonical form*, 1968.
+
+    Example:
+        >>> edges = [("size_1", "mass_1", 0), ("size_2", "mass_2", 0)]
+        >>> Families(["size_1", "size_2", "mass_1", "mass_2"], edges).members
+        {'size_{1,2}': ('size_1', 'size_2'), 'mass_{1,2}': ('mass_1', 'mass_2')}
     """
 
     def __init__(self, names: Iterable[str], edges: Iterable[EdgeKey]) -> None:
-        around: dict[str, set[tuple[str, str, int]]] = {}
+        around: dict[str, list[tuple[str, int, bool, str]]] = {name: [] for name in names}
         for cause, effect, lag in edges:
-            around.setdefault(cause, set()).add(("out", effect, lag))
-            around.setdefault(effect, set()).add(("in", cause, lag))
-        alike: dict[object, list[str]] = {}
-        for name in names:
-            key = (_template(name), frozenset(around.get(name, ())))
-            alike.setdefault(key, []).append(name)
-        self.members = {_label(found): tuple(found) for found in alike.values()}
+            own = _numbers(cause) == _numbers(effect)
+            around.setdefault(cause, []).append(("out", lag, own, effect))
+            around.setdefault(effect, []).append(("in", lag, own, cause))
+        alike = _refined(around)
+        self.members = dict(zip(_labels(alike), map(tuple, alike), strict=True))
         self.of = {name: label for label, found in self.members.items() for name in found}
+
+
+def _numbers(name: str) -> list[str]:
+    return _NUMBER.findall(name)
+
+
+def _refined(around: Mapping[str, Sequence[tuple[str, int, bool, str]]]) -> list[list[str]]:
+    """Split variables of one template until all members of a part have the same edges."""
+    part: dict[str, object] = {name: _template(name) for name in around}
+    count = 0
+    while count < len(set(part.values())):
+        count = len(set(part.values()))
+        seen = {
+            name: (
+                part[name],
+                frozenset(Counter((*to, part[other]) for *to, other in links).items()),
+            )
+            for name, links in around.items()
+        }
+        number = {key: i for i, key in enumerate(dict.fromkeys(seen.values()))}
+        part = {name: number[key] for name, key in seen.items()}
+    alike: dict[object, list[str]] = {}
+    for name, which in part.items():
+        alike.setdefault(which, []).append(name)
+    return list(alike.values())
+
+
+def _labels(families: Sequence[Sequence[str]]) -> list[str]:
+    """Name every family: in few words where they are not those of another one."""
+    whole, short = [_label(found) for found in families], [_short(found) for found in families]
+    return [
+        few if len(few) < len(all_) and short.count(few) == 1 and few not in whole else all_
+        for all_, few in zip(whole, short, strict=True)
+    ]
+
+
+def _short(members: Sequence[str]) -> str:
+    """Write ``tool_{…}.mass`` for the masses of blocks whose names have several numbers."""
+    entity, dot, quantity = _template(members[0]).partition(".")
+    first = entity.partition("{}")[0]
+    kind = first.rstrip("_").rpartition("_")[0]
+    if len(members) == 1 or entity.count("{}") < 2 or entity.startswith(_LINK.rstrip(".")):
+        return _label(members)
+    return f"{kind}_{{…}}{dot}{quantity} ({len(members)})"
 
 
 def _label(members: Sequence[str]) -> str:

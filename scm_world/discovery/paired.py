@@ -31,9 +31,11 @@ STEPS = (0.05, -0.05, 0.02, -0.02, 0.005, -0.005, 0.001, -0.001)
 FAR = (0.4, -0.4, 0.2, -0.2)
 """How far to move it first, in some of the probes: what has a threshold shows there."""
 
-
-SOLVED_ALONE = 8
+TRIED_ALONE = 8
 """In how many probes the mechanisms of what does not move are tried on their own."""
+
+SEEN_ELSEWHERE = 8
+"""How many earlier values of a readout are kept, to hand them to its children."""
 
 
 @final
@@ -77,11 +79,12 @@ class Paired:
         for target in self.targets:
             self._experiment(target)
         self._vary_action()
-        if number < SOLVED_ALONE:
-            see_mechanisms(self._world, self.effects, self._noise, number)
+        if number < TRIED_ALONE:
+            see_mechanisms(self._world, self._at_once, self.effects, self._noise, number)
         for name in self._readouts:
             self._vary_readout(name)
-            self._pool[name] = [*self._pool[name], self._at_once[name], self._later[name]][-8:]
+            self._pool[name] = [*self._pool[name], self._at_once[name], self._later[name]]
+            self._pool[name] = self._pool[name][-SEEN_ELSEWHERE:]
 
     # --- the pieces of an experiment ----------------------------------------------------------
 
@@ -101,26 +104,42 @@ class Paired:
             value = self._other(target, step, attempt)
             if value is None:
                 return
-            self._world.restore(self._probe.snapshot)
-            try:
-                self._world.do({target: value})
-            except InterventionError:
-                continue
-            restructured = self._world.declaration is not self._declaration
-            if (
-                self._in_another_structure(target, value)
-                if restructured
-                else (self._within_the_instant(target, value))
-            ):
+            if self._changed(target, value):
                 return
         self.effects.refused[target] = self.effects.refused.get(target, 0) + 1
 
+    def _changed(self, target: str, value: Value) -> bool:
+        """Do the experiments with one value of a target; tell whether all could be done."""
+        try:
+            self._see_target(target, value)
+        except InterventionError:
+            return False
+        self._undo(target, value)
+        return True
+
+    def _see_target(self, target: str, value: Value) -> None:
+        """Find the effects of one value.
+
+        What decides the structure is an effect like any other, and is held like any other. What
+        causes it is seen where its mechanism is tried on its own.
+        """
+        deciding: tuple[str, ...] = ()
+        self._hold(target, value, ())
+        if self._world.declaration is not self._declaration:
+            deciding = self._world.task.decided_by
+            if target in deciding:
+                self._in_another_structure(target, value)
+                return
+            self._hold(target, value, deciding)
+        self._within_the_instant(target, value, deciding)
+
     def _other(self, target: str, step: float, attempt: int) -> Value | None:
         """Choose another value; of what decides the structure, one that changes it a little."""
-        if target not in self._world.task.decided_by:
-            return self._another(self._world.model.declared(target), step, attempt)
-        nearby = [r[target] for r in self._world.task.nearby(self._at_once) if target in r]
-        return nearby[attempt % len(nearby)] if nearby else None
+        if target in self._world.task.decided_by:
+            nearby = [r[target] for r in self._world.task.nearby(self._at_once) if target in r]
+            if nearby:
+                return nearby[attempt % len(nearby)]
+        return self._another(self._world.model.declared(target), step, attempt)
 
     def _another(self, variable: Variable, step: float, attempt: int) -> Value | None:
         """Choose another value than the present one."""
@@ -145,38 +164,28 @@ class Paired:
             case _:
                 return None
 
-    def _within_the_instant(self, target: str, value: Value) -> bool:
-        """Find the effects at once and one step later; tell whether all could be done."""
+    def _within_the_instant(self, target: str, value: Value, deciding: tuple[str, ...]) -> None:
+        """Find the effects at once and one step later, in the structure that there is."""
         world = self._world
         reached = world.values()
         moved = [n for n in reached if n != target and gap(reached[n], self._at_once[n]) > 0.0]
         held = [n for n in moved if n not in self._computed]
-        try:
-            self._see_settable(target, value, held)
-            self._hold(target, value, held)
-        except InterventionError:
-            return False
+        self._see_settable(target, value, held, deciding)
+        self._hold(target, value, (*deciding, *held))
         alone = world.values()
         self._see_computed(target, [n for n in moved if n in self._computed], alone)
         self._see_later(target)
-        self._undo(target, value)
-        return True
 
-    def _in_another_structure(self, target: str, value: Value) -> bool:
+    def _in_another_structure(self, target: str, value: Value) -> None:
         """Find the effects of a change of structure, on what there is before and after it."""
         moved: list[str] = []
-        try:
-            while further := self._differing(target, moved):
-                moved += further
-                self._see_settable(target, value, moved)
-                self._hold(target, value, moved)
-        except InterventionError:
-            return False
+        while further := self._differing(target, moved):
+            moved += further
+            self._see_settable(target, value, moved)
+            self._hold(target, value, moved)
         after, _ = self._advanced(self._probe.action)
         for name in self._states.intersection(after):
             self.effects.see(target, name, 1, gap(after[name], self._later[name]))
-        self._undo(target, value)
-        return True
 
     def _differing(self, target: str, held: list[str]) -> list[str]:
         """Name what is not as it was, although it could be."""
@@ -203,10 +212,13 @@ class Paired:
         self._world.restore(self._probe.snapshot)
         self._world.do({target: value, **{name: self._at_once[name] for name in names}})
 
-    def _see_settable(self, target: str, value: Value, moved: list[str]) -> None:
+    def _see_settable(
+        self, target: str, value: Value, moved: list[str], deciding: tuple[str, ...] = ()
+    ) -> None:
+        """Let one variable follow at a time, with all others at their old values."""
         for name in moved:
             others = [other for other in moved if other != name]
-            self._hold(target, value, others)
+            self._hold(target, value, (*deciding, *others))
             size = gap(self._world[name], self._at_once[name])
             self.effects.see(target, name, 0, size)
 
