@@ -119,7 +119,8 @@ def propose(
     draft = _Draft(instant, {t: act for t, act in requests.items() if t in model}, moment)
     with np.errstate(all="ignore"):  # what is not finite is refused by name
         draft.solve_parameters()
-        problems += draft.set_states()
+        if not (draft.is_impossible and len(world.family.head)):
+            problems += draft.set_states()  # else bodies and layouts may not go together
         problems += draft.check(accepted, space)
     raise_all(problems)
     asked = tuple(name for name, _ in accepted.values())
@@ -147,6 +148,11 @@ class _Draft:
 
     def _is_state(self, target: str) -> bool:
         return self._world.model.declared(target).role == "state"
+
+    @property
+    def is_impossible(self) -> bool:
+        """Whether a parameter cannot have the value that it would get."""
+        return bool(self._problems)
 
     def solve_parameters(self) -> None:
         """Mutilate the model and recompute the descendants of the targets."""

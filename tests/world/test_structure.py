@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from worlds import PARAMS, actions, begin, play, same, shared
 
-from scm_world.errors import NotIntervenable, UnknownVariable
+from scm_world.errors import InterventionError, NotIntervenable, UnknownVariable
 from scm_world.tasks import Reaching
 from scm_world.variables import Box, Derived, Draw, Exogenous, Normal, Shift, Variable
 from scm_world.world import World
@@ -174,3 +174,17 @@ def test_a_draw_needs_a_space() -> None:
     world.reset(seed=0)
     with pytest.raises(NotIntervenable, match="no space"):
         world.do({"obstacle_places": Draw("A"), "robot_height": Draw("A")})
+
+
+def test_what_is_partly_impossible_is_refused_as_a_whole() -> None:
+    """A layout that fits no longer beside a number that is impossible: an error, no crash."""
+    world = World("stacked_blocks", backend="fake")
+    world.reset(seed=0)
+    values = world.values()
+    fewer = np.zeros_like(values["wall.layout"])
+    fewer[0, 0] = [0.0, 0.0, 0.05]
+    with pytest.raises(InterventionError, match="stack_levels"):
+        world.do({"wall.layout": fewer, "stack_levels": Shift(1000)})
+    assert same(world.values(), values)
+    world.do({"wall.layout": fewer})
+    assert world.composition.blocks == ("tool_level_0_num_0",)
