@@ -14,6 +14,7 @@ from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.delta import PREFIX, Delta
 from scm_world.env.goals import GoalReward, Goals, reader, reward_scale
+from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
 from scm_world.env.start import SPACES, asked, begin, beginning_structure, merged
 from scm_world.env.vector import box
@@ -33,7 +34,7 @@ RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
 
 
-class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class ScmWorldEnv(Looks, gymnasium.Env[Observation, NDArray[np.float32]]):
     """An environment whose every variable is a node of a causal graph.
 
     Made by ``gymnasium.make("scm_world/Pushing-v0")``; ``scm_world.env.IDS`` lists the ids.
@@ -145,7 +146,7 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             conventions=conventions,
             variables_space=variables_space,
         )
-        self.observation_mode, self.action_mode = observation_mode, action_mode
+        self._modes = (observation_mode, action_mode)
         self._rich = (info_contacts, info_state)
         self._begin_with(start, random_goal, attempts)
         self._open(render_mode)
@@ -307,16 +308,6 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         found: Observation = self._observer.observe(now)
         return found
 
-    @property
-    def layout(self) -> dict[str, slice]:
-        """Where each variable stands in the vector that is observed; empty for pictures."""
-        return dict(self._observer.layouts.get("observation", {}))
-
-    @property
-    def context_layout(self) -> dict[str, slice]:
-        """Where each variable stands in the privileged context; empty without one."""
-        return dict(self._observer.layouts.get("context", {}))
-
     def _info(self, now: Values) -> dict[str, Any]:
         achieved, desired = self._goals.read(self.world, now)
         success = bool(now["success"])
@@ -350,25 +341,6 @@ class ScmWorldEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         from scm_world.backends.renderer import render
 
         return render(self.world.scene(), OVERVIEW).rgb
-
-    def depth(self, camera: Camera = OVERVIEW) -> NDArray[np.float32]:
-        """Measure how far away everything is, shape (h, w) [m]."""
-        from scm_world.backends.renderer import depth_and_segmentation
-
-        found: NDArray[np.float32] = depth_and_segmentation(self.world.scene(), (camera,))[0][0]
-        return found
-
-    def segmentation(self, camera: Camera = OVERVIEW) -> tuple[NDArray[np.int32], tuple[str, ...]]:
-        """Tell which body every pixel shows.
-
-        Returns:
-            Shape (h, w): an index into the names of the bodies, -1 where there is nothing; and
-            these names.
-        """
-        from scm_world.backends.renderer import body_names, depth_and_segmentation
-
-        scene = self.world.scene()
-        return depth_and_segmentation(scene, (camera,))[1][0], body_names(scene.structure)
 
     def close(self) -> None:
         """Free the engine and the window."""

@@ -306,3 +306,12 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     lines = capsys.readouterr().out.splitlines()
     seen = [(" mass seen: True" in f" {line}", "color seen: True" in line) for line in lines[:3]]
     assert seen == [(False, False), (True, True), (False, True)]
+
+
+def test_modes_are_chosen_once() -> None:
+    """What an action means and what is observed cannot be changed under a learner."""
+    env = ScmWorldEnv("pushing", backend="fake", action_mode="joint_torques")
+    assert (env.action_mode, env.observation_mode) == ("joint_torques", "structured")
+    for name in ("action_mode", "observation_mode"):
+        with pytest.raises(AttributeError):
+            setattr(env, name, "another")
