@@ -59,6 +59,14 @@ Task = Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.
 Backend = Annotated[str, typer.Option(help="Physics engine: mujoco, bullet or fake.")]
 Preset = Annotated[str, typer.Option(help="Numerical settings: fast or precise.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of every random choice.")]
+Arguments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option",
+        metavar="NAME=VALUE",
+        help="Argument of the task, such as num_of_levels=2; give it once for each argument.",
+    ),
+]
 Out = Annotated[
     Path | None,
     typer.Option(help="Folder for the results.", show_default="under scm-world-results"),
@@ -92,6 +100,7 @@ def discover(
     preset: Preset = "fast",
     out: Out = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if the SHD is not 0.")] = False,
+    option: Arguments = None,
 ) -> None:
     """Recover the causal graph of a task by experiments, and score it.
 
@@ -99,7 +108,7 @@ def discover(
     """
     from scm_world.cli.discovery import Options, run
 
-    options = Options(task, backend, preset, probes, seed)
+    options = Options(task, backend, preset, probes, seed, tuple(option or ()))
     raise typer.Exit(run(options, out=out, strict=strict))
 
 
@@ -112,11 +121,12 @@ def graph(
         str,
         typer.Option(help="joint_positions, joint_torques or end_effector_positions."),
     ] = "joint_positions",
+    option: Arguments = None,
 ) -> None:
     """Show the declared causal graph of a task."""
     from scm_world.cli.graphs import run
 
-    run(task, format_.value, out, action_mode)
+    run(task, format_.value, out, action_mode, option or ())
 
 
 @app.command()
@@ -140,11 +150,12 @@ def do(
         bool, typer.Option("--all", help="Show descendants that did not move, too.")
     ] = False,
     out: Out = None,
+    option: Arguments = None,
 ) -> None:
     """Intervene on a task and show what followed, beside the same world left alone."""
     from scm_world.cli.intervene import Options, run
 
-    options = Options(task, backend, preset, seed, steps, space)
+    options = Options(task, backend, preset, seed, steps, space, tuple(option or ()))
     raise typer.Exit(run(assignments, options, show_all=show_all, out=out))
 
 

@@ -12,8 +12,8 @@ from scm_world.errors import ConflictingTargets
 _HINT = "'NAME=VALUE...'"
 
 
-def _refuse(text: str, why: str) -> typer.BadParameter:
-    return typer.BadParameter(f"{text!r}: {why}", param_hint=_HINT)
+def _refuse(text: str, why: str, hint: str = _HINT) -> typer.BadParameter:
+    return typer.BadParameter(f"{text!r}: {why}", param_hint=hint)
 
 
 def _number(text: str) -> Any:
@@ -38,11 +38,12 @@ def _numbers(text: str) -> Any:
     return [_number(part) for part in parts if part or len(parts) > 1]
 
 
-def parse_value(text: str) -> Any:
+def parse_value(text: str, hint: str = _HINT) -> Any:
     """Read a value or an intervention.
 
     Args:
         text: A number, a list of numbers, ``shift:…``, ``scale:…``, or ``draw:A``.
+        hint: The argument that it was given for, for the message.
 
     Raises:
         BadParameter: It is empty, or an intervention that does not exist.
@@ -56,7 +57,7 @@ def parse_value(text: str) -> Any:
     from scm_world.variables import Draw, Scale, Shift
 
     if not text.strip():
-        raise _refuse(text, "there is no value")
+        raise _refuse(text, "there is no value", hint)
     kind, colon, rest = text.partition(":")
     if not colon:
         return _numbers(text)
@@ -70,12 +71,16 @@ def parse_value(text: str) -> Any:
                 return Draw(rest.strip())
     except ValidationError:
         wanted = "draw:A, draw:B or draw:A|B" if kind.strip().lower() == "draw" else "numbers"
-        raise _refuse(text, f"expected {wanted}") from None
-    raise _refuse(text, "expected a number, a list, shift:…, scale:… or draw:…")
+        raise _refuse(text, f"expected {wanted}", hint) from None
+    raise _refuse(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)
 
 
-def parse_assignments(texts: Iterable[str]) -> dict[str, Any]:
+def parse_assignments(texts: Iterable[str], hint: str = _HINT) -> dict[str, Any]:
     """Read ``name=value`` pairs.
+
+    Args:
+        texts: One pair each.
+        hint: The argument that they were given for, for messages.
 
     Raises:
         BadParameter: One has no ``=``, no name, or a value that cannot be read.
@@ -86,8 +91,8 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         name = name.strip()
         if not equals or not name:
-            raise _refuse(text, "expected name=value, for example floor_friction=0.4")
+            raise _refuse(text, "expected name=value, for example floor_friction=0.4", hint)
         if name in request:
             raise ConflictingTargets((name, name), name)
-        request[name] = parse_value(value)
+        request[name] = parse_value(value, hint)
     return request

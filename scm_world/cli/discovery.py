@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
@@ -19,6 +19,7 @@ from scm_world.cli.console import (
     table,
     written,
 )
+from scm_world.cli.tasks import build, suffix
 from scm_world.discovery import DiscoveryReport, discover
 from scm_world.discovery.names import by_entity
 from scm_world.discovery.plots import draw_graphs
@@ -44,6 +45,7 @@ class Options:
         preset: Numerical settings.
         probes: How many probe states.
         seed: Of the experiments.
+        arguments: Of the task, each as ``name=value``.
     """
 
     task: str
@@ -51,18 +53,22 @@ class Options:
     preset: str
     probes: int
     seed: int
+    arguments: tuple[str, ...] = ()
 
 
 def run(options: Options, *, out: Path | None, strict: bool) -> int:
     """Discover, print, write; return the exit code."""
-    folder = out or RESULTS / f"discover-{options.task}-{options.backend}-seed{options.seed}"
+    about = f"{options.backend}-seed{options.seed}{suffix(options.arguments)}"
+    folder = out or RESULTS / f"discover-{options.task}-{about}"
     check_writable(folder, folder=True)
-    world = World(options.task, backend=options.backend, preset=options.preset)
+    task = build(options.task, options.arguments)
+    world = World(task, backend=options.backend, preset=options.preset)
     try:
         with _progress(options.probes) as progress:
             report = discover(world, probes=options.probes, seed=options.seed, progress=progress)
     finally:
         world.close()
+    report = replace(report, arguments=options.arguments)
     terminal = console()
     _print(terminal, report, tuple(world.model))
     with staged(folder) as draft:
@@ -160,6 +166,8 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
     complete = report.probes == report.planned
     states = f"{report.probes}" if complete else f"{report.probes} of {report.planned}: interrupted"
     yield "engine", f"{report.backend} {version}, preset {report.preset}", None
+    if report.arguments:
+        yield "options", ", ".join(report.arguments), None
     yield "probe states", states, None if complete else False
     yield "rollouts", str(report.rollouts), None
     yield "floor (do and undo)", f"{report.floor:.3g}", None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import typer
 from rich.text import Text
 
 from scm_world.cli.console import PAGE, check_writable, console, keep_whole, show, table, written
+from scm_world.cli.tasks import build, suffix
 from scm_world.discovery.names import braces, by_entity
 from scm_world.graph import SCM, to_dot, to_json
 from scm_world.variables import Affine, Box, Variable
@@ -24,13 +26,19 @@ KIND_STYLE = {"exogenous": "yellow", "derived": "green", "measured": "blue", "ac
 LONG = 80  # [characters] what is longer is written once
 
 
-def run(task: str, format_: str, out: Path | None, action_mode: str) -> None:
+def run(
+    task: str,
+    format_: str,
+    out: Path | None,
+    action_mode: str,
+    arguments: Sequence[str] = (),
+) -> None:
     """Write the declared graph of a task."""
     if format_ == "png" and out is None:
-        out = Path(f"{task}-graph.png")
+        out = Path(f"{task}{suffix(arguments)}-graph.png")
     if out is not None:
         check_writable(out, folder=False)
-    world = World(task, backend="fake", action_mode=action_mode)
+    world = World(build(task, arguments), backend="fake", action_mode=action_mode)
     if out is None:
         _to_terminal(world, format_)
         return

@@ -10,6 +10,7 @@ from typing import Any, final
 from scm_world._types import Floats, Value, Values
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import PAGE, RESULTS, check_writable, console
+from scm_world.cli.tasks import build, suffix
 from scm_world.discovery.effects import gap
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
@@ -31,6 +32,7 @@ class Options:
         seed: Of the noise.
         steps: Control steps to run afterwards.
         space: The space that values must lie in, or None.
+        arguments: Of the task, each as ``name=value``.
     """
 
     task: str
@@ -39,6 +41,7 @@ class Options:
     seed: int
     steps: int
     space: str | None
+    arguments: tuple[str, ...] = ()
 
 
 @final
@@ -109,7 +112,8 @@ def run(assignments: Sequence[str], options: Options, *, show_all: bool, out: Pa
     if options.space is not None and options.space not in SPACES:
         raise UnknownOption("space", options.space, SPACES)
     request = parse_assignments(assignments)
-    folder = out or RESULTS / f"do-{options.task}-{options.backend}-seed{options.seed}"
+    about = f"{options.backend}-seed{options.seed}{suffix(options.arguments)}"
+    folder = out or RESULTS / f"do-{options.task}-{about}"
     check_writable(folder, folder=True)
     outcome = paired(request, options)
     save(outcome, folder)
@@ -124,7 +128,8 @@ def paired(request: dict[str, Any], options: Options) -> Outcome:
         InterventionError: The intervention was refused.
         UnknownOption: A name does not exist.
     """
-    world = World(options.task, backend=options.backend, preset=options.preset)
+    task = build(options.task, options.arguments)
+    world = World(task, backend=options.backend, preset=options.preset)
     try:
         world.reset(seed=options.seed)
         start, before, scene = world.snapshot(), world.values(), world.scene()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT, DPI = 1600, 900, 100  # [pixels], [pixels], [pixels/inch]
-MATCHED, EXTRA, MISSING = "#1f6fb4", "#f28e2b", "#d62728"
+DECLARED, MATCHED, EXTRA, MISSING = "#4a5568", "#1f6fb4", "#f28e2b", "#d62728"
 INK, FAINT = "#222222", "#c9ced6"
 AT_ONCE, LAGGED = "#5f6b7a", "#9a6fb0"
 MARKERS = {0: "o", 1: ">"}
@@ -57,11 +57,20 @@ def _save(figure: Figure, path: Path | str) -> None:
 @final
 @dataclass(frozen=True)
 class _Cell:
-    """The edges between two families of variables with one lag."""
+    """The edges between two families of variables with one lag.
+
+    Attributes:
+        matched: How many are found and declared.
+        extra: How many are found, but not declared.
+        missing: How many are declared, but not found.
+        own: Whether not every member of one is declared to affect every member of the other:
+            each block has its own size, say.
+    """
 
     matched: int
     extra: int
     missing: int
+    own: bool
 
 
 @final
@@ -90,7 +99,14 @@ class _Matrix:
             for cause, effect, lag in edges:
                 key = (families.of[cause], families.of[effect], lag)
                 counts.setdefault(key, [0, 0, 0])[number] += 1
-        return {key: _Cell(*count) for key, count in counts.items()}
+        return {
+            key: _Cell(matched, extra, missing, self._own(families, key, matched + missing))
+            for key, (matched, extra, missing) in counts.items()
+        }
+
+    def _own(self, families: Families, key: EdgeKey, declared: int) -> bool:
+        cause, effect, _ = key
+        return 0 < declared < len(families.members[cause]) * len(families.members[effect])
 
 
 def entity(label: str) -> str:
@@ -177,15 +193,22 @@ def _grid(ax: Axes, matrix: _Matrix) -> None:
         ax.axhline(y, color=FAINT, lw=0.5, zorder=1)
 
 
+def _mark(ax: Axes, spot: tuple[float, float], lag: int, cell: _Cell, color: str) -> None:
+    """Draw edges; hollow where each member of a family has its own."""
+    face, size = ("white", 36) if cell.own else (color, 46)
+    width = 1.6 if cell.own else 0.0
+    ax.scatter(*spot, s=size, marker=MARKERS[lag], fc=face, ec=color, zorder=3, lw=width)
+
+
 def _draw_declared(ax: Axes, spot: tuple[float, float], lag: int, cell: _Cell) -> None:
     if cell.matched or cell.missing:
-        ax.scatter(*spot, s=46, marker=MARKERS[lag], color="#4a5568", zorder=3, lw=0)
+        _mark(ax, spot, lag, cell, DECLARED)
 
 
 def _draw_found(ax: Axes, spot: tuple[float, float], lag: int, cell: _Cell) -> None:
     """Draw what was found, and over it what was missed or found too much."""
     if cell.matched:
-        ax.scatter(*spot, s=46, marker=MARKERS[lag], color=MATCHED, zorder=3, lw=0)
+        _mark(ax, spot, lag, cell, MATCHED)
     if cell.extra:
         ax.scatter(*spot, s=170, marker="s", color=EXTRA, zorder=2.5, lw=0)
         ax.scatter(*spot, s=40, marker=MARKERS[lag], color="white", zorder=3, lw=0)
@@ -211,6 +234,10 @@ def _heading(figure: Figure, report: DiscoveryReport) -> None:
     figure.text(0.012, 0.918, numbers, fontsize=12, color=INK)
 
 
+def _hollow(color: str) -> dict[str, Any]:
+    return {"markerfacecolor": "white", "markeredgecolor": color, "markeredgewidth": 1.6}
+
+
 def _legend(figure: Figure) -> None:
     from matplotlib.lines import Line2D
 
@@ -218,13 +245,13 @@ def _legend(figure: Figure) -> None:
         look = {"markersize": 8, "markeredgewidth": 0, **style}
         return Line2D([], [], ls="", marker=marker, color=color, label=label, **look)
 
-    hollow = {"markerfacecolor": "white", "markeredgecolor": MISSING, "markeredgewidth": 1.6}
     handles = [
-        key("o", "at once", "#4a5568"),
-        key(">", "one control step later", "#4a5568"),
+        key("o", "at once", DECLARED),
+        key(">", "one control step later", DECLARED),
+        key("o", "each its own", DECLARED, **_hollow(DECLARED)),
         key("o", "found and declared", MATCHED),
         key("s", "found, not declared", EXTRA, markersize=11),
-        key("X", "declared, not found", MISSING, **hollow),
+        key("X", "declared, not found", MISSING, **_hollow(MISSING)),
     ]
     figure.legend(
         handles=handles,

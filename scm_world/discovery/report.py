@@ -52,6 +52,7 @@ class DiscoveryReport:
         refused: Targets that found no feasible value in some probes, with how often.
         seconds: Wall time.
         versions: Of everything that decides the result.
+        arguments: What the task was made with, each as ``name=value``, where that is known.
     """
 
     task: str
@@ -71,12 +72,14 @@ class DiscoveryReport:
     refused: dict[str, int]
     seconds: float
     versions: dict[str, str]
+    arguments: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Write the report as plain data."""
         return {
             "format": FORMAT,
             "task": self.task,
+            "arguments": list(self.arguments),
             "backend": self.backend,
             "preset": self.preset,
             "seed": self.seed,

@@ -15,7 +15,7 @@ from scm_world.discovery.probes import probes
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.tasks import Pushing, Task
-from scm_world.tasks.base import Conventions, Observed
+from scm_world.tasks.base import Observed
 from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Variable
 from scm_world.world import World
 
@@ -186,9 +186,11 @@ def test_custom_tasks_can_be_discovered() -> None:
         name = "heavy"
         seconds = 1.0
 
+        default_weights = Pushing.default_weights
+
         def __init__(self) -> None:
+            super().__init__()
             self._pushing = Pushing(tool_block_mass=0.08)
-            self.weights = self._pushing.weights
 
         def entities(self):  # type: ignore[no-untyped-def]
             return self._pushing.entities()
@@ -196,14 +198,20 @@ def test_custom_tasks_can_be_discovered() -> None:
         def shared(self) -> Iterable[Variable]:
             return self._pushing.shared()
 
-        def readouts(self, conventions: Conventions) -> Iterable[Variable]:
-            return self._pushing.readouts(conventions)
+        def readouts(self) -> Iterable[Variable]:
+            return self._pushing.readouts()
 
         def observed(self) -> Iterable[Observed]:
             return self._pushing.observed()
 
-        def goals(self, values):  # type: ignore[no-untyped-def]
-            return self._pushing.goals(values)
+        def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+            return self._pushing.goal_names()
+
+        def fraction(self, achieved, desired):  # type: ignore[no-untyped-def]
+            return self._pushing.fraction(achieved, desired)
+
+        def fulfilled(self, fraction):  # type: ignore[no-untyped-def]
+            return self._pushing.fulfilled(fraction)
 
         def solution(self, values):  # type: ignore[no-untyped-def]
             return self._pushing.solution(values)
