@@ -51,6 +51,9 @@ class Task(ABC):
     conventions: Conventions = CONVENTIONS["scm_world"]
 
     def __init__(self, **common: Unpack[Common]) -> None:
+        unknown = sorted(common.keys() - Common.__annotations__.keys())
+        if unknown:
+            raise UnknownOption(f"option of {self.name}", unknown[0], Common.__annotations__)
         self.weights = resolve(self.default_weights, self.paper_weights, common)
         self.terms = tuple(common.get("terms", ()))
         given = common.get("joint_positions")

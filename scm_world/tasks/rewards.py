@@ -64,12 +64,16 @@ def resolve(
         if unknown:
             raise UnknownOption("reward term", min(unknown), (*weights, SUCCESS))
         weights.update({name: float(weight) for name, weight in asked.items()})
-    weights.update(_in_order([n for n in default if n != FRACTION], options))
-    if (fraction := options.get("fractional_reward_weight")) is not None:
-        weights[FRACTION] = float(fraction)
     sparse = asked == "sparse" or options.get("activate_sparse_reward", False)
     if sparse or asked == "none":
         weights = dict.fromkeys(weights, 0.0)
+    own_weights = _in_order([n for n in default if n != FRACTION], options)
+    if (fraction := options.get("fractional_reward_weight")) is not None:
+        own_weights[FRACTION] = float(fraction)
+    if sparse and any(own_weights.values()):
+        named = {name: weight for name, weight in own_weights.items() if weight}
+        raise UnknownOption("weights of a sparse reward", named, ("none: it is 1 for success",))
+    weights.update(own_weights)
     return {**weights, SUCCESS: 1.0} if sparse else weights
 
 
