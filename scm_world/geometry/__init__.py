@@ -1,8 +1,9 @@
 """Rotations, coordinates, and how boxes and capsules lie in one another: numbers only."""
 
 from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
+from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.hulls import Hull, box_hull, extents, hull_of, hull_overlap, load_hull
-from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_fraction, overlap_volume
+from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_volume
 from scm_world.geometry.penetration import (
     box_box,
     box_capsule,

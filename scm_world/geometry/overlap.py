@@ -183,48 +183,6 @@ def overlap_kernel(
     return float(min(max(volume, 0.0), most))
 
 
-@njit(cache=True)
-def overlap_fraction_kernel(
-    sizes: Floats,
-    positions: Floats,
-    orientations: Floats,
-    goal_sizes: Floats,
-    goal_positions: Floats,
-    goal_orientations: Floats,
-) -> float:
-    """Compute the fraction of the goals that the blocks fill; see ``overlap_fraction``.
-
-    Args:
-        sizes: Of the blocks, shape (n, 3) [m].
-        positions: Of the blocks, shape (n, 3) [m].
-        orientations: Of the blocks, shape (n, 4).
-        goal_sizes: Shape (m, 3) [m].
-        goal_positions: Shape (m, 3) [m].
-        goal_orientations: Shape (m, 4).
-
-    Returns:
-        The fraction, in [0, 1].
-    """
-    work = np.empty(WORKSPACE)
-    filled, wanted = 0.0, 0.0
-    for g in range(len(goal_sizes)):
-        volume = goal_sizes[g, 0] * goal_sizes[g, 1] * goal_sizes[g, 2]
-        shared = 0.0
-        for b in range(len(sizes)):
-            shared += overlap_kernel(
-                sizes[b],
-                positions[b],
-                orientations[b],
-                goal_sizes[g],
-                goal_positions[g],
-                goal_orientations[g],
-                work,
-            )
-        filled += min(shared, volume)
-        wanted += volume
-    return filled / wanted if wanted > 0.0 else 1.0
-
-
 def overlap_volume(
     size_a: ArrayLike,
     position_a: ArrayLike,
@@ -267,46 +225,6 @@ def overlap_volume(
             np.empty(WORKSPACE),
         )
     )
-
-
-def overlap_fraction(
-    sizes: ArrayLike,
-    positions: ArrayLike,
-    orientations: ArrayLike,
-    goal_sizes: ArrayLike,
-    goal_positions: ArrayLike,
-    goal_orientations: ArrayLike,
-) -> float:
-    """Compute how much of the volume of the goals the blocks fill.
-
-    What the blocks share with a goal is added up, and counts no more than that goal's own
-    volume. The result is the exact filling as long as neither blocks nor goals intersect one
-    another; where two goals intersect, what lies in both counts for both.
-
-    Args:
-        sizes: Full edge lengths of the blocks, shape (n, 3) [m].
-        positions: Centers of the blocks, shape (n, 3) [m].
-        orientations: Quaternions (x, y, z, w) of the blocks, shape (n, 4).
-        goal_sizes: As ``sizes``, of the goals, shape (m, 3) [m].
-        goal_positions: Shape (m, 3) [m].
-        goal_orientations: Shape (m, 4).
-
-    Returns:
-        The fraction, dimensionless, in [0, 1]. A world without goals, or whose goals have no
-        volume, is fulfilled: 1.0.
-
-    Example:
-        >>> upright = [[0.0, 0.0, 0.0, 1.0]]
-        >>> goal = ([[2.0, 1.0, 1.0]], [[0.0, 0.0, 0.0]], upright)
-        >>> overlap_fraction([[2.0, 1.0, 1.0]], [[1.0, 0.0, 0.0]], upright, *goal)
-        0.5
-
-    Source:
-        Ahmed et al., *CausalWorld*, ICLR 2021, "fractional success".
-    """
-    blocks = (rows(sizes, 3), rows(positions, 3), rows(orientations, 4))
-    goals = (rows(goal_sizes, 3), rows(goal_positions, 3), rows(goal_orientations, 4))
-    return float(overlap_fraction_kernel(*blocks, *goals))
 
 
 def _corners(sizes: ArrayLike, positions: ArrayLike, orientations: ArrayLike) -> Floats:

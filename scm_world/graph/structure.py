@@ -107,9 +107,7 @@ class Structure:
         return [name for name in self.order if name in found] if found else []
 
 
-def _edges(
-    parents: Mapping[str, Sequence[Parent]], *, lag: int | None = None
-) -> Iterator[Edge]:
+def _edges(parents: Mapping[str, Sequence[Parent]], *, lag: int | None = None) -> Iterator[Edge]:
     for name, causes in parents.items():
         for parent in causes:
             if lag is None or parent.lag == lag:

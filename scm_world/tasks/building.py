@@ -10,7 +10,8 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.entities import Entity
-from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_fraction_kernel
+from scm_world.geometry.filling import overlap_fraction_kernel
+from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.tasks import kernels
 from scm_world.tasks.base import Task
 from scm_world.tasks.observed import Observed, observe_goal, observe_obstacle, observe_tool
