@@ -287,10 +287,10 @@ class UnknownOption(ScmWorldError, ValueError):
         self.option = option
         self.value = value
         self.choices = tuple(choices)
-        hint = _suggest(nearest(str(value), self.choices))
-        super().__init__(
-            f"no {option} is named {value!r}{hint}; there are: {', '.join(self.choices)}"
-        )
+        what = f"{option} cannot be {value!r}"
+        if isinstance(value, str):
+            what = f"no {option} is named {value!r}{_suggest(nearest(value, self.choices))}"
+        super().__init__(f"{what}; there are: {', '.join(self.choices)}")
 
 
 class EngineError(ScmWorldError, RuntimeError):

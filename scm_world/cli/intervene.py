@@ -15,9 +15,8 @@ from scm_world.discovery.effects import gap
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.scene import Scene
+from scm_world.variables.kinds import SPACES
 from scm_world.world import Audit, World
-
-SPACES = ("A", "B", "A|B")
 
 
 @final

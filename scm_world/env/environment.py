@@ -12,18 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
+from scm_world.env.copies import Copied
 from scm_world.env.delta import PREFIX, Delta
 from scm_world.env.goals import GoalReward, Goals, reader, reward_scale
 from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
-from scm_world.env.start import SPACES, asked, begin, beginning_structure, merged
+from scm_world.env.start import asked, begin, beginning_structure, merged
 from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.scene.camera import OVERVIEW, Camera
 from scm_world.scene.kinematics import scaled_clip_kernel
 from scm_world.tasks import Task, make_task
-from scm_world.variables.kinds import SpaceName
+from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world import Audit, World
 from scm_world.world.declaration import Declaration
 from scm_world.world.start import whole_number
@@ -33,8 +34,10 @@ RENDER_MODES = ("rgb_array", "human")
 
 SINGLE = np.dtype(np.float32)
 
+_NOT_GIVEN = ("self", "__class__")
 
-class ScmWorldEnv(Looks, gymnasium.Env[Observation, NDArray[np.float32]]):
+
+class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]):
     """An environment whose every variable is a node of a causal graph.
 
     Made by ``gymnasium.make("scm_world/Pushing-v0")``; ``scm_world.env.IDS`` lists the ids.
@@ -42,7 +45,8 @@ class ScmWorldEnv(Looks, gymnasium.Env[Observation, NDArray[np.float32]]):
     Every observation lies in ``observation_space``. Bounds are physical; a number beyond them (a
     joint faster than 50 rad/s) saturates, like a sensor. An episode is truncated at its length
     and never terminated. An intervention that changes which bodies exist changes what is
-    observed: ``observation_space`` is then the one of the new structure.
+    observed: ``observation_space`` is then the one of the new structure. A copy, or what comes
+    out of a pickle, goes on bit for bit like the original.
 
     Args:
         task: Name of a registered task, or a task.
@@ -125,10 +129,12 @@ class ScmWorldEnv(Looks, gymnasium.Env[Observation, NDArray[np.float32]]):
         conventions: str = "scm_world",
         render_mode: str | None = None,
     ) -> None:
+        made_with = {name: value for name, value in locals().items() if name not in _NOT_GIVEN}
+        Copied.__init__(self, **made_with)
         self._how = Observing(
             mode=observation_mode,
-            names=tuple(observe),
-            include=tuple(include),
+            names=_names("observe", observe),
+            include=_names("include", include),
             context=context,
             keypoints=keypoints,
             cameras=cameras,
@@ -254,7 +260,7 @@ class ScmWorldEnv(Looks, gymnasium.Env[Observation, NDArray[np.float32]]):
         structure = beginning_structure(self.world, {**self._start, **mine})
         goal: dict[str, Any] = {}
         if self._random_goal:
-            goal = structure.task.sample_goal(self._random_goal)  # type: ignore[arg-type]
+            goal = structure.task.sample_goal(self._random_goal)
         return merged(structure, goal, self._start, mine)
 
     def step(
@@ -277,7 +283,7 @@ class ScmWorldEnv(Looks, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Turn an action into what the world takes, shape (9,)."""
         given: Any = np.asarray(action)
         if given.dtype is not SINGLE:
-            given = np.asarray(given, dtype=np.float64)
+            given = _doubles(given)
         if given.shape != (9,):
             raise ActionError(f"an action has shape (9,), got {given.shape}", action)
         if self._delta is not None:
@@ -355,6 +361,19 @@ def _touches(backend: Backend) -> tuple[dict[str, Any], ...]:
         {name: np.copy(value) if isinstance(value, np.ndarray) else value for name, value in fields}
         for fields in (vars(touch).items() for touch in backend.contacts())
     )
+
+
+def _doubles(action: Any) -> Floats:
+    try:
+        return np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ActionError(f"an action is nine finite numbers, got {action!r}", action) from None
+
+
+def _names(option: str, given: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(given, str):
+        raise UnknownOption(option, given, (f"a list of names, such as [{given!r}]",))
+    return tuple(given)
 
 
 def _made(task: Task | str, options: Mapping[str, Any] | None) -> Task:

@@ -106,7 +106,7 @@ class GoalReward:
     """The part of the reward that goals alone decide.
 
     With ``weights="sparse"``, or where only ``fractional_success`` and ``success`` have weights,
-    it is the reward of the step.
+    it is the reward of the step. Else the first call warns: goals do not decide dense terms.
 
     Args:
         world: Whose task, weights and conventions hold.
@@ -114,6 +114,7 @@ class GoalReward:
 
     def __init__(self, world: World) -> None:
         self._world = world
+        self._warned = False
 
     def __call__(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.
@@ -132,9 +133,19 @@ class GoalReward:
         weights = zip((parent.name for parent in node.parents), node.mechanism.weights, strict=True)
         total = np.zeros(np.broadcast_shapes(have.shape[:-1], want.shape[:-1]))
         for name, weight in weights:
-            if name in TERMS:
+            if name not in TERMS:
+                self._warn(name)
+            else:
                 total = total + weight * TERMS[name](self._world.task, have, want)
         return reward_scale(self._world) * total
+
+    def _warn(self, term: str) -> None:
+        if not self._warned:
+            self._warned = True
+            gymnasium.logger.warn(
+                f"compute_reward leaves out {term!r} and every other dense term, which the rewards "
+                "of steps contain; make the environment with task_options={'weights': 'sparse'}"
+            )
 
 
 def reader(names: tuple[str, ...]) -> Callable[[Values], tuple[Any, ...]]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.env.observer import Observer
+from scm_world.errors import UnknownOption
 from scm_world.scene.camera import OVERVIEW, Camera
 from scm_world.world import World
 
@@ -41,15 +42,33 @@ class Looks:
         """Where each variable stands in the privileged context; empty without one."""
         return dict(self._observer.layouts.get("context", {}))
 
-    def depth(self, camera: Camera = OVERVIEW) -> NDArray[np.float32]:
-        """Measure how far away everything is, shape (h, w) [m]."""
+    def _camera(self, camera: Camera | str) -> Camera:
+        if isinstance(camera, Camera):
+            return camera
+        known = {one.name: one for one in (*self.world.cameras(), OVERVIEW)}
+        if camera not in known:
+            raise UnknownOption("camera", camera, known)
+        return known[camera]
+
+    def depth(self, camera: Camera | str = OVERVIEW) -> NDArray[np.float32]:
+        """Measure how far away everything is, shape (h, w) [m].
+
+        Args:
+            camera: Any, or the name of one: ``"60"``, ``"120"``, ``"300"``, ``"overview"``.
+        """
         from scm_world.backends.renderer import depth_and_segmentation
 
-        found: NDArray[np.float32] = depth_and_segmentation(self.world.scene(), (camera,))[0][0]
+        scene, cameras = self.world.scene(), (self._camera(camera),)
+        found: NDArray[np.float32] = depth_and_segmentation(scene, cameras)[0][0]
         return found
 
-    def segmentation(self, camera: Camera = OVERVIEW) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+    def segmentation(
+        self, camera: Camera | str = OVERVIEW
+    ) -> tuple[NDArray[np.int32], tuple[str, ...]]:
         """Tell which body every pixel shows.
+
+        Args:
+            camera: As in ``depth``.
 
         Returns:
             Shape (h, w): an index into the names of the bodies, -1 where there is nothing; and
@@ -57,5 +76,5 @@ class Looks:
         """
         from scm_world.backends.renderer import body_names, depth_and_segmentation
 
-        scene = self.world.scene()
-        return depth_and_segmentation(scene, (camera,))[1][0], body_names(scene.structure)
+        scene, cameras = self.world.scene(), (self._camera(camera),)
+        return depth_and_segmentation(scene, cameras)[1][0], body_names(scene.structure)

@@ -75,8 +75,10 @@ class Observing:
         appended = self.include or self.keypoints or self.context == "observation"
         if pictures and appended:
             raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
-        if not pictures and (self.cameras is not None or self.image_size is not None):
-            raise UnknownOption("camera", self.mode, ("any, with observation_mode='pixel'",))
+        for option, value in (("cameras", self.cameras), ("image_size", self.image_size)):
+            if value is not None and not pictures:
+                allowed = ("any with observation_mode='pixel'", "None in the other modes")
+                raise UnknownOption(option, value, allowed)
 
 
 @final

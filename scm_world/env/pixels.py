@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, final
 
@@ -36,18 +36,45 @@ def chosen(
     """
     own = ORIGINAL_CAMERAS if original else CAMERAS
     known = {camera.name: camera for camera in (*own, OVERVIEW)}
-    found = []
-    for camera in own if cameras is None else cameras:
-        if not isinstance(camera, Camera) and camera not in known:
-            raise UnknownOption("camera", camera, known)
-        found.append(camera if isinstance(camera, Camera) else known[camera])
+    if isinstance(cameras, str) or (cameras is not None and not len(cameras)):
+        raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
+    found = [_camera(camera, known) for camera in (own if cameras is None else cameras)]
     if size is not None:
-        height, width = size if isinstance(size, tuple | list) else (size, size)
-        found = [replace(camera, height=int(height), width=int(width)) for camera in found]
+        height, width = _height_and_width(size)
+        found = [replace(camera, height=height, width=width) for camera in found]
     sizes = {(camera.height, camera.width) for camera in found}
     if len(sizes) != 1 or min(min(sizes)) < 1:
-        raise UnknownOption("image_size", size, ("one positive size for one or more cameras",))
+        raise UnknownOption("image_size", size, ("one positive size for all cameras",))
     return tuple(found)
+
+
+def _camera(camera: Any, known: Mapping[str, Camera]) -> Camera:
+    """Look up a camera, or read one that was written down as a dictionary."""
+    if isinstance(camera, Camera):
+        return camera
+    if isinstance(camera, Mapping):
+        given: dict[str, Any] = {
+            field: tuple(value) if isinstance(value, list) else value
+            for field, value in camera.items()
+        }
+        try:
+            return Camera(**given)
+        except TypeError:
+            fields = Camera.__dataclass_fields__
+            raise UnknownOption(
+                "camera", camera, (f"a dictionary of {', '.join(fields)}",)
+            ) from None
+    if not isinstance(camera, str) or camera not in known:
+        raise UnknownOption("camera", camera, known)
+    return known[camera]
+
+
+def _height_and_width(size: Any) -> tuple[int, int]:
+    numbers = np.asarray(size)
+    if numbers.shape not in ((), (2,)) or not np.issubdtype(numbers.dtype, np.integer):
+        raise UnknownOption("image_size", size, ("a whole number", "(height, width)"))
+    height, width = np.broadcast_to(numbers, (2,)).tolist()
+    return height, width
 
 
 @final
@@ -57,7 +84,7 @@ class Pixels:
     Args:
         world: That is observed.
         cameras: With pictures of one size.
-        followed: Names of those that stand where their variables say.
+        followed: Of each, whether it stands where its variables say.
 
     Attributes:
         names: The variables that have to be computed: none.
@@ -68,7 +95,7 @@ class Pixels:
     names: tuple[str, ...] = ()
 
     def __init__(
-        self, world: World, cameras: tuple[Camera, ...], followed: frozenset[str] = frozenset()
+        self, world: World, cameras: tuple[Camera, ...], followed: tuple[bool, ...]
     ) -> None:
         self._world, self._cameras, self._followed = world, cameras, followed
         self.layouts: Layouts = {}
@@ -99,20 +126,19 @@ class Pixels:
         present = {camera.name: camera for camera in self._world.cameras()}
         return tuple(
             replace(present[camera.name], height=camera.height, width=camera.width)
-            if camera.name in self._followed
+            if follows
             else camera
-            for camera in self._cameras
+            for camera, follows in zip(self._cameras, self._followed, strict=True)
         )
 
 
-def followed(cameras: Sequence[str | Camera] | None, *, original: bool) -> frozenset[str]:
-    """Name the cameras that are asked for by name: they are nodes of the graph.
+def followed(cameras: Sequence[str | Camera] | None, *, original: bool) -> tuple[bool, ...]:
+    """Tell which cameras are those of the robot, asked for by name: they are nodes of the graph.
 
     Args:
         cameras: As in ``chosen``.
         original: Whether they are as the predecessor realises them, and fixed.
     """
-    if original:
-        return frozenset()
-    own = frozenset(camera.name for camera in CAMERAS)
-    return own if cameras is None else own.intersection(c for c in cameras if isinstance(c, str))
+    own = [camera.name for camera in CAMERAS]
+    asked = own if cameras is None else cameras
+    return tuple(not original and isinstance(c, str) and c in own for c in asked)

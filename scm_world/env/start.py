@@ -8,10 +8,9 @@ from typing import Any
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.graph import flatten
 from scm_world.variables import Draw
+from scm_world.variables.kinds import SPACES
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
-
-SPACES = ("A", "B", "A|B")
 
 
 def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:

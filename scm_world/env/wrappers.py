@@ -18,6 +18,7 @@ from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.scene.trifinger import RAISED
 from scm_world.variables import Shift
+from scm_world.world.start import whole_number
 
 Actions = NDArray[Any]
 
@@ -81,12 +82,11 @@ class MovingAverageAction(gymnasium.ActionWrapper[Any, Actions, Actions], Record
         window: How many actions count.
 
     Raises:
-        UnknownOption: ``window`` is not positive.
+        UnknownOption: ``window`` is no positive whole number.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], window: int = 8) -> None:
-        if window < 1:
-            raise UnknownOption("window", window, ("any whole number from 1 on",))
+        window = whole_number("window", window, least=1)
         RecordConstructorArgs.__init__(self, window=window)
         super().__init__(env)
         self._last: deque[Actions] = deque(maxlen=window)
@@ -102,7 +102,8 @@ class MovingAverageAction(gymnasium.ActionWrapper[Any, Actions, Actions], Record
         """Give the mean of the last actions."""
         self._last.append(np.array(action))
         mean: Any = np.mean(self._last, axis=0, dtype=np.float64)
-        averaged: Actions = mean.astype(self._last[-1].dtype)
+        kind = self._last[-1].dtype
+        averaged: Actions = mean.astype(kind) if np.issubdtype(kind, np.floating) else mean
         return averaged
 
 
@@ -133,9 +134,11 @@ class ObjectSelector(
         self._inner = inner = _unwrapped(env, "ObjectSelector")
         if inner.action_mode != "joint_positions":
             raise UnknownOption("action_mode", inner.action_mode, ("joint_positions",))
-        vector = isinstance(inner.observation_space, gymnasium.spaces.Box)
-        if inner.observation_mode not in _MODES or not vector:
+        if inner.observation_mode not in _MODES:
             raise UnknownOption("observation_mode", inner.observation_mode, _MODES)
+        if not isinstance(inner.observation_space, gymnasium.spaces.Box):
+            allowed = ("a vector: without goal_env and context='privileged'",)
+            raise UnknownOption("observation for ObjectSelector", "a dictionary", allowed)
         self._held: Any = inner.as_action(np.array(RAISED))
         self._first = inner.layout[TIPS].stop
         self._spaces: dict[int, gymnasium.spaces.MultiDiscrete] = {}
@@ -189,14 +192,14 @@ class ObjectSelector(
         if not (move or turn):
             return ""
         name = self._blocks()[block]
-        request: dict[str, Any] = {
-            f"{name}.linear_velocity": (0.0, 0.0, 0.0),
-            f"{name}.angular_velocity": (0.0, 0.0, 0.0),
-        }
+        request: dict[str, Any] = {}
         if move:
             request[f"{name}.cartesian_position"] = Shift(_along(move, _AXES, MOVE))
         if turn:
             request[f"{name}.euler_orientation"] = Shift(_along(turn, _TURNS, TURN))
+        request |= dict.fromkeys(
+            (f"{name}.linear_velocity", f"{name}.angular_velocity"), (0.0, 0.0, 0.0)
+        )
         try:
             self._inner.do(request)
         except InterventionError as error:

@@ -13,6 +13,7 @@ from scm_world.errors import (
     InterventionError,
     ModelError,
     NotIntervenable,
+    UnknownOption,
     UnknownVariable,
     raise_all,
 )
@@ -39,11 +40,14 @@ def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises:
         ConflictingTargets: A name is given twice, nested and dotted.
+        UnknownOption: It is no mapping.
 
     Example:
         >>> flatten({"tool_block": {"mass": 0.05}, "floor_friction": 0.4})
         {'tool_block.mass': 0.05, 'floor_friction': 0.4}
     """
+    if not isinstance(request, Mapping):
+        raise UnknownOption("request", request, ("a dictionary of variables and values",))
     flat: dict[str, Any] = {}
     for name, value in request.items():
         if isinstance(value, Mapping):

@@ -18,6 +18,9 @@ from scm_world.scene import trifinger
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
 from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS, Scene
 
+TOLERANCE = 1e-3
+"""How deep two bodies may lie in one another after an intervention [m]."""
+
 _LINK = {"upper": 1, "middle": 2, "lower": 3, "tip": 3}
 """The link that a collision shape belongs to: the tip is a part of the lower link."""
 

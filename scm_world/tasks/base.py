@@ -13,6 +13,7 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.entities import Entity
 from scm_world.errors import UnknownOption
 from scm_world.scene import trifinger
+from scm_world.tasks.arguments import numbers_of
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import Common, resolve
@@ -57,10 +58,10 @@ class Task(ABC):
         self.weights = resolve(self.default_weights, self.paper_weights, common)
         self.terms = tuple(common.get("terms", ()))
         given = common.get("joint_positions")
-        joints = self.rest if given is None else tuple(float(x) for x in given)
-        if len(joints) != trifinger.N_JOINTS or not np.isfinite(joints).all():
+        joints = numbers_of(self.rest if given is None else given)
+        if joints is None or joints.shape != (trifinger.N_JOINTS,):
             raise UnknownOption("joint_positions", given, ("nine angles [rad]",))
-        self.start = joints
+        self.start = tuple(joints.tolist())
 
     @property
     @abstractmethod

@@ -13,8 +13,9 @@ from scm_world.entities import Entity
 from scm_world.entities.base import lowest_point
 from scm_world.scene import trifinger
 from scm_world.tasks import piles
+from scm_world.tasks.arguments import checked
 from scm_world.tasks.building import Building
-from scm_world.tasks.generated import MASS, blocks_mass, checked, part_goal, part_tool
+from scm_world.tasks.generated import MASS, blocks_mass, part_goal, part_tool
 from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.variables import Box, Derived, Exogenous, Function, Variable
 from scm_world.variables import catalogue as numbers
@@ -128,7 +129,7 @@ class General(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._mass = tool_block_mass
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
         self._size = checked(SIZE, tool_block_size, numbers.DROPPED_SIZE_BOUNDS)
         self._number = checked(COUNT, nums_objects, numbers.NUMS_OBJECTS_BOUNDS)
 

@@ -2,40 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-
 from scm_world.entities import GoalBlock, ToolBlock, block_mass, goal_orientation, goal_position
-from scm_world.errors import UnknownOption
 from scm_world.tasks.shapes import block_spaces
-from scm_world.variables import Box, Derived, Exogenous, Function, Integers
+from scm_world.variables import Derived, Exogenous, Function
 from scm_world.variables import catalogue as numbers
 
 MASS = "blocks_mass"
 
 Mechanism = tuple[tuple[str, ...], Function]
 """Parents, and the function of them."""
-
-
-def checked(option: str, value: Any, allowed: Box | Integers) -> Any:
-    """Check an argument of a task against the bounds of the variable that it is the default of.
-
-    Args:
-        option: Its name.
-        value: What was given.
-        allowed: The bounds.
-
-    Returns:
-        What was given.
-
-    Raises:
-        UnknownOption: It is no number, or out of bounds.
-    """
-    number = np.asarray(value)
-    if not np.issubdtype(number.dtype, np.number) or not allowed.contains(number):
-        raise UnknownOption(option, value, (allowed.describe(number.shape, {}),))
-    return value
 
 
 def blocks_mass(default: float) -> Exogenous:

@@ -12,7 +12,7 @@ from scm_world._types import Floats, Value
 from scm_world.entities import Entity
 from scm_world.entities.goals import goal_position
 from scm_world.tasks import kernels
-from scm_world.tasks.generated import checked
+from scm_world.tasks.arguments import checked
 from scm_world.tasks.rewards import FRACTION, term
 from scm_world.tasks.shapes import Place
 from scm_world.tasks.single import GOAL, TOOL, Alike, OneBlock, smoothness, tips_to_block

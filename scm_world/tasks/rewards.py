@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypedDict
 
+import numpy as np
+
 from scm_world.errors import UnknownOption
+from scm_world.tasks.arguments import checked_weight
 from scm_world.variables import Box, Function, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"
@@ -22,7 +25,8 @@ class Common(TypedDict, total=False):
 
     Attributes:
         weights: ``"default"``, ``"paper"``, ``"sparse"`` (1 for success), ``"none"``
-            (reward-free), or weights of reward terms that differ from the default ones.
+            (reward-free), or a dictionary: the terms in it get these weights, the others keep
+            the default ones.
         fractional_reward_weight: Weight of the fractional success.
         dense_reward_weights: Weights of the dense terms, in their order.
         activate_sparse_reward: The same as ``weights="sparse"``.
@@ -50,7 +54,8 @@ def resolve(
         options: What the user asked for.
 
     Raises:
-        UnknownOption: A preset or a term that does not exist, or a wrong number of weights.
+        UnknownOption: A preset or a term that does not exist, a wrong number of weights, or one
+            that is no finite number.
     """
     asked = options.get("weights", "default")
     own = {term.name: 0.0 for term in options.get("terms", ())}
@@ -59,17 +64,19 @@ def resolve(
         if asked not in PRESETS:
             raise UnknownOption("weights", asked, PRESETS)
         weights.update(paper if asked == "paper" else {})
-    else:
+    elif isinstance(asked, Mapping):
         unknown = set(asked) - {*weights, SUCCESS}
         if unknown:
             raise UnknownOption("reward term", min(unknown), (*weights, SUCCESS))
-        weights.update({name: float(weight) for name, weight in asked.items()})
+        weights.update({name: checked_weight(name, weight) for name, weight in asked.items()})
+    else:
+        raise UnknownOption("weights", asked, (*PRESETS, "a dictionary of terms and numbers"))
     sparse = asked == "sparse" or options.get("activate_sparse_reward", False)
     if sparse or asked == "none":
         weights = dict.fromkeys(weights, 0.0)
     own_weights = _in_order([n for n in default if n != FRACTION], options)
     if (fraction := options.get("fractional_reward_weight")) is not None:
-        own_weights[FRACTION] = float(fraction)
+        own_weights[FRACTION] = checked_weight("fractional_reward_weight", fraction)
     if sparse and any(own_weights.values()):
         named = {name: weight for name, weight in own_weights.items() if weight}
         raise UnknownOption("weights of a sparse reward", named, ("none: it is 1 for success",))
@@ -81,9 +88,9 @@ def _in_order(dense: Sequence[str], options: Common) -> dict[str, float]:
     given = options.get("dense_reward_weights")
     if given is None:
         return {}
-    if len(given) != len(dense):
-        raise UnknownOption("dense_reward_weights", list(given), (f"{len(dense)} numbers", *dense))
-    return {name: float(weight) for name, weight in zip(dense, given, strict=True)}
+    if np.shape(given) != (len(dense),):
+        raise UnknownOption("dense_reward_weights", given, (f"{len(dense)} numbers", *dense))
+    return {name: checked_weight(name, weight) for name, weight in zip(dense, given, strict=True)}
 
 
 def term(

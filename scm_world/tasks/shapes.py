@@ -23,6 +23,7 @@ from scm_world.geometry import (
 )
 from scm_world.geometry.hulls import Hull, hull_of, hull_overlap
 from scm_world.scene import ParameterKey
+from scm_world.tasks.arguments import numbers_of
 from scm_world.variables import Box, Exogenous, Fixed, Function, Variable
 from scm_world.variables import catalogue as numbers
 from scm_world.variables.spaces import Bound
@@ -257,18 +258,18 @@ def unit_quaternion(option: str, orientation: Quaternion) -> Quaternion:
     Raises:
         UnknownOption: These are not four numbers, or they are all zero.
     """
-    given = np.asarray(orientation, dtype=np.float64)
-    if given.shape != (4,) or not np.isfinite(given).all() or not given.any():
+    given = numbers_of(orientation)
+    if given is None or given.shape != (4,) or not given.any():
         raise UnknownOption(option, orientation, ("a quaternion x, y, z, w",))
     x, y, z, w = canonical(given).tolist()
     return x, y, z, w
 
 
 def _checked(option: str, place: Place) -> tuple[float, ...]:
-    point = tuple(float(x) for x in place)
-    if len(point) not in (2, 3) or not np.isfinite(point).all():
+    point = numbers_of(place)
+    if point is None or point.shape not in ((2,), (3,)):
         raise UnknownOption(option, place, ("x, y", "x, y, z [m]"))
-    return point
+    return tuple(point.tolist())
 
 
 @final

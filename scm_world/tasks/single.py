@@ -14,8 +14,8 @@ from scm_world.entities.blocks import hull_size
 from scm_world.entities.goals import goal_orientation
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks import kernels, shapes
+from scm_world.tasks.arguments import checked
 from scm_world.tasks.building import Building
-from scm_world.tasks.generated import checked
 from scm_world.tasks.reaching import minus_change
 from scm_world.tasks.rewards import FRACTION, UNIT, Common, term
 from scm_world.tasks.shapes import Place, Quaternion

@@ -14,8 +14,8 @@ from scm_world.entities.base import lowest_point
 from scm_world.entities.blocks import coordinates
 from scm_world.entities.goals import goal_orientation, goal_position, on_the_floor, polar
 from scm_world.tasks import kernels, shapes
+from scm_world.tasks.arguments import checked
 from scm_world.tasks.building import Building
-from scm_world.tasks.generated import checked
 from scm_world.tasks.rewards import FRACTION, Common, term
 from scm_world.tasks.shapes import Place, Quaternion
 from scm_world.tasks.single import SIZE, smoothness

@@ -12,8 +12,9 @@ from scm_world._types import Floats, Value, Values
 from scm_world.entities import Entity
 from scm_world.entities.base import lowest_point
 from scm_world.scene import trifinger
+from scm_world.tasks.arguments import checked
 from scm_world.tasks.building import Building
-from scm_world.tasks.generated import MASS, blocks_mass, checked, part_goal, part_tool
+from scm_world.tasks.generated import MASS, blocks_mass, part_goal, part_tool
 from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.variables import Exogenous, Function, Variable
 from scm_world.variables import catalogue as numbers
@@ -132,11 +133,11 @@ class Towers(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._mass = tool_block_mass
         bounds = numbers.TOWER_COUNT_BOUNDS
-        self._number = checked(NUMBER, number_of_blocks_in_tower, bounds)
-        self._dims = checked(DIMS, tower_dims, numbers.TOWER_DIMS_BOUNDS)
-        self._center = checked(CENTER, tower_center, numbers.TOWER_CENTER_BOUNDS)
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
+        self._number = checked(NUMBER, number_of_blocks_in_tower, bounds, shape=(3,))
+        self._dims = checked(DIMS, tower_dims, numbers.TOWER_DIMS_BOUNDS, shape=(3,))
+        self._center = checked(CENTER, tower_center, numbers.TOWER_CENTER_BOUNDS, shape=(2,))
 
     def arrange(self, values: Values) -> Counts:
         """Count the blocks along each axis."""

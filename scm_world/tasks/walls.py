@@ -11,8 +11,9 @@ from scm_world._types import Value, Values
 from scm_world.entities import Entity
 from scm_world.scene import trifinger
 from scm_world.tasks import layouts
+from scm_world.tasks.arguments import checked
 from scm_world.tasks.building import Building
-from scm_world.tasks.generated import MASS, blocks_mass, checked, part_goal, part_tool
+from scm_world.tasks.generated import MASS, blocks_mass, part_goal, part_tool
 from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.variables import Box, Categories, Derived, Exogenous, Function, Integers, Variable
 from scm_world.variables import catalogue as numbers
@@ -69,7 +70,7 @@ class Walls(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._mass = tool_block_mass
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
         self._size = checked(SIZE, blocks_min_size, numbers.MIN_SIZE_BOUNDS)
         self._levels = checked("num_of_levels", num_of_levels, numbers.STACK_LEVELS_BOUNDS)
         self._width = checked(WIDTH, max_level_width, numbers.LEVEL_WIDTH_BOUNDS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, Literal, final, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -24,6 +24,7 @@ from scm_world.variables.spaces import (
 Number = float | tuple[float, ...]
 Role = Literal["parameter", "state", "readout", "action"]
 SpaceName = Literal["A", "B", "A|B"]
+SPACES: tuple[SpaceName, ...] = get_args(SpaceName)
 
 
 def _as_number(value: Any) -> Any:

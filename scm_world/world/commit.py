@@ -13,7 +13,7 @@ from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, Infeasible, InterventionError
 from scm_world.graph import flatten
 from scm_world.scene import Difference, PhysicalState, Structure
-from scm_world.scene.feasibility import Overlap, overlaps
+from scm_world.scene.feasibility import TOLERANCE, Overlap, overlaps
 from scm_world.variables import Hard
 from scm_world.variables.checks import coerce
 from scm_world.world.audit import Applied, Audit
@@ -24,10 +24,11 @@ from scm_world.world.proposal import Instant, Proposal, propose
 if TYPE_CHECKING:
     from scm_world.world.world import World
 
-TOLERANCE = 1e-3  # [m] how deep two bodies may lie in one another after an intervention
 READ_BACK = 1e-6  # how far an engine may report a number from what it was given
 _MOVES = ("size", "height", "position", "orientation")
 """Parameters that change where the surfaces of bodies are."""
+_PLACES = ("m", "rad", "1")
+"""Units of states that do so: positions, angles and quaternions, not velocities."""
 
 
 def difference(world: World, proposal: Proposal) -> Difference:
@@ -101,7 +102,7 @@ def refuse_overlaps(
 
 def _culprit(world: Declaration, names: Iterable[str], bodies: Iterable[str]) -> str:
     """Name the target that is most likely to have moved one of the bodies."""
-    surfaces = {*world.slices}
+    surfaces = {name for name in world.slices if world.model.declared(name).unit in _PLACES}
     surfaces |= {name for name, key in world.parameter_keys.items() if key[1] in _MOVES}
 
     def blame(name: str) -> tuple[bool, bool]:

@@ -7,11 +7,19 @@ from typing import Any
 
 from scm_world._types import Floats, Value, Values
 from scm_world.entities import Composition
+from scm_world.errors import NotReset
 from scm_world.graph import SCM
 from scm_world.scene import ParameterKey, PhysicalState, Scene
 from scm_world.tasks import Conventions, Task
 from scm_world.world.declaration import Declaration, Options
 from scm_world.world.family import Family
+
+
+def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:
+    world = kind(task, **options)
+    if snapshot is not None:
+        world.restore(snapshot)
+    return world
 
 
 class Declared:
@@ -26,6 +34,24 @@ class Declared:
     options: Options
     family: Family
     declaration: Declaration
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle through a snapshot: another engine, the same future bit for bit."""
+        world: Any = self
+        try:
+            snapshot = world.snapshot()
+        except NotReset:
+            snapshot = None
+        options = {
+            "backend": world.backend.name,
+            "preset": self.options.preset,
+            "action_mode": self.action_mode,
+            "frame_skip": self.frame_skip,
+            "max_episode_length": self.given_length,
+            "conventions": self.conventions.name,
+            "variables_space": world.variables_space,
+        }
+        return _copied, (type(self), self.family.task, options, snapshot)
 
     @property
     def task(self) -> Task:

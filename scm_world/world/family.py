@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, final
 
 import numpy as np
+from pydantic import ValidationError
 
 from scm_world._types import Values
 from scm_world.errors import ModelError
@@ -15,6 +17,7 @@ from scm_world.graph import SCM, Moment
 from scm_world.tasks import Task
 from scm_world.variables import Intervention, Variable
 from scm_world.world.declaration import Declaration, Options
+from scm_world.world.start import refuse_impossible
 
 KEPT = 4  # declarations that are kept for structures that come again
 
@@ -28,30 +31,34 @@ class Family:
         options: Of the world.
 
     Attributes:
+        task: Without a plan.
         head: The model of what decides which entities there are, on its own.
         steps: Length of an episode in control steps, by the structure without interventions.
     """
 
     def __init__(self, task: Task, options: Options) -> None:
         self.options = options
-        self._task = task.at(None, options.conventions)
-        self.head = _head(self._task)
+        self.task = task.at(None, options.conventions)
+        with _refused(self.task):
+            self.head = _head(self.task)
         self._declarations: OrderedDict[Hashable, Declaration] = OrderedDict()
-        first = self._task.at(self.plan(self.head.solve()), options.conventions)
+        first = self.task.at(self.plan(self.head.solve()), options.conventions)
         seconds = first.seconds
         whole = math.floor(seconds / options.control_period + 1e-9)
         self.steps = options.given_length or max(whole, 1)
+        refuse_impossible(self.natural(None))
 
     def plan(self, values: Values) -> Hashable:
         """Say what stands in the world, given the values of the head."""
-        return self._task.arrange(values) if len(self.head) else None
+        return self.task.arrange(values) if len(self.head) else None
 
     def declaration(self, plan: Hashable) -> Declaration:
         """Give the declaration of a structure."""
         found = self._declarations.get(plan)
         if found is None:
-            task = self._task.at(plan, self.options.conventions)
-            found = self._declarations[plan] = Declaration(task, self.options, self.steps)
+            task = self.task.at(plan, self.options.conventions)
+            with _refused(task):
+                found = self._declarations[plan] = Declaration(task, self.options, self.steps)
             while len(self._declarations) > KEPT:
                 self._declarations.popitem(last=False)
         self._declarations.move_to_end(plan)
@@ -87,6 +94,17 @@ class Family:
         if not all(_possible(variable, values) for variable in self.head.variables):
             return None  # the intervention will be refused, with the reason
         return self.declaration(self.plan(values))
+
+
+@contextmanager
+def _refused(task: Task) -> Iterator[None]:
+    """Say of which task a variable cannot be declared."""
+    try:
+        yield
+    except ValidationError as error:
+        problems = [problem["msg"].removeprefix("Value error, ") for problem in error.errors()]
+        named = [f"a variable of the task {task.name!r}: {problem}" for problem in problems]
+        raise ModelError(named) from error
 
 
 def _possible(variable: Variable, values: Values) -> bool:

@@ -10,12 +10,18 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.entities import CONTROL_INDEX
-from scm_world.errors import ConflictingTargets, InterventionError, OutOfBounds, raise_all
+from scm_world.errors import (
+    ConflictingTargets,
+    InterventionError,
+    OutOfBounds,
+    UnknownOption,
+    raise_all,
+)
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.scene import PhysicalState
 from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Rotations, Shift
 from scm_world.variables.checks import check_bounds, check_space
-from scm_world.variables.kinds import SpaceName
+from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world.compare import same
 from scm_world.world.restructure import restructured
 
@@ -109,7 +115,10 @@ def propose(
 
     Raises:
         InterventionError: With every problem of the request.
+        UnknownOption: There is no such space.
     """
+    if space not in (None, *SPACES):
+        raise UnknownOption("space", space, SPACES)
     moment = world.moment(instant.index)
     instant = restructured(world.family, instant, request, moment)
     accepted, problems = accept(instant, request)

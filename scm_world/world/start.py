@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import UnknownOption
+from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.scene import PhysicalState
+from scm_world.scene.feasibility import TOLERANCE, overlaps
 from scm_world.variables import Measured
+from scm_world.variables.checks import check_bounds
 
 if TYPE_CHECKING:
     from scm_world.world.declaration import Declaration
@@ -47,6 +49,28 @@ def _first(declaration: Declaration, variable: Measured, static: Values) -> Valu
             known[name] = parent.array(parent.default)
     parents = [known[name] for name in variable.set_parents()]
     return np.asarray(variable.start.bind()(*parents))
+
+
+def refuse_impossible(declaration: Declaration) -> None:
+    """Refuse a world that cannot begin.
+
+    Raises:
+        ModelError: A default is out of bounds, or two bodies are in one place.
+    """
+    static, state = beginning(declaration, None)
+    values = {**static, **declaration.states(state)}
+    problems = []
+    for variable in declaration.model.variables:
+        if variable.name in values:
+            try:
+                check_bounds(variable, values[variable.name], values)
+            except InterventionError as problem:
+                problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
+    found = overlaps(declaration.describe(static, state), tolerance=TOLERANCE)
+    problems += map(str, found)
+    if problems:
+        advice = f"choose other arguments of the task {declaration.task.name!r}"
+        raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
 
 
 def whole_number(option: str, value: Any, *, least: int) -> int:

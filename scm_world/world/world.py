@@ -20,7 +20,7 @@ from scm_world.scene.kinematics import inverse_kernel
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Noise
 from scm_world.variables.catalogue import PRESET
-from scm_world.variables.kinds import SpaceName
+from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world.audit import Audit
 from scm_world.world.commands import clipped, disturbed
 from scm_world.world.commit import commit, difference, refuse_overlaps
@@ -75,8 +75,8 @@ class World(Declared):
         conventions: str = "scm_world",
         variables_space: SpaceName | None = None,
     ) -> None:
-        if variables_space not in (None, "A", "B", "A|B"):
-            raise UnknownOption("variables_space", variables_space, ("A", "B", "A|B"))
+        if variables_space not in (None, *SPACES):
+            raise UnknownOption("variables_space", variables_space, SPACES)
         self.variables_space = variables_space
         self.options = Options.checked(
             preset_name=preset,
@@ -142,7 +142,11 @@ class World(Declared):
         """Compute some variables and give all present values without copying them.
 
         For loops that cannot wait; the values change with the next step.
+
+        Raises:
+            NotReset: There is no episode yet.
         """
+        self._require_episode()
         self._readouts.evaluate(names)
         return self._now
 
@@ -231,8 +235,6 @@ class World(Declared):
             NotReset: There is no episode yet.
             EngineFailure: The engine lost the state.
         """
-        if self._instant is None and not self._started:
-            raise NotReset
         self.advance(clipped(action, *self.declaration.action_bounds, self._action_unit))
 
     def advance(self, command: Floats) -> None:
@@ -240,8 +242,11 @@ class World(Declared):
 
         For loops that cannot wait; ``step`` checks and clips.
         """
+        self._require_episode()
         if self._action_is_held:
-            command = self._held_action(command)
+            known, where = {**self._now, "action": command}, self.moment(self._index)
+            command = self._held.solve(known, moment=where, only=("action",))["action"]
+            command = clipped(command, *self.declaration.action_bounds, self._action_unit)
         self._readouts.remember()
         self._now["action"] = command
         if self._noisy:
@@ -259,12 +264,6 @@ class World(Declared):
         self._clock[...] = self._index
         self._readouts.stale()
         self._instant = None
-
-    def _held_action(self, command: Floats) -> Floats:
-        known = {**self._now, "action": command}
-        moment = self.moment(self._index)
-        held = self._held.solve(known, moment=moment, only=("action",))["action"]
-        return clipped(np.array(held), *self.declaration.action_bounds, self._action_unit)
 
     def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.
@@ -286,7 +285,8 @@ class World(Declared):
         """
         self._require_episode()
         instant = self._instant or self._present()
-        proposal = propose(self, instant, request, space or self.variables_space)
+        space = self.variables_space if space is None else space
+        proposal = propose(self, instant, request, space)
         change = difference(self, proposal)
         refuse_overlaps(self, instant, proposal, change, request)
         audit, self._instant = commit(self, instant, proposal, change, request)
@@ -392,7 +392,8 @@ class World(Declared):
         self._instant = None if saved is None else saved.instant(self.family)
 
     def close(self) -> None:
-        """Free the engine."""
+        """Free the engine. There is no episode any more."""
+        self._started = False
         self.backend.close()
 
     def _require_episode(self) -> None:

@@ -1,0 +1,40 @@
+"""Environments that can be copied and pickled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gymnasium.utils import EzPickle
+
+from scm_world.errors import NotReset
+from scm_world.world import World
+
+
+class Copied(EzPickle):
+    """Makes an environment anew from its arguments, and puts its world where the other one is.
+
+    Attributes:
+        world: That is simulated.
+    """
+
+    world: World
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Give the arguments, a snapshot of the world, and Gymnasium's generator."""
+        try:
+            snapshot = self.world.snapshot()
+        except NotReset:
+            snapshot = None
+        generator = {name: self.__dict__[name] for name in _GENERATOR if name in self.__dict__}
+        return {**super().__getstate__(), "snapshot": snapshot, "generator": generator}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin where the other environment is; a closed one, or one without episode, is new."""
+        super().__setstate__(state)
+        self.__dict__.update(state["generator"])
+        if state["snapshot"] is not None:
+            self.world.restore(state["snapshot"])
+
+
+_GENERATOR = ("_np_random", "_np_random_seed", "spec")
+"""What Gymnasium keeps in an environment."""
