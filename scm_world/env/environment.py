@@ -281,9 +281,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
     def _command(self, action: NDArray[np.float32]) -> Floats:
         """Turn an action into what the world takes, shape (9,)."""
-        given: Any = np.asarray(action)
-        if given.dtype is not SINGLE:
-            given = _doubles(given)
+        given: Any = action
+        if getattr(action, "dtype", None) is not SINGLE:
+            given = _doubles(action)
         if given.shape != (9,):
             raise ActionError(f"an action has shape (9,), got {given.shape}", action)
         if self._delta is not None:

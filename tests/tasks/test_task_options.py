@@ -31,3 +31,38 @@ def test_a_sparse_reward_has_no_other_terms(name: str) -> None:
         assert {n: w for n, w in task.weights.items() if w} == {"success": 1.0}
         with pytest.raises(UnknownOption, match="sparse"):
             TASKS[name](**options, fractional_reward_weight=1.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("weight", [float("nan"), float("inf"), "much", None, [1.0]])
+def test_a_weight_is_a_finite_number(weight: object) -> None:
+    """Else every reward would be NaN."""
+    for options in ({"weights": {"fractional_success": weight}}, {"weights": {"success": weight}}):
+        with pytest.raises(UnknownOption, match="finite number"):
+            TASKS["pushing"](**options)  # type: ignore[arg-type] # that is the point
+    with pytest.raises(UnknownOption, match="weights cannot be 5"):
+        TASKS["pushing"](weights=5)  # type: ignore[arg-type] # that is the point
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value"),
+    [
+        ("pushing", "tool_block_position", None),
+        ("pushing", "tool_block_position", "abc"),
+        ("pushing", "tool_block_position", 5),
+        ("pushing", "tool_block_mass", (0.1, 0.2)),
+        ("pushing", "goal_block_orientation", "up"),
+        ("pushing", "joint_positions", 1.0),
+        ("pushing", "joint_positions", [[0.0], [0.0, 1.0]]),
+        ("picking", "goal_height", (0.1, 0.2)),
+        ("towers", "tower_dims", 0.1),
+        ("towers", "tower_center", 0.01),
+        ("towers", "tool_block_mass", (1.0, 2.0)),
+        ("towers", "number_of_blocks_in_tower", 3),
+        ("general", "nums_objects", (2, 3)),
+        ("stacked_blocks", "tool_block_mass", 100.0),
+    ],
+)
+def test_an_argument_of_another_shape_is_refused(name: str, option: str, value: object) -> None:
+    """With its name, when the task is made."""
+    with pytest.raises(UnknownOption, match=option):
+        TASKS[name](**{option: value})  # type: ignore[arg-type] # that is the point

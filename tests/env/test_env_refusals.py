@@ -1,0 +1,156 @@
+"""Facts about options and calls that make no sense: typed errors that say what does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from envs import BACKENDS, make
+from gymnasium.envs.registration import EnvSpec
+
+import scm_world as sw
+from scm_world.errors import (
+    ActionError,
+    Infeasible,
+    ModelError,
+    NotReset,
+    UnknownOption,
+    UnknownVariable,
+)
+from scm_world.scene.camera import OVERVIEW, Camera
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"observation_mode": "custom", "observe": "joint_positions"}, "a list of names"),
+        ({"include": "gravity"}, "a list of names"),
+        ({"image_size": 64}, "image_size cannot be 64"),
+        ({"cameras": ["60"]}, "cameras cannot be"),
+        ({"observation_mode": "pixel", "cameras": []}, "one or more"),
+        ({"observation_mode": "pixel", "cameras": "60"}, "one or more"),
+        ({"observation_mode": "pixel", "cameras": [{"eye": 1}]}, "field_of_view"),
+        ({"observation_mode": "pixel", "image_size": (10.5, 4)}, "height, width"),
+        ({"observation_mode": "pixel", "image_size": (10, 4, 3)}, "height, width"),
+        ({"observation_mode": "pixel", "image_size": 0}, "positive"),
+        ({"start": [("tool_block.mass", 0.1)]}, "dictionary"),
+    ],
+)
+def test_options_that_do_not_go_together(options: dict[str, Any], words: str) -> None:
+    """The error names the option, and what it can be."""
+    with pytest.raises(UnknownOption, match=words):
+        make(**options)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda env: env.reset(options={"do": 5}), UnknownOption, "dictionary"),
+        (lambda env: env.do([1]), UnknownOption, "dictionary"),
+        (lambda env: env.step("abc"), ActionError, "nine finite numbers"),
+        (lambda env: env.step([[1], [2, 3]]), ActionError, "nine finite numbers"),
+        (lambda env: env.do({"gravity": [0, 0, -9]}, space="a"), UnknownOption, "A, B, A"),
+        (lambda env: env.do({"gravity": [0, 0, -9]}, space=""), UnknownOption, "A, B, A"),
+        (lambda env: env.depth("6"), UnknownOption, "did you mean '60'"),
+        (lambda env: env.do({"gravty": 1}), UnknownVariable, "gravity"),
+        (lambda env: sw.MovingAverageAction(env, window=2.5), UnknownOption, "whole number"),
+    ],
+)
+def test_calls_that_make_no_sense(
+    call: Callable[[Any], Any], error: type[Exception], words: str
+) -> None:
+    """Nothing happens but the error."""
+    env = make().unwrapped
+    before = env.reset(seed=0)[0]
+    with pytest.raises(error, match=words):
+        call(env)
+    np.testing.assert_array_equal(env.observe(), before)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_there_is_nothing_before_the_first_episode_and_after_the_end(backend: str) -> None:
+    """Steps and observations need an episode; a closed environment has none."""
+    env = make(backend=backend).unwrapped
+    for _ in range(2):
+        for call in (lambda: env.step(np.zeros(9)), env.observe, env.world.values):
+            with pytest.raises(NotReset):
+                call()
+        env.reset(seed=0)
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("id_", "options", "words"),
+    [
+        ("Pushing", {"tool_block_position": [5, 0.1]}, "tool_block.cartesian_position"),
+        ("Pushing", {"tool_block_position": [0.1, 0.1, 9]}, "0.5"),
+        ("Pushing", {"joint_positions": [9] * 9}, "joint_positions"),
+        ("Pushing", {"tool_block_position": [0.24, 0.24, 0.0325]}, "deep in 'stage'"),
+        ("Reaching", {"default_goal_60": [9, 9, 9]}, "goal_60"),
+        ("Reaching", {"default_goal_60": [9, 9]}, "shape"),
+        ("Stacking2", {"tool_block_2_position": [0, 0]}, "deep in 'tool_block_2'"),
+    ],
+)
+def test_a_world_that_cannot_begin_is_refused(id_: str, options: Any, words: str) -> None:
+    """When it is made, not after the blocks have flown apart."""
+    with pytest.raises(ModelError, match=words):
+        make(f"scm_world/{id_}-v0", task_options=options)
+
+
+def test_an_overlap_is_the_fault_of_a_place_not_of_a_velocity() -> None:
+    """Whatever is named first."""
+    env = make().unwrapped
+    env.reset(seed=0)
+    place = "tool_block.cartesian_position"
+    with pytest.raises(Infeasible) as refused:
+        env.do({"tool_block.linear_velocity": [0, 0, 0], place: [0, 0, 0.01]})
+    assert refused.value.variable == place
+    env.do({place: refused.value.nearest})
+
+
+def test_a_camera_survives_being_written_down() -> None:
+    """``EnvSpec`` makes a dictionary of it."""
+    made = make(observation_mode="pixel", cameras=[OVERVIEW, "60"], image_size=16)
+    again: Any = gymnasium.make(EnvSpec.from_json(made.spec.to_json()))
+    np.testing.assert_array_equal(made.reset(seed=0)[0], again.reset(seed=0)[0])
+
+
+def test_ones_own_camera_may_have_the_name_of_another() -> None:
+    """What is asked for by name follows its variables; what is given stays."""
+    mine = Camera("60", eye=(0.0, 0.0, 2.0), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+    env = make(observation_mode="pixel", cameras=["60", mine], image_size=16)
+    first, second = env.reset(seed=0)[0][:2]
+    assert not np.array_equal(first, second)
+
+
+def test_cameras_measure_by_name() -> None:
+    """The robot's cameras where they are now, and the one that overlooks all."""
+    env = make().unwrapped
+    env.reset(seed=0)
+    assert env.depth("60").shape == env.segmentation("120")[0].shape == (128, 128)
+    np.testing.assert_array_equal(env.depth("overview"), env.depth())
+
+
+def test_averages_of_whole_numbers_are_no_whole_numbers() -> None:
+    """A list of ones and a list of zeros make one half."""
+    env = sw.MovingAverageAction(make(normalize_actions=False, action_mode="joint_torques"))
+    env.reset(seed=0)
+    env.step([0] * 9)
+    env.step(np.array([1] * 9) * 0)
+    assert env.action(np.array([1] * 9)).tolist() == pytest.approx([1 / 3] * 9)
+
+
+def test_compute_reward_warns_of_dense_terms() -> None:
+    """Once, and only where steps have them."""
+    env = make(goal_env=True)
+    observation, info = env.reset(seed=0)
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    with pytest.warns(UserWarning, match="leaves out 'reward"):
+        env.unwrapped.compute_reward(*goals, info)
+    env.unwrapped.compute_reward(*goals, info)
+    sparse = make(goal_env=True, task_options={"weights": "sparse"})
+    sparse.reset(seed=0)
+    sparse.unwrapped.compute_reward(*goals, info)
