@@ -287,10 +287,11 @@ class UnknownOption(ScmWorldError, ValueError):
         self.option = option
         self.value = value
         self.choices = tuple(choices)
-        what = f"{option} cannot be {value!r}"
+        what = f"{option} cannot be {value!r}; it can be"
         if isinstance(value, str):
-            what = f"no {option} is named {value!r}{_suggest(nearest(value, self.choices))}"
-        super().__init__(f"{what}; there are: {', '.join(self.choices)}")
+            near = _suggest(nearest(value, self.choices))
+            what = f"no {option} is named {value!r}{near}; there are"
+        super().__init__(f"{what}: {', '.join(self.choices)}")
 
 
 class EngineError(ScmWorldError, RuntimeError):
