@@ -85,8 +85,7 @@ class World(Declared):
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        made = make_task(task) if isinstance(task, str) else task
-        self.family = Family(made, self.options)
+        self.family = Family(make_task(task) if isinstance(task, str) else task, self.options)
         self._mode = self.options.mode
         self._by_tips = action_mode == "end_effector_positions"
         self._action_unit = ACTIONS[action_mode][0]
