@@ -55,8 +55,9 @@ class Task(ABC):
         unknown = sorted(common.keys() - Common.__annotations__.keys())
         if unknown:
             raise UnknownOption(f"option of {self.name}", unknown[0], Common.__annotations__)
-        self.weights = resolve(self.default_weights, self.paper_weights, common)
         self.terms = tuple(common.get("terms", ()))
+        common["terms"] = self.terms  # it may have been an iterator, which is empty now
+        self.weights = resolve(self.default_weights, self.paper_weights, common)
         given = common.get("joint_positions")
         joints = numbers_of(self.rest if given is None else given)
         if joints is None or joints.shape != (trifinger.N_JOINTS,):

@@ -12,10 +12,11 @@ from scm_world.entities import Entity, GoalSphere
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
 from scm_world.tasks import kernels
+from scm_world.tasks.arguments import checked
 from scm_world.tasks.base import Task
 from scm_world.tasks.observed import Observed, observe_obstacle, observe_position
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
-from scm_world.tasks.scattered import COUNT, obstacle_names, scattered, scattering
+from scm_world.tasks.scattered import COUNT, MOST, obstacle_names, scattered, scattering
 from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
 from scm_world.variables import catalogue as numbers
 from scm_world.variables.kinds import SpaceName
@@ -94,7 +95,8 @@ class Reaching(Task):
     ) -> None:
         super().__init__(**common)
         self._places = (default_goal_60, default_goal_120, default_goal_300)
-        self._count = number_of_obstacles
+        allowed = Integers(0, MOST)
+        self._count = checked(COUNT, number_of_obstacles, allowed)
 
     @property
     def seconds(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from scm_world.errors import UnknownOption
-from scm_world.tasks import TASKS
+from scm_world.tasks import TASKS, term
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -66,3 +66,18 @@ def test_an_argument_of_another_shape_is_refused(name: str, option: str, value: 
     """With its name, when the task is made."""
     with pytest.raises(UnknownOption, match=option):
         TASKS[name](**{option: value})  # type: ignore[arg-type] # that is the point
+
+
+def test_terms_may_come_from_an_iterator() -> None:
+    """They are read once, and are there."""
+    own = term("reward.h", lambda position: float(position[2]), ("tool_block.orientation",), "h")
+    task = TASKS["pushing"](terms=iter([own]), weights={"reward.h": 2.0})  # type: ignore[call-arg]
+    assert task.terms == (own,)
+    assert task.weights["reward.h"] == 2.0
+
+
+@pytest.mark.parametrize("count", [-1, 1.5, 20, "many", (1, 2)])
+def test_obstacles_are_counted_in_whole_numbers(count: object) -> None:
+    """As many as there are places for."""
+    with pytest.raises(UnknownOption, match="number_of_obstacles"):
+        TASKS["reaching"](number_of_obstacles=count)  # type: ignore[call-arg] # that is the point
