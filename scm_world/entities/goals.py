@@ -10,6 +10,7 @@ import numpy as np
 from scm_world._types import Floats, Values
 from scm_world.entities.base import Entity
 from scm_world.entities.blocks import color, coordinates, object_type, same
+from scm_world.geometry import rotation_matrix
 from scm_world.geometry.hulls import Hull
 from scm_world.scene import Goal
 from scm_world.variables import Box, Derived, Exogenous, Function, Variable
@@ -36,6 +37,21 @@ def on_the_floor(polar: Floats, size: Floats) -> Floats:
     center[..., 1] = radius * np.sin(angle)
     center[..., 2] = size[..., 2] / 2.0
     return center
+
+
+def turned_on_the_floor(polar: Floats, size: Floats, orientation: Floats) -> Floats:
+    """Put a turned box on the floor at a radius and an angle: its lowest point touches it.
+
+    Args:
+        polar: Radius [m] and angle [rad], shape (..., 2).
+        size: Edge lengths, shape (..., 3) [m].
+        orientation: Quaternion (x, y, z, w), shape (..., 4).
+
+    Returns:
+        The center, shape (..., 3) [m].
+    """
+    height = (np.abs(rotation_matrix(orientation)[..., 2, :]) * size).sum(axis=-1, keepdims=True)
+    return on_the_floor(polar, np.broadcast_to(height, (*height.shape[:-1], 3)))
 
 
 def goal_position(

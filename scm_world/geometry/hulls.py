@@ -16,6 +16,7 @@ from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry.arrays import compact
 from scm_world.geometry.hull_kernels import Solid, hull_overlap_kernel
+from scm_world.geometry.rotations import canonical
 
 Vector = tuple[float, float, float]
 
@@ -40,6 +41,8 @@ class Hull:
             ``normal · x <= offset`` [m].
         volume: [m³].
         moments: Principal moments of inertia divided by the mass, about the three axes [m²].
+        axes: How the principal axes lay in the frame of the points that were given: quaternion
+            (x, y, z, w). A body of this orientation lies as they did.
     """
 
     vertices: tuple[Vector, ...]
@@ -47,14 +50,16 @@ class Hull:
     planes: tuple[tuple[float, float, float, float], ...]
     volume: float
     moments: Vector
+    axes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
 def hull_of(points: ArrayLike) -> Hull:
     """Wrap points in a convex polyhedron of uniform density.
 
-    The result is expressed in the frame of its center of mass and its principal axes. Order and
-    signs of the axes are those that turn the points least; where moments are equal, and axes
-    can be chosen, too. A shape whose axes are principal axes is not turned at all.
+    The result is expressed in the frame of its center of mass and its principal axes, and
+    remembers how these lay. Order and signs of the axes are those that turn the points least;
+    where moments are equal, and axes can be chosen, too. A shape whose axes are principal axes is
+    not turned at all.
 
     Args:
         points: Corners, and any number of points among them, shape (n, 3) [m].
@@ -88,7 +93,24 @@ def hull_of(points: ArrayLike) -> Hull:
         tuple(map(tuple, np.column_stack([planes[:, :3] @ axes, offsets]).tolist())),
         volume,
         tuple((along.sum() - along).tolist()),
+        _quaternion(axes),
     )
+
+
+def _quaternion(matrix: Floats) -> tuple[float, float, float, float]:
+    """Read the quaternion off a rotation matrix: its outer product is linear in the matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    squares = np.array([1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i])
+    outer = np.array(
+        [
+            [squares[0], b + d, c + g, h - f],
+            [b + d, squares[1], f + h, c - g],
+            [c + g, f + h, squares[2], d - b],
+            [h - f, c - g, d - b, squares[3]],
+        ]
+    )
+    x, y, z, w = canonical(outer[np.argmax(squares)]).tolist()
+    return x, y, z, w
 
 
 def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:

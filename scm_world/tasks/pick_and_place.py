@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.entities import Entity, Obstacle
-from scm_world.entities.goals import goal_position, on_the_floor, polar
+from scm_world.entities.goals import goal_position, polar, turned_on_the_floor
 from scm_world.entities.obstacles import obstacle_size, wall_on_the_floor
 from scm_world.tasks import kernels, shapes
 from scm_world.tasks.rewards import FRACTION, term
@@ -49,9 +49,9 @@ def mirrored(polar_position: Floats, side: Value) -> Floats:
     return polar_position * np.stack([np.ones_like(sign), sign], axis=-1)
 
 
-def goal_across(side: Value, polar_position: Floats, size: Floats) -> Floats:
+def goal_across(side: Value, polar_position: Floats, size: Floats, orientation: Floats) -> Floats:
     """Put a box on the floor on its side of the wall, shape (..., 3) [m]."""
-    return on_the_floor(mirrored(polar_position, side), size)
+    return turned_on_the_floor(mirrored(polar_position, side), size, orientation)
 
 
 def hull_across(

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Unpack, final
 
 from scm_world.entities import Entity
-from scm_world.entities.goals import goal_position, on_the_floor, polar
+from scm_world.entities.goals import goal_position, polar, turned_on_the_floor
 from scm_world.tasks import kernels, shapes
 from scm_world.tasks.rewards import term
 from scm_world.tasks.shapes import Place
@@ -58,7 +58,7 @@ class Pushing(OneBlock):
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
         yield self.tool(spaces=self.spaces(TOOL))
-        rests = on_the_floor if self.shape is None else shapes.hull_on_the_floor
+        rests = turned_on_the_floor if self.shape is None else shapes.hull_on_the_floor
         yield self.goal(
             polar(GOAL, self._polar, a=numbers.POLAR_A, b=numbers.POLAR_B),
             goal_position(

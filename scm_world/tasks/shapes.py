@@ -265,6 +265,19 @@ def unit_quaternion(option: str, orientation: Quaternion) -> Quaternion:
     return x, y, z, w
 
 
+def turn_of(option: str, orientation: Quaternion, hull: Hull | None) -> Quaternion:
+    """Read how a body begins turned; a hull is turned from the way its points were given.
+
+    Raises:
+        UnknownOption: See ``unit_quaternion``.
+    """
+    turn = unit_quaternion(option, orientation)
+    if hull is None:
+        return turn
+    x, y, z, w = canonical(quaternion_product(turn, hull.axes)).tolist()
+    return x, y, z, w
+
+
 def _checked(option: str, place: Place) -> tuple[float, ...]:
     point = numbers_of(place)
     if point is None or point.shape not in ((2,), (3,)):

@@ -35,9 +35,10 @@ class Alike(Common, total=False):
     Attributes:
         shape: Of block and goal; a box if None. The size of a shape cannot change.
         tool_block_mass: Default mass of the block [kg].
-        tool_block_orientation: How it begins: quaternion (x, y, z, w).
-        goal_block_orientation: Default orientation of the goal. A shape rests like this on the
-            floor; it is turned about the vertical by ``goal_block.yaw``.
+        tool_block_orientation: How it begins: quaternion (x, y, z, w). A shape is turned by so
+            much from the way its points were given.
+        goal_block_orientation: Default orientation of the goal, likewise. A shape rests like this
+            on the floor; it is turned about the vertical by ``goal_block.yaw``.
     """
 
     shape: Hull | None
@@ -77,19 +78,22 @@ class OneBlock(Building):
         self.shape = shape
         self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
         self._turns = {
-            TOOL: shapes.unit_quaternion("tool_block_orientation", tool_block_orientation),
-            GOAL: shapes.unit_quaternion("goal_block_orientation", goal_block_orientation),
+            TOOL: shapes.turn_of("tool_block_orientation", tool_block_orientation, shape),
+            GOAL: shapes.turn_of("goal_block_orientation", goal_block_orientation, shape),
         }
-        corners = () if shape is None else (np.array(shape.vertices),)
-        below = shapes.depth(np.array(numbers.BLOCK_SIZE), np.array(self._turns[TOOL]), *corners)
-        self.place = shapes.start_place("tool_block_position", tool_block_position, below)
+        self.place = shapes.start_place(
+            "tool_block_position", tool_block_position, self._below(TOOL)
+        )
+
+    def _below(self, name: str) -> float:
+        """Compute how far block or goal reaches below its center as it begins [m]."""
+        corners = () if self.shape is None else (np.array(self.shape.vertices),)
+        size, turn = np.array(numbers.BLOCK_SIZE), np.array(self._turns[name])
+        return shapes.depth(size, turn, *corners)
 
     def floor_polar(self, place: Place) -> tuple[float, float]:
         """Turn the place of a goal on the floor into radius [m] and angle [rad]."""
-        height = 0.5 * numbers.BLOCK_SIZE[2]
-        if self.shape is not None:
-            height = shapes.rest_height(self.shape, self._turns[GOAL])
-        x, y = shapes.floor_place("goal_block_position", place, height)
+        x, y = shapes.floor_place("goal_block_position", place, self._below(GOAL))
         return math.hypot(x, y), math.atan2(y, x)
 
     def tools(self) -> tuple[str, ...]:
@@ -116,9 +120,8 @@ class OneBlock(Building):
 
     def form(self, name: str) -> tuple[str, ...]:
         """Name the variables that say how high block or goal is on the floor."""
-        if self.shape is None:
-            return (f"{name}.size",)
-        return (f"{name}.vertices", f"{name}.orientation")
+        form = "size" if self.shape is None else "vertices"
+        return f"{name}.{form}", f"{name}.orientation"
 
     def tool(
         self,

@@ -12,7 +12,8 @@ from scm_world._types import Floats
 from scm_world.entities import Entity, GoalBlock, ToolBlock, block_mass, block_size
 from scm_world.entities.base import lowest_point
 from scm_world.entities.blocks import coordinates
-from scm_world.entities.goals import goal_orientation, goal_position, on_the_floor, polar
+from scm_world.entities.goals import goal_orientation, goal_position, polar, turned_on_the_floor
+from scm_world.geometry import rotation_matrix
 from scm_world.tasks import kernels, shapes
 from scm_world.tasks.arguments import checked
 from scm_world.tasks.building import Building
@@ -28,27 +29,31 @@ GOALS = ("goal_block_1", "goal_block_2")
 GAP = 0.005  # [m] at least between the blocks at the start
 
 
-def tower_center(polar_position: Floats, size: Floats) -> Floats:
-    """Stand a tower of two blocks on the floor.
+def tower_center(polar_position: Floats, size: Floats, orientation: Floats) -> Floats:
+    """Put a tower of two blocks on the floor: its lowest point touches it.
 
     Args:
         polar_position: Radius [m] and angle [rad], shape (..., 2).
         size: Edge lengths of a block, shape (..., 3) [m].
+        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
 
     Returns:
         The center of the tower, shape (..., 3) [m].
     """
-    return on_the_floor(polar_position, size * [1.0, 1.0, 2.0])
+    return turned_on_the_floor(polar_position, size * [1.0, 1.0, 2.0], orientation)
 
 
-def floor_of_tower(center: Floats, *, share: float) -> Floats:
+def floor_of_tower(center: Floats, size: Floats, orientation: Floats, *, side: float) -> Floats:
     """Find the center of a block of the tower, shape (..., 3) [m].
 
     Args:
-        center: Of the tower, as high as a block, shape (..., 3) [m].
-        share: Its height as a share of that of the center.
+        center: Of the tower, shape (..., 3) [m].
+        size: Edge lengths of a block, shape (..., 3) [m].
+        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
+        side: -1 for the lower block, 1 for the upper one.
     """
-    return np.asarray(center * [1.0, 1.0, share])
+    upwards = rotation_matrix(orientation)[..., :, 2]
+    return np.asarray(center + (0.5 * side) * size[..., 2:] * upwards)
 
 
 def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -> Floats:
@@ -88,9 +93,8 @@ class GoalTower(Entity):
     def variables(self) -> Iterable[Variable]:
         """Declare position and orientation, in all coordinates."""
         yield polar(TOWER, self._place, a=numbers.POLAR_A, b=numbers.POLAR_B)
-        yield goal_position(
-            TOWER, parents=(f"{TOWER}.polar", SIZE), mechanism=Function(tower_center)
-        )
+        causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
+        yield goal_position(TOWER, parents=causes, mechanism=Function(tower_center))
         yield goal_orientation(TOWER, default=self._orientation)
         height = Affine(parent=SIZE, index=2)
         yield from coordinates(
@@ -166,9 +170,11 @@ class Stacking2(Building):
         )
         starts = [self._start(t, *pose) for t, pose in zip(TOOLS, given, strict=True)]
         self._places, self._turns = zip(*starts, strict=True)
-        x, y = shapes.floor_place("goal_position", goal_position, 0.5 * tool_block_size)
-        self._tower = math.hypot(x, y), math.atan2(y, x)
         self._tower_turn = shapes.unit_quaternion("goal_orientation", goal_orientation)
+        size, turn = np.array(self._size), np.array(self._tower_turn)
+        lower = floor_of_tower(tower_center(np.zeros(2), size, turn), size, turn, side=-1.0)
+        x, y = shapes.floor_place("goal_position", goal_position, float(lower[2]))
+        self._tower = math.hypot(x, y), math.atan2(y, x)
 
     def _start(
         self, tool: str, place: Place, orientation: Quaternion
@@ -195,13 +201,14 @@ class Stacking2(Building):
         yield self._tool(0, Function(shapes.stand, constants={"place": first}))
         yield self._tool(1, Function(beside, constants={"place": second, "other": first}))
         yield GoalTower(self._tower, self._tower_turn)
-        for name, share in zip(GOALS, (0.5, 1.5), strict=True):
-            center = Function(floor_of_tower, constants={"share": share})
+        causes = (f"{TOWER}.cartesian_position", SIZE, f"{TOWER}.orientation")
+        for name, side in zip(GOALS, (-1.0, 1.0), strict=True):
+            center = Function(floor_of_tower, constants={"side": side})
             yield GoalBlock(
                 name,
                 size=block_size(f"{name}.size", SIZE, spaces=False),
                 pose=(
-                    goal_position(name, parents=(f"{TOWER}.cartesian_position",), mechanism=center),
+                    goal_position(name, parents=causes, mechanism=center),
                     goal_orientation(name, parents=(f"{TOWER}.orientation",)),
                 ),
                 yaw=False,

@@ -118,6 +118,22 @@ class EffectConformance(Suite):
         assert speeds[0] > speeds[1] + 0.5
         assert speeds[1] > speeds[2] + 0.5
 
+    @pytest.mark.parametrize("sliding", [0.0, 0.001, 0.003, 0.3])
+    @pytest.mark.parametrize("spinning", [0.0, 0.005, 0.05, 0.1])
+    def test_friction_only_slows_a_spin(
+        self, backend: Backend, sliding: float, spinning: float
+    ) -> None:
+        """No pair of frictions makes a spinning block turn faster."""
+        if not backend.capabilities.physics:
+            return
+        smooth = {("floor", "friction"): np.array(sliding)}
+        values = {**FAR_UP, **smooth, ("world", "spinning_friction"): np.array(spinning)}
+        scene = self.arranged(Structure(("block",), self.preset), values, [0.0, 0.0, HALF])
+        scene.state.angular_velocities[0] = [0.0, 0.0, 10.0]
+        turns = np.abs(self.watched(backend, scene, 0.3)[:, 39])
+        assert turns.max() <= 10.0 + 1e-9
+        assert turns[-1] < 9.999 or not (sliding and spinning)
+
     @pytest.mark.parametrize("name", ["restitution", "spinning_friction"])
     def test_contacts_need_touch(self, backend: Backend, name: str) -> None:
         """What belongs to contacts has exactly no effect on a block in the air."""

@@ -35,10 +35,10 @@ NO_ROOM = {"pick_and_place": {"touch", "block_in_air"}}
 
 DECLARED = {
     "reaching": 111,
-    "pushing": 266,
+    "pushing": 267,
     "picking": 275,
-    "pick_and_place": 305,
-    "stacking2": 510,
+    "pick_and_place": 306,
+    "stacking2": 515,
     "towers": 511,
     "stacked_blocks": 530,
     "creative_stacked_blocks": 541,

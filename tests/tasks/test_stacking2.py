@@ -115,11 +115,15 @@ def test_the_tower_can_be_moved_and_turned_at_once() -> None:
     np.testing.assert_allclose(world[TOP], before[TOP], atol=1e-15)
 
 
-def test_the_goals_are_at_a_quarter_and_three_quarters_of_the_tower() -> None:
-    """The published height of the tower is that of its center."""
+def test_the_tower_moves_and_turns_as_one() -> None:
+    """The goals stay stacked; a tower on its side has them side by side on the floor."""
     world = stacking()
     world.do({TOWER: [0.05, 0.0, 0.08]})
-    assert (world[GOAL][2], world[TOP][2]) == pytest.approx((0.04, 0.12))
+    assert (world[GOAL][2], world[TOP][2]) == pytest.approx((0.0475, 0.1125))
+    world = stacking()
+    world.do({"goal_tower.euler_orientation": [np.pi / 2, 0.0, 0.0]})
+    assert (world[GOAL][2], world[TOP][2]) == pytest.approx((0.0325, 0.0325))
+    np.testing.assert_allclose(world[TOP] - world[GOAL], [0.0, -0.065, 0.0], atol=1e-12)
 
 
 def test_one_size_for_all() -> None:

@@ -56,6 +56,7 @@ class Everywhere(Slot):
     """A number that stands in many places."""
 
     places: Floats
+    coupled: bool = False
 
     def write(self, value: Floats) -> None:
         """Write it to all of them."""
