@@ -288,7 +288,7 @@ class UnknownOption(ScmWorldError, ValueError):
         self.value = value
         self.choices = tuple(choices)
         what = f"{option} cannot be {value!r}; it can be"
-        if isinstance(value, str):
+        if isinstance(value, str) and not any(" " in choice for choice in self.choices):
             near = _suggest(nearest(value, self.choices))
             what = f"no {option} is named {value!r}{near}; there are"
         super().__init__(f"{what}: {', '.join(self.choices)}")

@@ -111,7 +111,8 @@ def _print_audit(terminal: Console, outcome: Outcome) -> None:
     made = table("target", "requested", "applied", "engine reports", title=title)
     for name, entry in outcome.audit.targets.items():
         back = "-" if entry.read_back is None else show(entry.read_back)
-        made.add_row(Text(name, style="bold"), _words(entry.requested), show(entry.applied), back)
+        held = "at every step" if entry.applied is None else show(entry.applied)
+        made.add_row(Text(name, style="bold"), _words(entry.requested), held, back)
     terminal.print(made)
     for label, changes in (
         ("followed at once", outcome.audit.followed),

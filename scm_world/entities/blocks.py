@@ -155,6 +155,8 @@ class ToolBlock(Entity):
         yield Exogenous(
             name=self._v("friction"),
             bounds=numbers.FRICTION_BOUNDS,
+            a=numbers.BLOCK_FRICTION_A,
+            b=numbers.BLOCK_FRICTION_B,
             default=numbers.BLOCK_FRICTION,
             doc="Friction of its surface; a contact has the product of two frictions.",
         )

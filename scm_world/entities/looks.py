@@ -7,13 +7,15 @@ from typing import final
 
 from scm_world._types import Values
 from scm_world.entities.base import Entity
+from scm_world.geometry import from_rotation_vector, to_rotation_vector
 from scm_world.scene import Light
 from scm_world.scene.camera import CAMERAS, Camera, camera_from, published_poses
-from scm_world.variables import Box, Exogenous, Variable
+from scm_world.variables import Box, Derived, Exogenous, Variable
 from scm_world.variables import catalogue as numbers
 
 _DEFAULT = Light()
 _NEAR, _FAR = 0.01, 0.03  # [m] how far a camera is moved in A and in B
+_TURN = 0.02  # [rad] how far it is turned in A, about each axis
 
 
 @final
@@ -64,6 +66,19 @@ class Looks(Entity):
             bounds=numbers.QUATERNION_BOUNDS,
             default=tuple(orientation),
             doc="Quaternion (x, y, z, w) of its axes right, down and forward.",
+        )
+        x, y, z = to_rotation_vector(orientation).tolist()
+        turned = Box((x - _TURN, y - _TURN, z - _TURN), (x + _TURN, y + _TURN, z + _TURN))
+        yield Derived(
+            name=f"{name}.euler_orientation",
+            unit="rad",
+            shape=(3,),
+            a=turned,
+            b=Box((x - _TURN, y - _TURN, z + _TURN), (x + _TURN, y + _TURN, z + 3.0 * _TURN)),
+            parents=(f"{name}.orientation",),
+            mechanism=to_rotation_vector,
+            inverse=from_rotation_vector,
+            doc="Orientation as a rotation vector; setting it sets the quaternion.",
         )
         yield Exogenous(
             name=f"{name}.field_of_view",

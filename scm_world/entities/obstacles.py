@@ -61,6 +61,8 @@ class Obstacle(Entity):
         yield Exogenous(
             name=self._v("friction"),
             bounds=numbers.FRICTION_BOUNDS,
+            a=numbers.FRICTION_A,
+            b=numbers.FRICTION_B,
             default=numbers.SURFACE_FRICTION,
             doc="Friction of its surface; a contact has the product of two frictions.",
         )

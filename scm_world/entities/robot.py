@@ -102,6 +102,8 @@ class Robot(Entity):
             name="robot_height",
             unit="m",
             bounds=numbers.ROBOT_HEIGHT_BOUNDS,
+            a=numbers.ROBOT_HEIGHT_A,
+            b=numbers.ROBOT_HEIGHT_B,
             default=trifinger.NOMINAL_HEIGHT,
             doc="Height of the robot's base above a plane 0.011 m below the table top.",
         )

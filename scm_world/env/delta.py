@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
+from scm_world.entities import ACTIONS
 from scm_world.env.vector import box
 from scm_world.world import World
 
 PREFIX = "delta_"
 TIPS = "end_effector_positions"
+MODES = (*ACTIONS, *(PREFIX + mode for mode in ACTIONS))
+"""What an environment calls its actions."""
 
 
 @final

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.copies import Copied
-from scm_world.env.delta import PREFIX, Delta
+from scm_world.env.delta import MODES, PREFIX, Delta
 from scm_world.env.goals import GoalReward, Goals, reader, reward_scale
 from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
@@ -24,6 +24,7 @@ from scm_world.errors import ActionError, UnknownOption
 from scm_world.scene.camera import OVERVIEW, Camera
 from scm_world.scene.kinematics import scaled_clip_kernel
 from scm_world.tasks import Task, make_task
+from scm_world.tasks.rewards import one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world import Audit, World
 from scm_world.world.declaration import Declaration
@@ -142,6 +143,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             normalize=normalize_observations,
             goals=goal_env,
         )
+        if action_mode not in MODES:
+            raise UnknownOption("action_mode", action_mode, MODES)
         self.world = World(
             _made(task, task_options),
             backend=backend,
@@ -242,6 +245,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             UnknownOption: Another key than ``"do"``.
             InterventionError: The intervention was refused.
+            ModelError: A reward term of one's own is no number.
         """
         super().reset(seed=seed)
         unknown = set(options or {}) - {"do"}
@@ -249,6 +253,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             raise UnknownOption("reset option", min(unknown), ("do",))
         begin(self.world, seed, self._acts((options or {}).get("do")), self._attempts)
         now = self._look()
+        for own in self.world.task.terms:
+            one_number(now, own.name, (own.name,))
         self._show()
         return self._observer.observe(now), self._info(now)
 
@@ -273,7 +279,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """
         self.world.advance(self._command(action))
         now = self._look()
-        reward = self._scale * float(now["reward"])
+        reward = self._scale * one_number(now, "reward", self._terms)
         truncated = self.world.index >= self._limit
         if self._window is not None:
             self._show()

@@ -38,6 +38,7 @@ class Moment:
         count: For how many episodes in a row; None for a single one without a batch axis.
         origin: The control step at which variables got their own noise, if that was another one:
             what nature drew at the start of an episode stays, however late one intervenes.
+        attempt: How many draws were rejected before, because the world could not be like that.
     """
 
     noise: Noise
@@ -45,12 +46,15 @@ class Moment:
     step: int = 0
     count: int | None = None
     origin: int | None = None
+    attempt: int = 0
 
     def nature(
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
     ) -> Value:
         """Draw what a variable has by itself, without intervention."""
-        moment = self if self.origin is None else replace(self, step=self.origin, origin=None)
+        moment = replace(self, attempt=0) if self.attempt else self
+        if self.origin is not None:
+            moment = replace(moment, step=self.origin, origin=None)
         return moment.draw(source, name, shape, values)
 
     def draw(
@@ -59,7 +63,7 @@ class Moment:
         """Draw a value of a variable, shape ``(count, *shape)`` or ``shape``."""
         drawn = self.noise.draw(
             source,
-            name,
+            f"{name}#{self.attempt}" if self.attempt else name,
             shape,
             values,
             episode=self.episode,

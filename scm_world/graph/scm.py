@@ -32,7 +32,7 @@ from scm_world.variables import (
     Shift,
     Variable,
 )
-from scm_world.variables.checks import check_bounds, coerce
+from scm_world.variables.checks import check_bounds, check_draw, coerce
 
 
 def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
@@ -283,8 +283,7 @@ class SCM:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
             raise NotIntervenable(name, reason, self._settable_causes(target.name))
         if isinstance(value, Draw):
-            if isinstance(value.source, str) and variable.space(value.source) is None:
-                raise NotIntervenable(name, f"has no space {value.source}")
+            check_draw(variable, value)
             for parent in sorted(source_of(Act(value, variable)).parents()):
                 self.declared(parent)
             return value

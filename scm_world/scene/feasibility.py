@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
-from scm_world._types import Floats, Integers
+from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.geometry.arrays import compact, rows
 from scm_world.geometry.convex import Convex, placed, sides_depth
 from scm_world.geometry.hulls import box_hull
+from scm_world.geometry.penetration import box_capsule
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, sweep
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
-from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS, Scene
+from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS, Goal, Scene
 
 TOLERANCE = 1e-3
 """How deep two bodies may lie in one another after an intervention [m]."""
@@ -117,6 +118,52 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     return tuple(_sharper(scene, result, tolerance) if structure.hulls else result)
 
 
+def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
+    """List goals that lie deeper than ``TOLERANCE`` in an obstacle: nothing can ever fill them.
+
+    Args:
+        scene: With complete parameters.
+        names: Of the goals to look at.
+    """
+    found = []
+    for goal in scene.goals:
+        for obstacle in scene.structure.obstacles if goal.name in names else ():
+            depth = _depth_of_goal(goal, scene, obstacle)
+            if depth > TOLERANCE:
+                found.append(Overlap((goal.name, obstacle), depth))
+    return tuple(found)
+
+
+def _depth_of_goal(goal: Goal, scene: Scene, obstacle: str) -> float:
+    if goal.shape == "sphere":
+        size, position, turn = (
+            scene.parameters[obstacle, what] for what in ("size", "position", "orientation")
+        )
+        center, radius = goal.position, 0.5 * float(goal.size[0])
+        return box_capsule(size, position, turn, center, center, radius)
+    hull = goal.hull or box_hull(goal.size)
+    return sides_depth(placed(hull, goal.position, goal.orientation), _solid(scene, obstacle))
+
+
+def fingers_reach(
+    size: ArrayLike, position: ArrayLike, orientation: ArrayLike, joints: ArrayLike, height: float
+) -> bool:
+    """Tell whether a finger lies in a box.
+
+    Args:
+        size: Full edge lengths of the box, shape (3,) [m].
+        position: Its center, shape (3,) [m].
+        orientation: Its quaternion (x, y, z, w).
+        joints: Of the robot, shape (9,) [rad].
+        height: Of its base [m].
+    """
+    capsules = [part for parts in _placed_links(joints, height).values() for part in parts]
+    return any(
+        box_capsule(size, position, orientation, p.corners[0], p.corners[1], p.radius) > TOLERANCE
+        for p in capsules
+    )
+
+
 def _boxes(scene: Scene) -> tuple[Floats, Floats, Floats]:
     """Gather sizes, centers and orientations of the boxes: blocks first, then obstacles."""
     structure, parameters = scene.structure, scene.parameters
@@ -171,9 +218,13 @@ def _solid(scene: Scene, name: str) -> Convex:
 
 
 def _links(scene: Scene) -> dict[str, list[Convex]]:
-    """Put the capsules of all links into the world."""
     height = float(scene.parameters["robot", "height"])
-    origins, orientations = link_frames(scene.state.joint_positions, height)
+    return _placed_links(scene.state.joint_positions, height)
+
+
+def _placed_links(joints: ArrayLike, height: float) -> dict[str, list[Convex]]:
+    """Put the capsules of all links into the world."""
+    origins, orientations = link_frames(joints, height)
     links: dict[str, list[Convex]] = {}
     for capsule, (frame, body, *_) in zip(_CAPSULES, _MEMBERS.tolist(), strict=True):
         ends = origins[frame] + capsule[:6].reshape(2, 3) @ rotation_matrix(orientations[frame]).T

@@ -49,6 +49,7 @@ JOINT_LOW = (-1.57, -1.2, -3.0) * 3  # [rad] what a command may ask for
 JOINT_HIGH = (1.0, 1.57, 3.0) * 3  # [rad]
 REST = (0.0, math.pi / 4, -math.pi / 4) * 3  # [rad]
 RAISED = (-1.56, -0.08, -2.7) * 3  # [rad]
+ASIDE = (0.0, 1.5, -1.5) * 3  # [rad] stretched outward, the lower links hanging
 
 LINK_MASS = (1.0, 0.14854, 0.14854, 0.0307)  # [kg] links 0 to 3 of a finger
 TIP_MASS = 0.01  # [kg]

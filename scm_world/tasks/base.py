@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping
 from typing import Any, ClassVar, Self, Unpack
@@ -16,7 +17,7 @@ from scm_world.scene import trifinger
 from scm_world.tasks.arguments import numbers_of
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.observed import Observed
-from scm_world.tasks.rewards import Common, resolve
+from scm_world.tasks.rewards import Common, own_terms, resolve
 from scm_world.variables import Draw, Integers, Variable
 from scm_world.variables.kinds import SpaceName
 
@@ -54,8 +55,8 @@ class Task(ABC):
     def __init__(self, **common: Unpack[Common]) -> None:
         unknown = sorted(common.keys() - Common.__annotations__.keys())
         if unknown:
-            raise UnknownOption(f"option of {self.name}", unknown[0], Common.__annotations__)
-        self.terms = tuple(common.get("terms", ()))
+            raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
+        self.terms = own_terms(common.get("terms", ()), self.default_weights)
         common["terms"] = self.terms  # it may have been an iterator, which is empty now
         self.weights = resolve(self.default_weights, self.paper_weights, common)
         given = common.get("joint_positions")
@@ -63,6 +64,14 @@ class Task(ABC):
         if joints is None or joints.shape != (trifinger.N_JOINTS,):
             raise UnknownOption("joint_positions", given, ("nine angles [rad]",))
         self.start = tuple(joints.tolist())
+
+    @classmethod
+    def arguments(cls) -> tuple[str, ...]:
+        """Name the arguments of the constructor, those of this family first."""
+        own = [vars(kind)["__init__"] for kind in cls.__mro__ if "__init__" in vars(kind)]
+        given = [p for init in own[:-1] for p in inspect.signature(init).parameters.values()]
+        names = [parameter.name for parameter in given if parameter.kind is parameter.KEYWORD_ONLY]
+        return tuple(dict.fromkeys((*names, *Common.__annotations__)))
 
     @property
     @abstractmethod

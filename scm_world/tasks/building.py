@@ -12,6 +12,8 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.entities import Entity
 from scm_world.geometry.filling import overlap_fraction_kernel
 from scm_world.geometry.overlap import aabb_overlap_fraction
+from scm_world.scene import trifinger
+from scm_world.scene.feasibility import fingers_reach
 from scm_world.tasks import kernels
 from scm_world.tasks.base import Task
 from scm_world.tasks.observed import Observed, observe_goal, observe_obstacle, observe_tool
@@ -157,12 +159,17 @@ class Building(Task):
         return np.asarray(fraction) > FULFILLED
 
     def solution(self, values: Values) -> dict[str, Value]:
-        """Put each block where its goal is."""
-        return {
+        """Put each block where its goal is, and fingers that are in the way to the side."""
+        found = {
             f"{tool}.{part}": values[f"{goal}.{part}"]
             for goal, tool in self.targets().items()
             for part in _POSE[1:]
         }
+        joints, height = values["joint_positions"], float(values["robot_height"])
+        boxes = [[values[f"{goal}.{part}"] for part in _POSE] for goal in self.targets()]
+        if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
+            found["joint_positions"] = np.array(trifinger.ASIDE)
+        return found
 
 
 def _split(boxes: Floats) -> tuple[Floats, Floats, Floats]:

@@ -94,7 +94,11 @@ class Reaching(Task):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._places = (default_goal_60, default_goal_120, default_goal_300)
+        given = {"60": default_goal_60, "120": default_goal_120, "300": default_goal_300}
+        self._places = tuple(
+            checked(f"default_goal_{finger}", place, numbers.POSITION_BOUNDS, shape=(3,))
+            for finger, place in given.items()
+        )
         allowed = Integers(0, MOST)
         self._count = checked(COUNT, number_of_obstacles, allowed)
 

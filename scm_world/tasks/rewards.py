@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
 
-from scm_world.errors import UnknownOption
+from scm_world._types import Values
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.tasks.arguments import checked_weight
 from scm_world.variables import Box, Function, Linear, Measured, Parent, Variable
 
@@ -16,6 +18,7 @@ SUCCESS = "success"
 FULFILLED = 0.9  # the fraction of the goal that counts as success
 UNIT = Box(0.0, 1.0)
 
+PREFIX = "reward."
 PRESETS = ("default", "paper", "sparse", "none")
 """The weights that every task knows by name."""
 
@@ -91,6 +94,53 @@ def _in_order(dense: Sequence[str], options: Common) -> dict[str, float]:
     if np.shape(given) != (len(dense),):
         raise UnknownOption("dense_reward_weights", given, (f"{len(dense)} numbers", *dense))
     return {name: checked_weight(name, weight) for name, weight in zip(dense, given, strict=True)}
+
+
+def own_terms(terms: Any, known: Iterable[str]) -> tuple[Measured, ...]:
+    """Check reward terms of the user's own.
+
+    Args:
+        terms: Any number of them.
+        known: Names of the terms that there are.
+
+    Raises:
+        UnknownOption: One is no measured number with a mechanism, or has the wrong name.
+    """
+    found = tuple(terms) if isinstance(terms, Iterable) else (terms,)
+    names = [*known, SUCCESS]
+    for own in found:
+        if not isinstance(own, Measured) or own.mechanism is None or own.shape:
+            allowed = "a Measured variable of shape () with a mechanism"
+            raise UnknownOption("terms", own, (allowed,))
+        if not own.name.startswith(PREFIX) or own.name in names:
+            allowed = f"a new name that begins with {PREFIX!r}"
+            raise UnknownOption("name of a reward term", own.name, (allowed,))
+        names.append(own.name)
+    return found
+
+
+def one_number(values: Values, name: str, terms: Iterable[str]) -> float:
+    """Give the value of a variable as a number.
+
+    Args:
+        values: Of the variable and of what it is made of.
+        name: Of the variable.
+        terms: Of what it is made of.
+
+    Raises:
+        ModelError: It is none; with the terms to blame.
+    """
+    try:
+        number = float(values[name])
+    except (TypeError, ValueError):
+        number = math.nan
+    if math.isfinite(number):
+        return number
+    blamed = {term: values[term] for term in terms if term in values}
+    wrong = {t: v for t, v in blamed.items() if np.shape(v) or not np.isfinite(v).all()}
+    raise ModelError(
+        [f"{name} is no finite number, because of {wrong}; their mechanisms must give one each"]
+    )
 
 
 def term(

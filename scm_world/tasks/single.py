@@ -12,6 +12,7 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.entities import Entity, GoalBlock, ToolBlock, block_mass, block_size
 from scm_world.entities.blocks import hull_size
 from scm_world.entities.goals import goal_orientation
+from scm_world.errors import ModelError
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks import kernels, shapes
 from scm_world.tasks.arguments import checked
@@ -75,6 +76,10 @@ class OneBlock(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
+        if not (shape is None or isinstance(shape, Hull)):
+            raise ModelError(
+                [f"shape must be a Hull: load_hull(path) or hull_of(points); {shape!r}"]
+            )
         self.shape = shape
         self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
         self._turns = {

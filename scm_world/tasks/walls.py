@@ -9,6 +9,7 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.entities import Entity
+from scm_world.errors import InterventionError
 from scm_world.scene import trifinger
 from scm_world.tasks import layouts
 from scm_world.tasks.arguments import checked
@@ -28,7 +29,6 @@ LAYOUT = "wall.layout"
 RANDOM = 1  # the category of ``wall_pattern``
 
 LOW = 0.25  # [m] what is lower fits under the raised fingers
-ASIDE = (0.0, 1.5, -1.5) * 3  # [rad] fingers stretched outward, the lower links hanging
 
 
 class Walls(Building):
@@ -76,8 +76,16 @@ class Walls(Building):
         self._width = checked(WIDTH, max_level_width, numbers.LEVEL_WIDTH_BOUNDS)
 
     def arrange(self, values: Values) -> Any:
-        """Count the blocks of each level."""
-        return layouts.counts(values[LAYOUT])
+        """Count the blocks of each level.
+
+        Raises:
+            InterventionError: There are none.
+        """
+        counts = layouts.counts(values[LAYOUT])
+        if not counts:
+            message = f"do({LAYOUT}): a wall has at least one block; give one a width above zero"
+            raise InterventionError(message, variable=LAYOUT)
+        return counts
 
     def counts(self) -> tuple[int, ...]:
         """Say how many blocks each level has."""
@@ -129,7 +137,7 @@ class Walls(Building):
             found[f"tool_{name}.cartesian_position"] = place
             found[f"tool_{name}.orientation"] = np.array(numbers.IDENTITY)
         if len(self.counts()) * float(values[SIZE]) > LOW:
-            found["joint_positions"] = np.array(ASIDE)
+            found["joint_positions"] = np.array(trifinger.ASIDE)
         return found
 
     def nearby(self, values: Values) -> Iterable[dict[str, Value]]:

@@ -130,6 +130,7 @@ class TaskConformance(WorldConformance):
             self.prepare(world, name)
             wanted, audit = moved(world, name)
             entry = audit.targets[name]
+            assert entry.applied is not None, name
             np.testing.assert_array_equal(entry.applied, world[name])
             np.testing.assert_allclose(entry.applied, wanted, rtol=1e-9, atol=1e-12)
             if name in world.parameter_keys or name in world.slices:

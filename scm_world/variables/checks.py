@@ -8,13 +8,16 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.errors import (
+    InterventionError,
     NotFinite,
     OutOfBounds,
     OutOfSpace,
     WrongShape,
     WrongType,
 )
-from scm_world.variables.kinds import SpaceName, Variable
+from scm_world.variables.interventions import Draw
+from scm_world.variables.kinds import SPACES, SpaceName, Variable
+from scm_world.variables.noise import Noise
 
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 
@@ -22,7 +25,8 @@ _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 def _expected(variable: Variable) -> str:
     noun = {"real": "numbers", "integer": "whole numbers", "categorical": "whole numbers"}
     where = f" of shape {variable.shape}" if variable.shape else ""
-    return f"{noun[variable.dtype]}{where}"
+    drawn = [f'Draw("{name}")' for name in SPACES if variable.space(name) is not None]
+    return f"{noun[variable.dtype]}{where}" + (f", or {', '.join(drawn)}" if drawn else "")
 
 
 def coerce(variable: Variable, value: Any) -> Value:
@@ -75,6 +79,37 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
             allowed=bounds.describe(variable.shape, values),
             nearest=_plain(bounds.nearest(value, values)),
             unit=variable.unit,
+        )
+
+
+def check_draw(variable: Variable, act: Draw) -> None:
+    """Refuse a draw from a space that is not declared, or of another shape than the variable.
+
+    Raises:
+        InterventionError: There is no such space, or the numbers of a distribution are too many
+            or too few.
+    """
+    if isinstance(act.source, str):
+        if variable.space(act.source) is None:
+            raise InterventionError(
+                f"{variable.name!r} has no space {act.source} to draw from; draw from a "
+                "distribution, such as Draw(Box(low, high))",
+                variable=variable.name,
+                value=act,
+            )
+        return
+    if act.source.parents():
+        return  # known only when it is drawn
+    try:
+        fits = Noise(0).draw(act.source, variable.name, variable.shape, {})[0].shape
+    except ValueError:
+        fits = None
+    if fits != variable.shape:
+        raise InterventionError(
+            f"do({variable.name}): {act.source!r} does not fit its shape {variable.shape}; give "
+            "one number for all, or one for each component",
+            variable=variable.name,
+            value=act,
         )
 
 

@@ -12,15 +12,22 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import Field
 
+from scm_world.errors import UnknownOption
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.kinds import SpaceName
+from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
 
 Number = float | tuple[float, ...]
 
 
-def _number(value: Any) -> Any:
-    return tuple(np.ravel(value).tolist()) if np.ndim(value) else value
+def _number(what: str, value: Any) -> Any:
+    try:
+        given = np.asarray(value)
+    except ValueError:  # a ragged list
+        given = np.asarray("")
+    if given.dtype.kind not in "iufb":
+        raise UnknownOption(what, value, ("a number", "an array of numbers"))
+    return tuple(given.ravel().tolist()) if given.ndim else value
 
 
 @final
@@ -31,7 +38,7 @@ class Hard(Frozen):
     value: Number
 
     def __init__(self, value: Any, **fields: Any) -> None:
-        super().__init__(value=_number(value), **fields)  # type: ignore[call-arg]
+        super().__init__(value=_number("Hard(value)", value), **fields)  # type: ignore[call-arg]
 
 
 @final
@@ -47,7 +54,7 @@ class Shift(Frozen):
     by: Number
 
     def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=_number(by), **fields)  # type: ignore[call-arg]
+        super().__init__(by=_number("Shift(by)", by), **fields)  # type: ignore[call-arg]
 
 
 @final
@@ -58,7 +65,7 @@ class Scale(Frozen):
     by: Number
 
     def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=_number(by), **fields)  # type: ignore[call-arg]
+        super().__init__(by=_number("Scale(by)", by), **fields)  # type: ignore[call-arg]
 
 
 @final
@@ -74,6 +81,8 @@ class Draw(Frozen):
     source: SpaceName | Distribution
 
     def __init__(self, source: Any, **fields: Any) -> None:
+        if not isinstance(source, Frozen | dict) and source not in SPACES:
+            raise UnknownOption("Draw(source)", source, (*SPACES, "a distribution, such as a Box"))
         super().__init__(source=source, **fields)  # type: ignore[call-arg]
 
 

@@ -19,14 +19,15 @@ class Applied:
     Attributes:
         variable: The name that was asked for.
         requested: The intervention, as it was given.
-        applied: The value that the model now has.
+        applied: The value that the model now has; None for actions that are shifted, scaled or
+            drawn, since each is known only when its step comes.
         read_back: The value that the engine reports, or None where the engine does not know the
             variable (goals, counters).
     """
 
     variable: str
     requested: Any
-    applied: Value
+    applied: Value | None
     read_back: Value | None
 
 
@@ -54,6 +55,9 @@ class Audit:
     def __str__(self) -> str:
         lines = []
         for name, entry in self.targets.items():
+            if entry.applied is None:
+                lines.append(f"{name}: {entry.requested!r} at every step")
+                continue
             engine = "" if entry.read_back is None else f", engine reports {_show(entry.read_back)}"
             lines.append(f"{name} = {_show(entry.applied)}{engine}")
         for title, changes in (("follows", self.followed), ("engine", self.engine)):

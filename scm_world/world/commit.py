@@ -13,9 +13,10 @@ from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, Infeasible, InterventionError
 from scm_world.graph import flatten
 from scm_world.scene import Difference, PhysicalState, Structure
-from scm_world.scene.feasibility import TOLERANCE, Overlap, overlaps
-from scm_world.variables import Hard
+from scm_world.scene.feasibility import TOLERANCE, Overlap, buried_goals, overlaps
+from scm_world.variables import Draw, Hard
 from scm_world.variables.checks import coerce
+from scm_world.variables.kinds import SpaceName
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.compare import same
 from scm_world.world.declaration import Declaration
@@ -29,6 +30,8 @@ _MOVES = ("size", "height", "position", "orientation")
 """Parameters that change where the surfaces of bodies are."""
 _PLACES = ("m", "rad", "1")
 """Units of states that do so: positions, angles and quaternions, not velocities."""
+ATTEMPTS = 1000
+"""How often is drawn; one in sixty draws of the joints from A leaves all fingers apart."""
 
 
 def difference(world: World, proposal: Proposal) -> Difference:
@@ -76,28 +79,68 @@ def _new_overlaps(
     return [o for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
 
 
-def refuse_overlaps(
-    world: World,
-    instant: Instant,
-    proposal: Proposal,
-    change: Difference,
-    request: Mapping[str, Any],
-) -> None:
-    """Refuse an intervention that puts two bodies in one place.
+def feasible(
+    world: World, instant: Instant, request: Mapping[str, Any], space: SpaceName | None
+) -> tuple[Proposal, Difference]:
+    """Work out an intervention that does not put two bodies in one place.
 
-    Bodies that intersect already (a block that is being squeezed) may go on doing so.
+    Bodies that intersect already (a block that is being squeezed) may go on doing so. What is
+    drawn is drawn again until the world can be like that: from the feasible part of its space.
 
     Raises:
-        Infeasible: With the bodies, the depths, and the nearest value that is feasible.
+        InterventionError: See ``propose``.
+        Infeasible: With the bodies, the depths, and the nearest value that is feasible; or no
+            draw was.
+    """
+    draws = any(isinstance(act, Draw) for act in flatten(request).values())
+    for attempt in range(ATTEMPTS if draws else 1):
+        proposal = propose(world, instant, request, space, attempt=attempt)
+        change = difference(world, proposal)
+        problems = _new_overlaps(world, instant, proposal, change)
+        if draws and not problems:
+            problems = _buried(proposal, flatten(request))
+        if not problems:
+            return proposal, change
+    raise _refusal(world, instant, proposal, problems, request)
+
+
+def _buried(proposal: Proposal, request: Mapping[str, Any]) -> list[Overlap]:
+    """List goals that were drawn into an obstacle. Where they are put by hand, they may be."""
+    declaration = proposal.declaration
+    if not declaration.composition.obstacles:
+        return []
+    targets = [declaration.model.target(n) for n, act in request.items() if isinstance(act, Draw)]
+    moved = {*targets, *declaration.static_order(targets)}
+    scene = declaration.describe(proposal.static, proposal.state)
+    return list(buried_goals(scene, {name.partition(".")[0] for name in moved}))
+
+
+def refuse_overlaps(
+    world: World, instant: Instant, proposal: Proposal, change: Difference, name: str
+) -> None:
+    """Refuse what nature drew where it puts two bodies in one place.
+
+    Raises:
+        Infeasible: With the bodies and the depths.
     """
     problems = _new_overlaps(world, instant, proposal, change)
     if problems:
-        flat = flatten(request)
-        bodies = {body for problem in problems for body in problem.bodies}
-        name = _culprit(proposal.declaration, flat, bodies)
-        found = nearest_feasible(world, instant, request)
-        nearest = None if found is None else found[name]
-        raise Infeasible(name, flat[name], [str(p) for p in problems], nearest)
+        raise _refusal(world, instant, proposal, problems, {name: Draw("A")})
+
+
+def _refusal(
+    world: World,
+    instant: Instant,
+    proposal: Proposal,
+    problems: list[Overlap],
+    request: Mapping[str, Any],
+) -> Infeasible:
+    flat = flatten(request)
+    name = _culprit(proposal.declaration, flat, {body for p in problems for body in p.bodies})
+    found = nearest_feasible(world, instant, request)
+    return Infeasible(
+        name, flat[name], [str(p) for p in problems], None if found is None else found[name]
+    )
 
 
 def _culprit(world: Declaration, names: Iterable[str], bodies: Iterable[str]) -> str:
@@ -232,12 +275,12 @@ def _inertia(world: World, change: Difference) -> dict[str, Value]:
     return {f"{body}.inertia": world.backend.inertia(body) for body in sorted(bodies)}
 
 
-def _outcome(world: World, proposal: Proposal, target: str) -> tuple[Value, Value | None]:
-    """Give the value that a target has now, and what the engine says it is."""
+def _outcome(world: World, proposal: Proposal, target: str) -> tuple[Value | None, Value | None]:
+    """Give the value that a target has now, and what the engine says it is; None if unknown."""
     now, state = world.current()
     if target == "action":
         act = proposal.requests[target][1]
-        return (np.array(act.value) if isinstance(act, Hard) else np.full(9, np.nan)), None
+        return (np.array(act.value) if isinstance(act, Hard) else None), None
     applied = np.array(now[target])
     if target == CONTROL_INDEX:
         return applied, np.asarray(world.index)
@@ -261,7 +304,7 @@ def _report(
     entries = {}
     for name in proposal.asked:
         applied, back = _outcome(world, proposal, world.model.target(name))
-        if name != world.model.target(name):
+        if applied is not None and name != world.model.target(name):
             exact = back is not None and same(back, applied)
             applied = world.in_coordinates(name, applied)
             if back is not None:

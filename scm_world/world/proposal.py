@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -109,9 +109,21 @@ def _accept(instant: Instant, name: str, value: Any) -> Intervention:
 
 
 def propose(
-    world: World, instant: Instant, request: Mapping[str, Any], space: SpaceName | None
+    world: World,
+    instant: Instant,
+    request: Mapping[str, Any],
+    space: SpaceName | None,
+    *,
+    attempt: int = 0,
 ) -> Proposal:
     """Work out an intervention without touching the world.
+
+    Args:
+        world: That is asked.
+        instant: From where.
+        request: The intervention.
+        space: Every target has to lie in, if any.
+        attempt: How many draws were rejected before.
 
     Raises:
         InterventionError: With every problem of the request.
@@ -119,7 +131,7 @@ def propose(
     """
     if space not in (None, *SPACES):
         raise UnknownOption("space", space, SPACES)
-    moment = world.moment(instant.index)
+    moment = replace(world.moment(instant.index), attempt=attempt)
     instant = restructured(world.family, instant, request, moment)
     accepted, problems = accept(instant, request)
     requests: Requests = {**instant.requests, **accepted}
@@ -311,10 +323,8 @@ class _Draft:
         context = self._context()
         for target, (name, act) in accepted.items():
             requested = self._world.model.declared(name)
-            value = self._held_action(act) if target == "action" else None
             try:
-                if value is None:
-                    value = self._coordinates(target, name)
+                value = self._held(act) if target == "action" else self._coordinates(target, name)
                 check_space(requested, value, space, context)
             except InterventionError as problem:
                 problems.append(problem)
@@ -323,8 +333,14 @@ class _Draft:
     def _context(self) -> Values:
         return {**self.static, **self._world.states(self.state)}
 
-    def _held_action(self, act: Intervention) -> Value:
-        return np.array(act.value) if isinstance(act, Hard) else np.full(9, np.nan)
+    def _held(self, act: Intervention) -> Value:
+        if isinstance(act, Hard):
+            return np.array(act.value)
+        raise InterventionError(
+            f"do(action): {act!r} is another action at every step, so it cannot be held against a "
+            "space; leave out `space`, or give one action as nine numbers",
+            variable="action",
+        )
 
     def frozen(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:
         """Replace a draw, or a change of a state, by the value that came out."""

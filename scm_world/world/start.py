@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scm_world._types import Value, Values
+from scm_world.backends import BACKENDS, Backend, make_backend
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.scene import PhysicalState
 from scm_world.scene.feasibility import TOLERANCE, overlaps
+from scm_world.tasks import TASKS, Task, make_task
 from scm_world.variables import Measured
 from scm_world.variables.checks import check_bounds
 
@@ -71,6 +73,33 @@ def refuse_impossible(declaration: Declaration) -> None:
     if problems:
         advice = f"choose other arguments of the task {declaration.task.name!r}"
         raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
+
+
+def the_task(task: Any) -> Task:
+    """Take a task, or make the one of a name.
+
+    Raises:
+        UnknownOption: There is none of this name, or it is neither.
+    """
+    if isinstance(task, Task):
+        return task
+    if isinstance(task, str):
+        return make_task(task)
+    made = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
+    raise UnknownOption("task", task, (*TASKS, f"a task that is made, such as {made}"))
+
+
+def the_backend(backend: Any) -> Backend:
+    """Take a backend, or make the one of a name.
+
+    Raises:
+        UnknownOption: There is none of this name, or it is neither.
+    """
+    if isinstance(backend, Backend):
+        return backend
+    if isinstance(backend, str):
+        return make_backend(backend)
+    raise UnknownOption("backend", backend, (*BACKENDS, "a backend that is made"))
 
 
 def whole_number(option: str, value: Any, *, least: int) -> int:

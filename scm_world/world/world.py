@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.backends import Backend, make_backend
+from scm_world.backends import Backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX, cameras
 from scm_world.errors import NotReset, SnapshotMismatch, UnknownOption
@@ -17,20 +17,20 @@ from scm_world.graph import SCM, Moment
 from scm_world.scene import PhysicalState, Scene
 from scm_world.scene.camera import Camera
 from scm_world.scene.kinematics import inverse_kernel
-from scm_world.tasks import Task, make_task
-from scm_world.variables import Draw, Noise
+from scm_world.tasks import Task
+from scm_world.variables import Noise
 from scm_world.variables.catalogue import PRESET
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world.audit import Audit
 from scm_world.world.commands import clipped, disturbed
-from scm_world.world.commit import commit, difference, refuse_overlaps
+from scm_world.world.commit import commit, difference, feasible, refuse_overlaps
 from scm_world.world.declaration import Declaration, Options
 from scm_world.world.declared import Declared
 from scm_world.world.family import Family
-from scm_world.world.proposal import Instant, Proposal, propose
+from scm_world.world.proposal import Instant, Proposal
 from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
-from scm_world.world.start import beginning, whole_number
+from scm_world.world.start import beginning, the_backend, the_task, whole_number
 
 
 @final
@@ -85,11 +85,11 @@ class World(Declared):
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        self.family = Family(make_task(task) if isinstance(task, str) else task, self.options)
+        self.family = Family(the_task(task), self.options)
         self._mode = self.options.mode
         self._by_tips = action_mode == "end_effector_positions"
         self._action_unit = ACTIONS[action_mode][0]
-        self.backend = make_backend(backend) if isinstance(backend, str) else backend
+        self.backend = the_backend(backend)
         self._started = False
         self.noise, self.episode = Noise(0), 0
         self.version = 0  # counts changes of anything but what physics moves
@@ -213,7 +213,7 @@ class World(Declared):
         model = declaration.model
         drawn = Proposal(declaration, model, static, state, 0, {}, declaration.random[:1])
         change = difference(self, drawn)
-        refuse_overlaps(self, self._present(), drawn, change, {declaration.random[0]: Draw("A")})
+        refuse_overlaps(self, self._present(), drawn, change, declaration.random[0])
         if change:
             self.backend.apply(change)
         self.adopt(declaration, model, static, 0)
@@ -285,9 +285,7 @@ class World(Declared):
         self._require_episode()
         instant = self._instant or self._present()
         space = self.variables_space if space is None else space
-        proposal = propose(self, instant, request, space)
-        change = difference(self, proposal)
-        refuse_overlaps(self, instant, proposal, change, request)
+        proposal, change = feasible(self, instant, request, space)
         audit, self._instant = commit(self, instant, proposal, change, request)
         if instant.at_start:
             self._readouts.forget()
