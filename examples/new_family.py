@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from scm_world.entities import (
     goal_position,
 )
 from scm_world.scene import trifinger
-from scm_world.tasks import Building
+from scm_world.tasks import Building, Common
 from scm_world.variables import Exogenous, Function, Integers, Variable
 
 LEVELS, SIZE = "pyramid_levels", "block.size"
@@ -50,8 +50,8 @@ class Pyramid(Building):
     goal_causes = (LEVELS,)  # … and what a new goal is drawn for
     rest = trifinger.RAISED  # the fingers begin out of the way
 
-    def __init__(self, levels: int = 2) -> None:
-        super().__init__()
+    def __init__(self, *, levels: int = 2, **common: Unpack[Common]) -> None:
+        super().__init__(**common)  # weights, terms of one's own, where the robot begins
         self._levels = levels
 
     def arrange(self, values: dict[str, np.ndarray]) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from scm_world.errors import ConflictingTargets
+from scm_world.errors import ConflictingTargets, UnknownOption
 
 _HINT = "'NAME=VALUE...'"
 
@@ -52,8 +52,6 @@ def parse_value(text: str, hint: str = _HINT) -> Any:
         >>> parse_value("0.05"), parse_value("[0, 0, -5]"), parse_value("shift:0.1")
         (0.05, [0, 0, -5], Shift(kind='shift', by=0.1))
     """
-    from pydantic import ValidationError
-
     from scm_world.variables import Draw, Scale, Shift
 
     if not text.strip():
@@ -69,7 +67,7 @@ def parse_value(text: str, hint: str = _HINT) -> Any:
                 return Scale(_numbers(rest))
             case "draw":
                 return Draw(rest.strip())
-    except ValidationError:
+    except UnknownOption:
         wanted = "draw:A, draw:B or draw:A|B" if kind.strip().lower() == "draw" else "numbers"
         raise _refuse(text, f"expected {wanted}", hint) from None
     raise _refuse(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)

@@ -233,7 +233,7 @@ def lay_out(
     layers = _order(level, chains.values(), near)
     y = _heights(layers, near, top, bottom) if layers else {}
     gap = width / max(len(layers), 1)
-    box = (min(170.0, 0.72 * gap), 32.0)
+    box = (min(170.0, 0.72 * gap), 30.0)
     places = {item: (gap * (n + 0.5), y[item]) for n, layer in enumerate(layers) for item in layer}
     shown = {n: _first(model, families, n) for n in graph}
     return Drawing(

@@ -58,7 +58,7 @@ CONTROLLER = (
         numbers.TORQUE_BOUNDS,
         (numbers.TORQUE_A, numbers.TORQUE_B),
         _SPEC.limit,
-        "Largest torque of a joint.",
+        "Largest torque of a joint. Torques that are commanded end at 0.36 N m whatever it is.",
     ),
 )
 """The joint controller: name, unit, bounds, spaces A and B, default, sentence."""

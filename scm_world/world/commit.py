@@ -101,7 +101,8 @@ def feasible(
             problems = _buried(proposal, flatten(request))
         if not problems:
             return proposal, change
-    raise _refusal(world, instant, proposal, problems, request)
+    tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
+    raise _refusal(world, instant, proposal, problems, request, tried)
 
 
 def _buried(proposal: Proposal, request: Mapping[str, Any]) -> list[Overlap]:
@@ -134,13 +135,13 @@ def _refusal(
     proposal: Proposal,
     problems: list[Overlap],
     request: Mapping[str, Any],
+    tried: str = "",
 ) -> Infeasible:
     flat = flatten(request)
     name = _culprit(proposal.declaration, flat, {body for p in problems for body in p.bodies})
     found = nearest_feasible(world, instant, request)
-    return Infeasible(
-        name, flat[name], [str(p) for p in problems], None if found is None else found[name]
-    )
+    nearest = None if found is None else found[name]
+    return Infeasible(name, flat[name], [tried + str(p) for p in problems], nearest)
 
 
 def _culprit(world: Declaration, names: Iterable[str], bodies: Iterable[str]) -> str:

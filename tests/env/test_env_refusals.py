@@ -21,6 +21,7 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.scene.camera import OVERVIEW, Camera
+from scm_world.tasks.rewards import term
 
 
 @pytest.mark.parametrize(
@@ -89,8 +90,6 @@ def test_there_is_nothing_before_the_first_episode_and_after_the_end(backend: st
         ("Pushing", {"tool_block_position": [0.1, 0.1, 9]}, "0.5"),
         ("Pushing", {"joint_positions": [9] * 9}, "joint_positions"),
         ("Pushing", {"tool_block_position": [0.24, 0.24, 0.0325]}, "deep in 'stage'"),
-        ("Reaching", {"default_goal_60": [9, 9, 9]}, "goal_60"),
-        ("Reaching", {"default_goal_60": [9, 9]}, "shape"),
         ("Stacking2", {"tool_block_2_position": [0, 0]}, "deep in 'tool_block_2'"),
     ],
 )
@@ -154,3 +153,23 @@ def test_compute_reward_warns_of_dense_terms() -> None:
     sparse = make(goal_env=True, task_options={"weights": "sparse"})
     sparse.reset(seed=0)
     sparse.unwrapped.compute_reward(*goals, info)
+
+
+def test_a_term_that_is_no_number_is_refused() -> None:
+    """At the reset, and where it becomes none in mid-episode, with its name."""
+    for function in (np.cumsum, lambda _: float("nan")):
+        own = term("reward.x", function, ("goal_block.polar",), "x")
+        env = make(task_options={"terms": [own], "weights": {"reward.x": 1.0}})
+        with pytest.raises(ModelError, match=r"reward\.x"):
+            env.reset(seed=0)
+    late = term("reward.x", lambda t: np.log(0.05 - float(t)), ("control_index",), "x")
+    env = make(task_options={"terms": [late], "weights": {"reward.x": 1.0}})
+    env.reset(seed=0)
+    with pytest.raises(ModelError, match=r"reward\.x"), np.errstate(invalid="ignore"):
+        env.step(np.zeros(9, np.float32))
+
+
+def test_relative_actions_are_listed_too() -> None:
+    """Where an action mode is unknown."""
+    with pytest.raises(UnknownOption, match="delta_joint_positions"):
+        make(action_mode="torque")

@@ -10,6 +10,7 @@ from envs import PUSHING, REACHING, make
 from scm_world import Draw
 from scm_world.env.start import asked, merged
 from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
+from scm_world.scene.feasibility import TOLERANCE, overlaps
 from scm_world.tasks import Pushing
 from scm_world.world import World
 
@@ -73,8 +74,22 @@ def test_interventions_stay_in_the_space_that_is_asked_for() -> None:
         env.unwrapped.do({"tool_block.mass": 0.09})
 
 
-def test_impossible_draws_are_drawn_again_if_asked_for() -> None:
+def test_draws_leave_bodies_apart() -> None:
+    """Whatever is drawn, is drawn again until it is possible, and the same for the same seed."""
+    env = make(start={"joint_positions": "A", "tool_block.cylindrical_position": "A|B"})
+    first, _ = env.reset(seed=3)
+    for seed in range(20):
+        env.reset(seed=seed)
+        assert overlaps(env.unwrapped.world.scene(), tolerance=TOLERANCE) == ()
+    again, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(first, again)
+
+
+def test_impossible_draws_are_followed_by_another_episode_if_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """With attempts an impossible draw is followed by the next episode; without it is an error."""
+    monkeypatch.setattr("scm_world.world.commit.ATTEMPTS", 1)
     start = {"tool_block.cylindrical_position": "B"}
     once, often = make(start=start), make(start=start, attempts=20)
     episodes = []

@@ -279,3 +279,13 @@ def test_overlap_of_one_within_the_other() -> None:
     expected = pytest.approx(small.volume, rel=1e-12)
     assert hull_overlap(small, away, turned, big, HERE, UPRIGHT) == expected
     assert hull_overlap(big, HERE, UPRIGHT, small, away, turned) == expected
+
+
+def test_the_pose_of_the_points_is_kept() -> None:
+    """Turned by the axes and moved, the corners are those that were given."""
+    points = np.array([[0.0, 0.0, 0.0], [0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.4]])
+    hull = hull_of(points)
+    turned = np.array(hull.vertices) @ rotation_matrix(hull.axes).T
+    order = [int(np.argmin(np.linalg.norm(points - points.mean(0) - v, axis=1))) for v in turned]
+    np.testing.assert_allclose(turned, points[order] - points.mean(0), atol=1e-12)
+    assert sorted(order) == [0, 1, 2, 3]

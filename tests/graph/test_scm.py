@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from scm_world.errors import (
     ConflictingTargets,
+    InterventionError,
     ModelError,
     NotFinite,
     NotIntervenable,
@@ -239,7 +240,7 @@ def test_nested_requests_are_dotted_ones() -> None:
         ({"count": 0.5}, WrongType),
         ({"readout": 1.0}, NotIntervenable),
         ({"kind": 1.0}, NotIntervenable),
-        ({"friction": Draw("A")}, NotIntervenable),
+        ({"friction": Draw("A")}, InterventionError),
     ],
     ids=repr,
 )

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 
-from scm_world.errors import UnknownOption
+from scm_world.errors import Infeasible, InterventionError, ModelError, UnknownOption
+from scm_world.geometry import rotation_matrix
+from scm_world.scene.feasibility import buried_goals
 from scm_world.tasks import TASKS, term
+from scm_world.variables import Box, Draw, Function, Measured
+from scm_world.variables.kinds import SpaceName
+from scm_world.world import World
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -81,3 +89,83 @@ def test_obstacles_are_counted_in_whole_numbers(count: object) -> None:
     """As many as there are places for."""
     with pytest.raises(UnknownOption, match="number_of_obstacles"):
         TASKS["reaching"](number_of_obstacles=count)  # type: ignore[call-arg] # that is the point
+
+
+def test_an_unknown_argument_is_answered_with_all_there_are() -> None:
+    """Those of the family and those of every task, with the nearest name."""
+    with pytest.raises(UnknownOption, match="did you mean 'tool_block_mass'") as refused:
+        TASKS["pushing"](tool_mass=0.1)  # type: ignore[call-arg] # that is the point
+    assert {"tool_block_position", "shape", "weights", "terms"} <= {*refused.value.choices}
+
+
+@pytest.mark.parametrize("goal", ["x", [9, 9, 9], [0.0, 0.1]], ids=repr)
+def test_a_goal_that_cannot_be_is_refused_by_its_name(goal: Any) -> None:
+    """When the task is made."""
+    with pytest.raises(UnknownOption, match="default_goal_60"):
+        TASKS["reaching"](default_goal_60=goal)  # type: ignore[call-arg] # that is the point
+
+
+def test_a_shape_is_a_hull() -> None:
+    """A path is none: it has to be read."""
+    with pytest.raises(ModelError, match="load_hull"):
+        TASKS["pushing"](shape="cube.obj")  # type: ignore[call-arg] # that is the point
+
+
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        ("reward.x", "Measured"),
+        (Measured(name="bonus", mechanism=Function(np.sum)), "begins with 'reward.'"),
+        (Measured(name="reward.orientation", mechanism=Function(np.sum)), "new name"),
+        (Measured(name="reward.x"), "with a mechanism"),
+        (Measured(name="reward.x", shape=(2,), mechanism=Function(np.sum)), "of shape"),
+    ],
+    ids=["text", "prefix", "taken", "bare", "vector"],
+)
+def test_a_term_of_ones_own_is_a_number_with_a_name(term: Any, words: str) -> None:
+    """Anything else is refused when the task is made."""
+    with pytest.raises(UnknownOption, match=words):
+        TASKS["pushing"](terms=[term])  # type: ignore[call-arg] # that is the point
+
+
+def test_a_wall_of_no_blocks_is_one_problem() -> None:
+    """The wall stays as it was."""
+    world = World("stacked_blocks", backend="fake")
+    world.reset(seed=0)
+    before = world["wall.layout"]
+    with pytest.raises(InterventionError, match="at least one block"):
+        world.do({"wall.layout": np.zeros_like(before)})
+    np.testing.assert_array_equal(world["wall.layout"], before)
+
+
+@pytest.mark.parametrize("task", ["pushing", "picking", "pick_and_place", "stacking2", "towers"])
+@pytest.mark.parametrize("space", ["A", "B"])
+def test_a_random_goal_can_be_fulfilled(task: str, space: SpaceName) -> None:
+    """Fingers that would be in the way make room, and no goal lies in an obstacle."""
+    world = World(task, backend="fake")
+    for seed in range(3 if task == "towers" else 15):
+        world.reset(seed=seed, do=world.task.sample_goal(space))
+        world.do(world.task.solution(world.values()))
+        assert world["fractional_success"] > 0.99
+
+
+def test_goals_are_drawn_outside_of_obstacles() -> None:
+    """By hand they may be put anywhere; what is drawn can be filled."""
+    world = World(TASKS["pick_and_place"](), backend="fake")
+    world.reset(seed=0, do={"goal_block.cartesian_position": [0.0, 0.0, 0.0325]})
+    inside = Draw(Box((0.0, 0.0), (0.15, 1.5)))
+    for seed in range(30):
+        world.reset(seed=seed, do={"goal_block.polar": inside})
+        assert buried_goals(world.scene(), {"goal_block"}) == ()
+    with pytest.raises(Infeasible, match="none of 1,000 draws"):
+        world.reset(seed=0, do={"goal_block.polar": Draw(Box((0.0, 0.0), (0.001, 0.0)))})
+
+
+def test_a_tilted_goal_rests_on_the_floor() -> None:
+    """A box on its edge is higher than one on its side."""
+    world = World("pushing", backend="fake")
+    world.reset(seed=0, do={"goal_block.euler_orientation": [np.pi / 4, 0.0, 0.3]})
+    height = world["goal_block.cartesian_position"][2]
+    turned = rotation_matrix(world["goal_block.orientation"])[2]
+    assert height == pytest.approx(0.0325 * np.abs(turned).sum())
+    assert height > 0.04

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 from worlds import PARAMS, REST, actions, begin, play, same, shared
 
-from scm_world.errors import ActionError, MissingEngine, UnknownOption, UnknownVariable
+from scm_world.errors import (
+    ActionError,
+    InterventionError,
+    MissingEngine,
+    UnknownOption,
+    UnknownVariable,
+    WrongType,
+)
 from scm_world.scene.kinematics import forward
+from scm_world.tasks import Pushing
+from scm_world.variables import Box, Draw, Hard, Scale, Shift
 from scm_world.world import World
 
 
@@ -195,3 +204,53 @@ def test_a_step_of_one_world_is_seen_by_evaluate() -> None:
         assert quick["reward"] == values["reward"]
         name = "tool_block.cylindrical_position"
         np.testing.assert_array_equal(quick[name], values[name])
+
+
+def test_actions_that_are_changed_at_every_step_have_no_value_yet() -> None:
+    """The audit says so, and no space can be asked for."""
+    world = begin("fake", "pushing")
+    audit = world.do({"action": Shift(0.1)})
+    assert audit.targets["action"].applied is None
+    assert "at every step" in str(audit)
+    with pytest.raises(InterventionError, match="another action at every step"):
+        world.do({"action": Shift(0.1)}, space="A")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"backend": 123}, "backend cannot be 123"),
+        ({"task": Pushing}, r"such as Pushing\(\)"),
+        ({"task": None}, "task cannot be None"),
+    ],
+    ids=repr,
+)
+def test_what_is_no_task_and_no_backend_is_refused(options: dict[str, Any], words: str) -> None:
+    """With what there is."""
+    with pytest.raises(UnknownOption, match=words):
+        World(**{"backend": "fake", **options})
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Draw("C"),
+        lambda: Draw(3),
+        lambda: Shift("a"),
+        lambda: Scale([1.0, "b"]),
+        lambda: Hard([[1.0], [1.0, 2.0]]),
+    ],
+)
+def test_what_is_no_intervention_is_refused_at_once(make: Any) -> None:
+    """With what it can be."""
+    with pytest.raises(UnknownOption, match="it can be"):
+        make()
+
+
+def test_a_space_is_drawn_from_by_name_and_a_box_has_to_fit() -> None:
+    """The errors say how to draw, and that the numbers are too many."""
+    world = begin("fake", "pushing")
+    with pytest.raises(WrongType, match='Draw\\("A"\\)'):
+        world.do({"tool_block.mass": "A"})
+    with pytest.raises(InterventionError, match="does not fit its shape"):
+        world.do({"tool_block.mass": Draw(Box((0.0, 0.0), (1.0, 1.0)))})

@@ -57,7 +57,7 @@ REFUSED: list[tuple[dict[Any, Any], type[Exception]]] = [
     ({"reward": 1.0}, NotIntervenable),
     ({"joint_torques": [0.0] * 9}, NotIntervenable),
     ({"end_effector_positions": Draw("A")}, NotIntervenable),
-    ({"robot_height": Draw("A")}, NotIntervenable),
+    ({"joint_velocities": Draw("A")}, InterventionError),
     ({"floor_friction": 0.4, "stage": {"friction": 1}, "gravity": 1.0}, SeveralProblems),
     ({"joint_positions": np.tile([0.0, 0.0, 0.0], 3), "robot_height": 0.2}, Infeasible),
 ]

@@ -242,8 +242,8 @@ def test_the_asked_space_is_checked() -> None:
             world.do({name: value}, space=space)
         assert caught.value.space == space
         world.do({name: caught.value.nearest}, space=space)
-    for name in ("robot_height", "action", "tool_block.friction"):
-        value = np.zeros(9) if name == "action" else 0.35
+    for name in ("joint_velocities", "action"):
+        value = np.zeros(9)
         with pytest.raises(OutOfSpace, match="none is declared"):
             world.do({name: value}, space="A")
 

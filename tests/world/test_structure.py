@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from worlds import PARAMS, actions, begin, play, same, shared
 
-from scm_world.errors import InterventionError, NotIntervenable, UnknownVariable
+from scm_world.errors import InterventionError, UnknownVariable
 from scm_world.tasks import Reaching
 from scm_world.variables import Box, Derived, Draw, Exogenous, Normal, Shift, Variable
 from scm_world.world import World
@@ -172,8 +172,8 @@ def test_a_draw_needs_a_space() -> None:
     """What has no space cannot be drawn from it."""
     world = shared("fake", "reaching")
     world.reset(seed=0)
-    with pytest.raises(NotIntervenable, match="no space"):
-        world.do({"obstacle_places": Draw("A"), "robot_height": Draw("A")})
+    with pytest.raises(InterventionError, match="no space A to draw from"):
+        world.do({"obstacle_places": Draw("A"), "joint_velocities": Draw("A")})
 
 
 def test_what_is_partly_impossible_is_refused_as_a_whole() -> None:
