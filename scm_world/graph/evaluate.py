@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, WrongShape
 from scm_world.variables import (
     SOFT,
     Derived,
@@ -20,7 +20,9 @@ from scm_world.variables import (
     Hard,
     Intervention,
     Measured,
+    Mechanism,
     Noise,
+    Parent,
     Shift,
     Variable,
 )
@@ -133,6 +135,8 @@ class Evaluator:
         """Compute a variable from the values so far, under an intervention or none."""
         if act is None:
             return self._natural(self._declared[name], values, previous, moment)
+        if isinstance(act.intervention, Mechanism):
+            return self._followed(name, act, act.intervention, values, previous)
         if not isinstance(act.intervention, SOFT):
             return self.forced(name, act, values, moment)
         natural = self._natural(self._declared[name], values, previous, moment)
@@ -146,6 +150,23 @@ class Evaluator:
         if requested.name == name:
             return np.asarray(moved)
         return np.asarray(self._bound(requested, inverse=True)(moved))
+
+    def _followed(
+        self, name: str, act: Act, given: Mechanism, values: Values, previous: Values
+    ) -> Value:
+        """Compute what another mechanism makes of a variable."""
+        requested = act.requested
+        value = np.asarray(given.function.bind()(*self._arguments(given.parents, values, previous)))
+        if value.shape[value.ndim - len(requested.shape) :] != requested.shape:
+            try:
+                value = requested.array(value)
+            except (TypeError, ValueError):
+                raise WrongShape(name, given, requested.shape, value.shape) from None
+        if requested.dtype != "real":
+            value = np.rint(value).astype(np.int64)
+        if requested.name == name:
+            return value
+        return np.asarray(self._bound(requested, inverse=True)(value))
 
     def _natural(
         self, variable: Variable, values: Values, previous: Values, moment: Moment | None
@@ -162,7 +183,7 @@ class Evaluator:
             case Derived():
                 return self._derive(variable, values, previous, moment)
             case Measured() if variable.mechanism is not None:
-                arguments = self._arguments(variable, values, previous)
+                arguments = self._arguments(variable.all_parents, values, previous)
                 return np.asarray(self._bound(variable)(*arguments))
             case _:
                 if variable.name not in values:
@@ -174,7 +195,7 @@ class Evaluator:
     def _derive(
         self, variable: Derived, values: Values, previous: Values, moment: Moment | None
     ) -> Value:
-        arguments = self._arguments(variable, values, previous)
+        arguments = self._arguments(variable.all_parents, values, previous)
         if variable.noise is None:
             return np.asarray(self._bound(variable)(*arguments))
         noise: Value = np.zeros(variable.shape)
@@ -182,10 +203,12 @@ class Evaluator:
             noise = moment.nature(variable.noise, variable.name, variable.shape, values)
         return np.asarray(self._bound(variable)(*arguments, noise=noise))
 
-    def _arguments(self, variable: Variable, values: Values, previous: Values) -> list[Value]:
+    def _arguments(
+        self, parents: Iterable[Parent], values: Values, previous: Values
+    ) -> list[Value]:
         return [
             values[parent.name] if parent.lag == 0 else self._lagged(parent.name, previous)
-            for parent in variable.all_parents
+            for parent in parents
         ]
 
     def _lagged(self, name: str, previous: Values) -> Value:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import networkx as nx
@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from scm_world.errors import InterventionError, ModelError
 from scm_world.graph.scm import SCM
 from scm_world.graph.views import summary
-from scm_world.variables import AnyVariable, Function, Intervention, Variable
+from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
 
 FORMAT = "scm_world/model/1"
 PACKAGE = "scm_world"
@@ -34,7 +34,12 @@ def _plain(data: Any) -> Any:
     return data
 
 
-def _functions(variables: Iterable[Variable]) -> Iterator[tuple[str, Function]]:
+def _functions(
+    variables: Iterable[Variable], held: Mapping[str, Intervention]
+) -> Iterator[tuple[str, Function]]:
+    for name, act in held.items():
+        if isinstance(act, Mechanism) and isinstance(act.function, Function):
+            yield name, act.function
     for variable in variables:
         for field in ("mechanism", "inverse", "start", "carry"):
             mechanism = getattr(variable, field, None)
@@ -46,19 +51,21 @@ def _check_portable(model: SCM) -> None:
     problems = [
         f"{name!r} has the function {function.reference!r}, which cannot be found "
         "under this name; define it at the top level of a module"
-        for name, function in _functions(model.variables)
+        for name, function in _functions(model.variables, model.interventions)
         if not function.is_portable()
     ]
     if problems:
         raise ModelError(problems)
 
 
-def _check_trusted(variables: Iterable[Variable], trusted: tuple[str, ...]) -> None:
+def _check_trusted(
+    variables: Iterable[Variable], held: Mapping[str, Intervention], trusted: tuple[str, ...]
+) -> None:
     """Refuse functions from elsewhere before anything of theirs is imported."""
     problems = [
         f"{name!r} has the function {function.reference!r}, which lies outside the trusted "
         f"packages {', '.join(trusted)}; pass trusted=(…) to read it"
-        for name, function in _functions(variables)
+        for name, function in _functions(variables, held)
         if not function.is_defined_in(trusted)
     ]
     if problems:
@@ -101,7 +108,7 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         ) from None
     except (TypeError, KeyError) as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
-    _check_trusted(variables, (PACKAGE, *trusted))
+    _check_trusted(variables, held, (PACKAGE, *trusted))
     model = SCM(variables)
     try:
         return model.hold(held)

@@ -17,22 +17,21 @@ from scm_world.errors import (
     UnknownVariable,
     raise_all,
 )
+from scm_world.graph.acceptance import accepted, adds_edges, settable_causes
 from scm_world.graph.evaluate import Act, Evaluator, Moment, source_of
 from scm_world.graph.structure import Edge, Structure, checked
 from scm_world.variables import (
     SOFT,
     Derived,
-    Draw,
     Exogenous,
     Fixed,
     Hard,
     Intervention,
+    Mechanism,
+    Natural,
     Noise,
-    Scale,
-    Shift,
     Variable,
 )
-from scm_world.variables.checks import check_bounds, check_draw, coerce
 
 
 def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
@@ -131,6 +130,11 @@ class SCM:
                 **spaces,
             )
         default = tuple([0.0] * int(np.prod(variable.shape))) if variable.shape else 0.0
+        if isinstance(act.intervention, Mechanism):
+            given = act.intervention
+            return Derived(
+                name=name, parents=given.parents, mechanism=given.function, **common, **spaces
+            )
         source = source_of(act)
         return Exogenous(name=name, default=default, distribution=source, **common, **spaces)
 
@@ -216,7 +220,7 @@ class SCM:
 
         Raises:
             InterventionError: With every problem of the request.
-            ModelError: A draw from a space that follows other variables closes a cycle.
+            ModelError: A mechanism, or a draw from a space that follows others, closes a cycle.
         """
         return self._do(request, any_variable=False)
 
@@ -228,12 +232,12 @@ class SCM:
         return self._do(request, any_variable=True)
 
     def _do(self, request: Mapping[str, Any], *, any_variable: bool) -> SCM:
-        accepted: dict[str, Intervention] = {}
+        wanted: dict[str, Intervention] = {}
         problems: list[InterventionError] = []
         targets: dict[str, str] = {}
         for name, value in flatten(request).items():
             try:
-                accepted[name] = self.accept(name, value, any_variable=any_variable)
+                wanted[name] = self.accept(name, value, any_variable=any_variable)
                 target = self.target(name)
                 if target in targets:
                     raise ConflictingTargets((targets[target], name), target)
@@ -241,34 +245,33 @@ class SCM:
             except InterventionError as problem:
                 problems.append(problem)
         raise_all(problems)
-        return self.with_interventions(accepted)
+        return self.with_interventions(wanted)
 
-    def with_interventions(self, accepted: Mapping[str, Intervention]) -> SCM:
+    def with_interventions(self, acts: Mapping[str, Intervention]) -> SCM:
         """Apply interventions that have been checked already.
 
         Raises:
-            ModelError: Draws from spaces that follow other variables close a cycle.
+            ModelError: Draws from spaces that follow other variables, or mechanisms, close a cycle.
         """
         model = object.__new__(SCM)
         model._declared = self._declared
         model._evaluator = self._evaluator
         model._interventions = {**self._interventions}
         model._acts = {**self._acts}
-        for name, intervention in accepted.items():
+        for name, intervention in acts.items():
             target = self.target(name)
             replaced = model._acts.get(target)
             if replaced is not None:
                 model._interventions.pop(replaced.requested.name, None)
+            if isinstance(intervention, Natural):
+                model._acts.pop(target, None)
+                continue
             model._acts[target] = Act(intervention, self._declared[name])
             model._interventions[name] = intervention
-        model._structure = None if accepted else self._structure
-        # Cutting edges keeps every causal order valid; only a draw from a space whose bounds
-        # follow other variables adds edges.
-        draws = (a for a in model._acts.values() if isinstance(a.intervention, Draw))
-        if any(source_of(act).parents() for act in draws):
-            model._order = model.structure.order
-        else:
-            model._order = self._order
+        model._structure = None if acts else self._structure
+        # Cutting edges keeps every causal order valid.
+        adds = any(adds_edges(act) for act in model._acts.values())
+        model._order = model.structure.order if adds else self._order
         return model
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
@@ -281,44 +284,8 @@ class SCM:
         target = self.declared(self.target(name))
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
-            raise NotIntervenable(name, reason, self._settable_causes(target.name))
-        if isinstance(value, Draw):
-            check_draw(variable, value)
-            for parent in sorted(source_of(Act(value, variable)).parents()):
-                self.declared(parent)
-            return value
-        if isinstance(value, Shift | Scale):
-            coerce(variable, value.by) if np.ndim(value.by) else coerce(
-                variable, np.full(variable.shape, value.by)
-            )
-            return value
-        number = coerce(variable, self._plain(variable, value))
-        if variable.bounds is not None and not variable.bounds.parents():
-            check_bounds(variable, number, {})
-        return Hard(number.tolist())
-
-    @staticmethod
-    def _plain(variable: Variable, value: Any) -> Any:
-        """Take a value out of ``Hard``, which holds the numbers of a matrix in one row."""
-        if not isinstance(value, Hard):
-            return value
-        matrix = len(variable.shape) > 1 and np.size(value.value) == np.prod(variable.shape)
-        return np.reshape(value.value, variable.shape) if matrix else value.value
-
-    def _settable_causes(self, name: str) -> list[str]:
-        """Name the nearest causes that can be set, past others that cannot."""
-        found: dict[str, None] = {}
-        stack, seen = [name], {name}
-        while stack:
-            for parent in self._declared[stack.pop(0)].all_parents:
-                if parent.name in seen:
-                    continue
-                seen.add(parent.name)
-                if self._declared[parent.name].settable:
-                    found[parent.name] = None
-                else:
-                    stack.append(parent.name)
-        return list(found)
+            raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
+        return accepted(self._declared, variable, value)
 
     # --- solving ------------------------------------------------------------------------------
 

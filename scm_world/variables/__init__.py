@@ -1,7 +1,16 @@
 """Typed variables, their spaces, their noise, and what can be done to them."""
 
 from scm_world.variables.distributions import Cylinder, Distribution, Normal
-from scm_world.variables.interventions import SOFT, Draw, Hard, Intervention, Scale, Shift
+from scm_world.variables.interventions import (
+    SOFT,
+    Draw,
+    Hard,
+    Intervention,
+    Mechanism,
+    Natural,
+    Scale,
+    Shift,
+)
 from scm_world.variables.kinds import (
     Action,
     AnyVariable,
@@ -13,7 +22,7 @@ from scm_world.variables.kinds import (
     Variable,
     names,
 )
-from scm_world.variables.mechanisms import Function, Linear, Mechanism
+from scm_world.variables.mechanisms import Equation, Function, Linear
 from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import (
     Affine,
@@ -38,6 +47,7 @@ __all__ = [
     "Distribution",
     "Draw",
     "Either",
+    "Equation",
     "Exogenous",
     "Fixed",
     "Function",
@@ -47,6 +57,7 @@ __all__ = [
     "Linear",
     "Measured",
     "Mechanism",
+    "Natural",
     "Noise",
     "Normal",
     "Parent",

@@ -14,7 +14,8 @@ from pydantic import Field
 
 from scm_world.errors import UnknownOption
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.kinds import SPACES, AsMechanism, AsParents, Parent, SpaceName
+from scm_world.variables.mechanisms import Function, Linear
 from scm_world.variables.spaces import Frozen
 
 Number = float | tuple[float, ...]
@@ -86,7 +87,46 @@ class Draw(Frozen):
         super().__init__(source=source, **fields)  # type: ignore[call-arg]
 
 
-Intervention = Annotated[Hard | Shift | Scale | Draw, Field(discriminator="kind")]
+@final
+class Mechanism(Frozen):
+    """Give a variable another structural equation: it follows other variables than before.
+
+    A parameter may follow parameters (so that a color can cause a friction, which it does not by
+    default), a state is set to what the function gives at that instant, and an action follows
+    anything at every step: then the function is the policy.
+
+    Attributes:
+        function: Called with the values of the parents, in their order.
+        parents: The causes; the graph then has these edges in place of the others.
+
+    Example:
+        >>> tie = Mechanism(Function("numpy:mean"), ["floor_color"])
+        >>> tie.parents[0].name, tie.parents[0].lag
+        ('floor_color', 0)
+    """
+
+    kind: Literal["mechanism"] = "mechanism"
+    function: AsMechanism
+    parents: AsParents
+
+    def __init__(self, function: Any, parents: Any = (), **fields: Any) -> None:
+        named = (parents,) if isinstance(parents, str | Parent) else tuple(parents)
+        if not (callable(function) or isinstance(function, Function | Linear | dict)):
+            allowed = ("a function of the parents", "Function", "Linear")
+            raise UnknownOption("Mechanism(function)", function, allowed)
+        super().__init__(function=function, parents=named, **fields)  # type: ignore[call-arg]
+
+
+@final
+class Natural(Frozen):
+    """Hand a variable back to its own structural equation: no intervention holds it any more."""
+
+    kind: Literal["natural"] = "natural"
+
+
+Intervention = Annotated[
+    Hard | Shift | Scale | Draw | Mechanism | Natural, Field(discriminator="kind")
+]
 """Anything that ``do`` accepts, once a plain value has become ``Hard``."""
 
 SOFT = (Shift, Scale)

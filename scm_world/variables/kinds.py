@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.mechanisms import Function, Linear, Mechanism
+from scm_world.variables.mechanisms import Equation, Function, Linear
 from scm_world.variables.spaces import (
     Box,
     Categories,
@@ -41,7 +41,7 @@ def _as_mechanism(value: Any) -> Any:
 
 
 AsNumber = Annotated[Number, BeforeValidator(_as_number)]
-AsMechanism = Annotated[Mechanism, BeforeValidator(_as_mechanism)]
+AsMechanism = Annotated[Equation, BeforeValidator(_as_mechanism)]
 
 
 @final

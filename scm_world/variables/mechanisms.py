@@ -142,4 +142,4 @@ class Linear(Frozen):
         return True
 
 
-Mechanism = Annotated[Function | Linear, Field(discriminator="kind")]
+Equation = Annotated[Function | Linear, Field(discriminator="kind")]

@@ -15,14 +15,26 @@ from scm_world.errors import (
     InterventionError,
     OutOfBounds,
     UnknownOption,
+    WrongShape,
     raise_all,
 )
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.scene import PhysicalState
-from scm_world.variables import SOFT, Draw, Hard, Intervention, Measured, Rotations, Shift
+from scm_world.variables import (
+    SOFT,
+    Draw,
+    Hard,
+    Intervention,
+    Measured,
+    Mechanism,
+    Natural,
+    Rotations,
+    Shift,
+)
 from scm_world.variables.checks import check_bounds, check_space
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world.compare import same
+from scm_world.world.following import followed, refuse_continuous, what_follows
 from scm_world.world.restructure import restructured
 
 if TYPE_CHECKING:
@@ -180,10 +192,11 @@ class _Draft:
         acts = {t: na for t, na in self._requests.items() if not self._is_state(t)}
         if not acts:
             return
+        refuse_continuous(acts, self.static)
         self.model = self._instant.model.with_interventions(dict(acts.values()))
         targets = tuple(target for target in acts if target in self.static)
         draws = [t for t in targets if isinstance(acts[t][1], Draw)]
-        order: Iterable[str] = self._world.static_order(targets)
+        order: Iterable[str] = what_follows(self._world, self.model, self.static, targets)
         known = dict(self.static)
         for target in targets:
             del known[target]
@@ -208,6 +221,8 @@ class _Draft:
                 impossible.add(name)
                 continue
             known[name] = value = self.model.evaluate(name, known, self._moment)
+            if np.shape(value) != variable.shape:  # of a mechanism that a user gave
+                raise WrongShape(name, value, variable.shape, np.shape(value))
             follows = variable.bounds is not None and variable.bounds.parents()
             try:
                 check_bounds(variable, value, self._context() if follows else {})
@@ -276,6 +291,11 @@ class _Draft:
         requested: Any = self._world.model.declared(name)
         if isinstance(act, Hard):
             value = requested.array(act.value)
+        elif isinstance(act, Mechanism):
+            values = {**self.static, **self._world.states(self._instant.state)}
+            value = followed(requested, act, values)
+        elif isinstance(act, Natural):
+            value = self._coordinates(target, name)
         elif isinstance(act, Draw):
             source = requested.space(act.source) if isinstance(act.source, str) else act.source
             values = {**self.static, **self._world.states(self.state)}
@@ -344,7 +364,7 @@ class _Draft:
 
     def frozen(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:
         """Replace a draw, or a change of a state, by the value that came out."""
-        soft_parameter = isinstance(act, SOFT) and not self._is_state(target)
-        if isinstance(act, Hard) or target == "action" or soft_parameter:
+        keeps = isinstance(act, (*SOFT, Mechanism, Natural)) and not self._is_state(target)
+        if isinstance(act, Hard) or target == "action" or keeps:
             return name, act
         return target, Hard(self._value(target).tolist())

@@ -27,6 +27,7 @@ from scm_world.world.commit import commit, difference, feasible, refuse_overlaps
 from scm_world.world.declaration import Declaration, Options
 from scm_world.world.declared import Declared
 from scm_world.world.family import Family
+from scm_world.world.following import policy_inputs
 from scm_world.world.proposal import Instant, Proposal
 from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
@@ -95,6 +96,7 @@ class World(Declared):
         self.version = 0  # counts changes of anything but what physics moves
         self._static: Values = {}
         self._action_is_held = self._noisy = False
+        self._inputs: tuple[str, ...] = ()
         self._index = 0
         self._clock = np.zeros((), dtype=np.int64)
         self._instant: Instant | None = None
@@ -243,7 +245,8 @@ class World(Declared):
         """
         self._require_episode()
         if self._action_is_held:
-            known, where = {**self._now, "action": command}, self.moment(self._index)
+            known = {**self._now, **self.evaluate(self._inputs), "action": command}
+            where = self.moment(self._index)
             command = self._held.solve(known, moment=where, only=("action",))["action"]
             command = clipped(command, *self.declaration.action_bounds, self._action_unit)
         self._readouts.remember()
@@ -320,6 +323,7 @@ class World(Declared):
             self._enter(declaration)
         self._held, self._static = model, static
         self._action_is_held = "action" in model.interventions
+        self._inputs = policy_inputs(model)
         self._noisy = bool(static[ACTUATOR_NOISE] > 0.0)
         self.structure = declaration.structure(static)
         self._substeps = round(self.control_period / self.structure.preset.timestep)

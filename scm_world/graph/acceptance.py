@@ -1,0 +1,88 @@
+"""Whether an intervention fits the variable that it is meant for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from scm_world.errors import InterventionError, UnknownVariable
+from scm_world.graph.evaluate import Act, source_of
+from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Scale, Shift, Variable
+from scm_world.variables.checks import check_bounds, check_draw, coerce
+
+
+def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
+    """Check an intervention: type, shape, finite, fixed bounds, parents that exist.
+
+    Args:
+        declared: All variables, by name.
+        variable: That is set.
+        value: A plain value, or an intervention.
+
+    Raises:
+        InterventionError: What is wrong with it.
+    """
+    match value:
+        case Draw():
+            check_draw(variable, value)
+            _known(declared, source_of(Act(value, variable)).parents())
+            return value
+        case Mechanism():
+            _known(declared, (parent.name for parent in value.parents))
+            if any(parent.name == variable.name and not parent.lag for parent in value.parents):
+                raise InterventionError(
+                    f"do({variable.name}): a variable cannot follow itself within an instant; "
+                    "use Shift or Scale",
+                    variable=variable.name,
+                    value=value,
+                )
+            return value
+        case Natural():
+            return value
+        case Shift() | Scale():
+            by = value.by if np.ndim(value.by) else np.full(variable.shape, value.by)
+            coerce(variable, by)
+            return value
+    number = coerce(variable, _plain(variable, value))
+    if variable.bounds is not None and not variable.bounds.parents():
+        check_bounds(variable, number, {})
+    return Hard(number.tolist())
+
+
+def _known(declared: Mapping[str, Variable], names: Any) -> None:
+    for name in sorted(names):
+        if name not in declared:
+            raise UnknownVariable(name, declared)
+
+
+def _plain(variable: Variable, value: Any) -> Any:
+    """Take a value out of ``Hard``, which holds the numbers of a matrix in one row."""
+    if not isinstance(value, Hard):
+        return value
+    matrix = len(variable.shape) > 1 and np.size(value.value) == np.prod(variable.shape)
+    return np.reshape(value.value, variable.shape) if matrix else value.value
+
+
+def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
+    """Name the nearest causes that can be set, past others that cannot."""
+    found: dict[str, None] = {}
+    stack, seen = [name], {name}
+    while stack:
+        for parent in declared[stack.pop(0)].all_parents:
+            if parent.name in seen:
+                continue
+            seen.add(parent.name)
+            if declared[parent.name].settable:
+                found[parent.name] = None
+            else:
+                stack.append(parent.name)
+    return list(found)
+
+
+def adds_edges(act: Act) -> bool:
+    """Tell whether an intervention gives its target causes: then the order has to be found anew."""
+    if isinstance(act.intervention, Draw):
+        return bool(source_of(act).parents())
+    return isinstance(act.intervention, Mechanism)
