@@ -17,7 +17,7 @@ from scm_world.env.delta import MODES, PREFIX, Delta
 from scm_world.env.goals import GoalReward, Goals, reader, reward_scale
 from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
-from scm_world.env.start import asked, begin, beginning_structure, merged
+from scm_world.env.start import asked, begin, beginning_structure
 from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, UnknownOption
@@ -28,6 +28,7 @@ from scm_world.tasks.rewards import one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.world import Audit, World
 from scm_world.world.declaration import Declaration
+from scm_world.world.requests import merged
 from scm_world.world.start import whole_number
 
 RENDER_MODES = ("rgb_array", "human")

@@ -26,21 +26,6 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
     }
 
 
-def merged(declaration: Declaration, *requests: Mapping[str, Any]) -> dict[str, Any]:
-    """Put interventions over one another; the last one that sets a quantity counts.
-
-    Args:
-        declaration: Knows which names are coordinates of one quantity.
-        requests: With dotted names.
-    """
-    merged_acts: dict[str, Any] = {}
-    for acts in requests:
-        mine = {_target(declaration, name) for name in acts}
-        kept = {n: act for n, act in merged_acts.items() if _target(declaration, n) not in mine}
-        merged_acts = {**kept, **acts}
-    return merged_acts
-
-
 def begin(world: World, seed: int | None, acts: Mapping[str, Any], attempts: int) -> None:
     """Reset a world, with an intervention that may draw something impossible.
 
@@ -63,10 +48,6 @@ def begin(world: World, seed: int | None, acts: Mapping[str, Any], attempts: int
             seed = None
         else:
             return
-
-
-def _target(declaration: Declaration, name: str) -> str:
-    return declaration.model.target(name) if name in declaration.model else name
 
 
 def beginning_structure(world: World, acts: Mapping[str, Any]) -> Declaration:

@@ -162,13 +162,14 @@ class World(Declared):
         return cameras(self._now)
 
     def reset(
-        self, *, seed: int | None = None, do: Mapping[str, Any] | None = None
+        self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
     ) -> Audit | None:
         """Begin an episode. Nothing that was done in the last one remains.
 
         Args:
-            seed: Of the noise; it also makes this episode number 0. Without it the next episode
-                of the same noise begins, or of a fresh seed if there was none.
+            seed: Of the noise. Without it the next episode of the same noise begins, or of a
+                fresh seed if there was none.
+            episode: Number of the episode, with a seed.
             do: An intervention that takes part in the beginning: a block of another size stands
                 on the floor. It holds until the next reset.
 
@@ -179,7 +180,8 @@ class World(Declared):
             InterventionError: The intervention was refused. The episode has begun without it.
         """
         if seed is not None:
-            self.noise, self.episode = Noise(whole_number("seed", seed, least=0)), 0
+            self.noise = Noise(whole_number("seed", seed, least=0))
+            self.episode = whole_number("episode", episode, least=0)
         elif not self._started:
             self.noise, self.episode = Noise(secrets.randbits(63)), 0
         else:

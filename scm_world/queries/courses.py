@@ -1,0 +1,109 @@
+"""Which interventions are due at which control step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, final
+
+from scm_world.errors import InterventionError
+from scm_world.queries.plans import Plan
+from scm_world.queries.timed import ACTS, At, Clamp, On
+from scm_world.variables import Hard, Intervention, Mechanism, Natural
+from scm_world.world import World
+
+Layer = tuple[int, Plan]
+"""The control step from which a plan counts, and the plan."""
+Key = tuple[int, str, int]
+"""Layer, variable and number of an intervention that waits for an event."""
+
+
+@final
+class Course:
+    """Plans over one another: from its first step on, a later one counts for what it names.
+
+    Args:
+        layers: In the order of their making.
+
+    Raises:
+        InterventionError: Something should happen before its plan begins, or a state is to be
+            held at what is no value.
+    """
+
+    def __init__(self, layers: Iterable[Layer]) -> None:
+        self.layers = tuple((start, plan) for start, plan in layers if len(plan))
+        for start, plan in self.layers:
+            for name, part in plan.timed():
+                step = part.step if isinstance(part, At) else start
+                step = part.start if isinstance(part, Clamp) else step
+                if step < start:
+                    raise InterventionError(
+                        f"do({name}): control step {step} is over; the plan begins at {start}",
+                        variable=name,
+                        value=part,
+                    )
+        self._is_simple = not any(True for _, plan in self.layers for _ in plan.timed())
+        self._starts = frozenset(start for start, _ in self.layers)
+
+    def due(self, world: World, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
+        """Give what is to be done at the beginning of a control step.
+
+        Args:
+            world: As it is then; events are looked for in it.
+            step: Number of the control step.
+            fired: When events happened; those that happen now are added.
+        """
+        if self._is_simple and step not in self._starts:
+            return {}
+        found: dict[str, Intervention] = {}
+        for number, name, start, parts in self._owners(step):
+            for index, part in enumerate(parts):
+                key = (number, name, index)
+                act = _due(part, step, start, name, world, fired, key)
+                if act is not None:
+                    found[name] = act
+        return found
+
+    def _owners(self, step: int) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
+        last = {
+            name: number
+            for number, (start, plan) in enumerate(self.layers)
+            if start <= step
+            for name in plan
+        }
+        for name, number in last.items():
+            start, plan = self.layers[number]
+            yield number, name, start, plan[name]
+
+
+def _due(
+    part: Any, step: int, start: int, name: str, world: World, fired: dict[Key, int], key: Key
+) -> Intervention | None:
+    act: Intervention | None = None
+    match part:
+        case At():
+            act = part.act if part.step == step else None
+        case Clamp():
+            act = _held(part, step, name, world)
+        case On():
+            if key not in fired and part.event.happens(world):
+                fired[key] = step
+            act = part.act if fired.get(key) == step else None
+        case _ if isinstance(part, ACTS):
+            act = part if step == start else None
+    return act
+
+
+def _held(part: Clamp, step: int, name: str, world: World) -> Intervention | None:
+    """Say what a clamp does: a state is put back at every step, a parameter is set and released."""
+    if step < part.start or (part.stop is not None and step > part.stop):
+        return None
+    is_state = world.model.declared(world.model.target(name)).role == "state"
+    if not is_state:
+        return {part.start: part.act, part.stop: Natural()}.get(step)
+    if not isinstance(part.act, Hard | Mechanism):
+        raise InterventionError(
+            f"do({name}): a state is held at a value or by a Mechanism, not by {part.act!r}",
+            variable=name,
+            value=part.act,
+        )
+    return part.act if step != part.stop else None

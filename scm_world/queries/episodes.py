@@ -1,0 +1,286 @@
+"""Episodes that are remembered whole, and what would have happened otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.errors import UnknownOption, UnknownVariable
+from scm_world.queries.courses import Course, Layer
+from scm_world.queries.plans import Plan
+from scm_world.queries.policies import Sequence as Given
+from scm_world.queries.policies import as_policy
+from scm_world.queries.stages import Stage, threaded
+from scm_world.queries.traces import ALL, Trace, begin, run
+from scm_world.world import Audit, World
+from scm_world.world.start import whole_number
+
+WORKERS = 2
+"""Threads that parallel worlds use by default."""
+
+
+@final
+class Episode:
+    """One unit of the world: its noise, its interventions and all that happened.
+
+    Everything is exact: an episode can be gone through again, and branched off, bit for bit.
+
+    Attributes:
+        stage: Twins of the world that it happened in.
+        seed: Of the noise.
+        number: Of the episode within that noise.
+        layers: Plans, each with the control step from which it counts.
+        steps: How many control steps it has.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        *,
+        seed: int,
+        number: int,
+        layers: Sequence[Layer],
+        steps: int,
+        trace: Trace,
+    ) -> None:
+        self.stage, self.seed, self.number = stage, seed, number
+        self.layers: tuple[Layer, ...] = tuple(layers)
+        self.steps = steps
+        self._trace = trace
+        self._all: Trace | None = None
+
+    # --- looking ------------------------------------------------------------------------------
+
+    @property
+    def plan(self) -> Plan:
+        """What was done from the beginning."""
+        return self.layers[0][1] if self.layers else Plan()
+
+    @property
+    def actions(self) -> Floats:
+        """What the policy asked for, shape (steps, 9)."""
+        return np.array(self._trace.actions).reshape(self.steps, 9)
+
+    @property
+    def audits(self) -> Mapping[int, Audit]:
+        """What each intervention did, by control step."""
+        return dict(self._trace.audits)
+
+    @property
+    def events(self) -> Mapping[str, int]:
+        """At which control step events happened that variables waited for, by variable."""
+        return {name: step for (_, name, _), step in self._trace.fired.items()}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All variables of the structure at the end."""
+        return tuple(self._trace.declarations[-1][1].model)
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __getitem__(self, name: str) -> Value:
+        """Give a variable at every instant, shape ``(steps + 1, *shape)``.
+
+        Instant t is the one at which the action of step t is chosen, after what was done then; the
+        last one is the end. What is not there at every instant, since bodies came or went, is
+        given as far as it is there.
+
+        Raises:
+            UnknownVariable: No variable has this name.
+        """
+        if name in self._trace.values:
+            return np.array(self._trace.values[name])
+        declarations = self._trace.declarations
+        if len(declarations) == 1 and name in declarations[0][1].slices:
+            return np.array(self._trace.vectors)[:, declarations[0][1].slices[name]]
+        if all(name in values for _, values in self._trace.statics):
+            return self._parameter(name)
+        if not any(name in declaration.model for _, declaration in declarations):
+            raise UnknownVariable(name, self.names)
+        return np.array(self.replay().values[name])
+
+    def _parameter(self, name: str) -> Value:
+        steps = [step for step, _ in self._trace.statics] + [self.steps + 1]
+        lengths = np.diff(steps)
+        return np.repeat([values[name] for _, values in self._trace.statics], lengths, axis=0)
+
+    def final(self, name: str) -> Value:
+        """Give a variable at the end; see ``__getitem__``."""
+        return np.asarray(self[name][-1])
+
+    def replay(self) -> Trace:
+        """Go through the episode again, with every variable and every contact written down."""
+        if self._all is None:
+            trace = Trace(fired={})
+            with self.stage.twin() as world:
+                begin(world, self.seed, self.number, Course(self.layers), trace)
+                run(
+                    world,
+                    trace,
+                    Course(self.layers),
+                    Given(self._trace.actions) if self.steps else as_policy(None),
+                    first=0,
+                    steps=self.steps,
+                    names=(ALL,),
+                    contacts=True,
+                    begun=True,
+                )
+            self._all = trace
+        return self._all
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether all states, parameters and actions are the same, bit for bit."""
+        return isinstance(other, Episode) and _same(self._trace, other._trace)
+
+    __hash__ = None  # type: ignore[assignment] # compared by content
+
+    def __repr__(self) -> str:
+        held = ", ".join(f"{name} from {at}" for at, plan in self.layers for name in plan)
+        return f"Episode({self.steps} steps, seed {self.seed}, number {self.number}, do({held}))"
+
+    # --- what would have been -----------------------------------------------------------------
+
+    def counterfactual(
+        self,
+        do: Mapping[str, Any] | None = None,
+        *,
+        at: int = 0,
+        actions: Any = "replay",
+        record: Iterable[str] = (),
+    ) -> Episode:
+        """Go back, intervene, and let the same noise happen again.
+
+        Args:
+            do: What is done; without a time it is done at the instant ``at``.
+            at: Number of the control step.
+            actions: ``"replay"`` for the same actions, or a policy that chooses anew from there.
+            record: Variables to write down on the way; others are found by going through again.
+
+        Returns:
+            The episode as it would have been; the same one, bit for bit, if nothing is done.
+
+        Raises:
+            InterventionError: The intervention was refused.
+            UnknownOption: There is no such control step.
+        """
+        if isinstance(at, bool) or not isinstance(at, int | np.integer) or not 0 <= at < self.steps:
+            raise UnknownOption("at", at, (f"a control step from 0 to {self.steps - 1}",))
+        step = int(at)
+        layers = (*self.layers, (step, Plan(do)))
+        with self.stage.twin() as world:
+            trace = self._branch(world, Course(layers), step, actions, tuple(record))
+        return Episode(
+            self.stage,
+            seed=self.seed,
+            number=self.number,
+            layers=layers,
+            steps=self.steps,
+            trace=trace,
+        )
+
+    def _branch(
+        self, world: World, course: Course, at: int, actions: Any, names: tuple[str, ...]
+    ) -> Trace:
+        past = Given(self._trace.actions)
+        near = max((step for step in self._trace.snapshots if step <= at), default=0)
+        world.restore(self._trace.snapshots[near])
+        if near < at:  # nothing is new until then
+            before, scratch = Course(self.layers), Trace(fired=dict(self._trace.fired))
+            run(world, scratch, before, past, first=near, steps=at, begun=True)
+        trace = self._trace.until(at)
+        trace.values = {name: list(self[name][:at]) for name in names}
+        # What is in the snapshot already is asked for again, which changes nothing: interventions
+        # at one instant are one intervention.
+        due = course.due(world, at, trace.fired)
+        if due:
+            trace.audits[at] = world.do(due)
+        policy = past if _is_replay(actions) else as_policy(actions)
+        run(world, trace, course, policy, first=at, steps=self.steps, names=names, begun=True)
+        return trace
+
+    def worlds(
+        self,
+        dos: Iterable[Mapping[str, Any]],
+        *,
+        at: int = 0,
+        actions: Any = "replay",
+        record: Iterable[str] = (),
+        workers: int = WORKERS,
+    ) -> tuple[Episode, ...]:
+        """Let parallel worlds run with the same noise, one for each intervention.
+
+        Args:
+            dos: What is done in each.
+            at: Number of the control step, as in ``counterfactual``; also what follows.
+            actions: ``"replay"`` or a policy.
+            record: Variables to write down on the way.
+            workers: Threads; the result does not depend on how many.
+        """
+        names = tuple(record)
+
+        def one(do: Mapping[str, Any]) -> Episode:
+            return self.counterfactual(do, at=at, actions=actions, record=names)
+
+        return tuple(threaded(one, list(dos), workers))
+
+
+def rollout(
+    stage: Stage,
+    policy: Any = None,
+    *,
+    seed: int = 0,
+    number: int = 0,
+    do: Mapping[str, Any] | None = None,
+    steps: int | None = None,
+    record: Iterable[str] = (),
+) -> Episode:
+    """Let an episode happen on a twin of a world.
+
+    Args:
+        stage: Of the world.
+        policy: A function of the world, actions of shape (9,) or (steps, 9), ``"random"``, or None:
+            the robot stays where it begins.
+        seed: Of the noise.
+        number: Of the episode within that noise.
+        do: A plan, or interventions.
+        steps: How many control steps; as many as the task has if None.
+        record: Variables to write down on the way; others are found by going through again.
+
+    Raises:
+        InterventionError: An intervention was refused.
+        UnknownOption: The number of steps is none.
+    """
+    plan = Plan(do)
+    course, trace = Course([(0, plan)]), Trace()
+    with stage.twin() as world:
+        begin(world, seed, number, course, trace)
+        length = world.max_episode_length if steps is None else steps
+        count = whole_number("steps", length, least=1)
+        run(world, trace, course, as_policy(policy), first=0, steps=count, names=record, begun=True)
+    return Episode(stage, seed=seed, number=number, layers=[(0, plan)], steps=count, trace=trace)
+
+
+def _is_replay(actions: Any) -> bool:
+    return isinstance(actions, str) and actions == "replay"
+
+
+def _same(one: Trace, other: Trace) -> bool:
+    if len(one.vectors) != len(other.vectors):
+        return False
+    vectors = zip((*one.vectors, *one.actions), (*other.vectors, *other.actions), strict=True)
+    if not all(a.tobytes() == b.tobytes() for a, b in vectors):
+        return False
+    return all(
+        mine.keys() == its.keys() and all(np.array_equal(mine[n], its[n]) for n in mine)
+        for step in range(len(one.vectors))
+        for mine, its in [(_at(one, step), _at(other, step))]
+        if mine is not its
+    )
+
+
+def _at(trace: Trace, step: int) -> dict[str, Value]:
+    return next(values for at, values in reversed(trace.statics) if at <= step)

@@ -1,0 +1,109 @@
+"""Who acts in a rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.errors import ActionError
+from scm_world.world import World
+
+Policy = Callable[[World], Any]
+"""Looks at a world and gives an action, shape (9,) in the units of its action mode."""
+
+
+@final
+@dataclass(frozen=True)
+class Random:
+    """Actions drawn uniformly, from the noise of the episode.
+
+    Two worlds with the same noise get the same actions, whatever else differs between them.
+
+    Attributes:
+        share: Of the range of actions, around its middle.
+        every: For how many control steps an action is kept.
+    """
+
+    share: float = 1.0
+    every: int = 1
+
+    def __call__(self, world: World) -> Floats:
+        """Draw the action of the present step."""
+        step = world.index // self.every
+        drawn = world.noise.uniforms("policy", n=9, episode=world.episode, step=step)[0]
+        middle = 0.5 * (world.action_low + world.action_high)
+        half = 0.5 * (world.action_high - world.action_low)
+        action: Floats = middle + self.share * half * (2.0 * drawn - 1.0)
+        return action
+
+
+@final
+class Sequence:
+    """Actions that are given: one for all steps, or one for each.
+
+    Args:
+        actions: Shape (9,) or (steps, 9); after the last one it is kept.
+
+    Raises:
+        ActionError: They have another shape, or are not finite.
+    """
+
+    def __init__(self, actions: Any) -> None:
+        try:
+            given = np.atleast_2d(np.asarray(actions, dtype=np.float64))
+        except (TypeError, ValueError):
+            given = np.empty((0, 0))
+        if given.ndim != 2 or given.shape[1:] != (9,) or not len(given):
+            raise ActionError("actions have shape (9,) or (steps, 9)", actions)
+        if not np.isfinite(given).all():
+            raise ActionError("actions must be finite", actions)
+        self.actions: Floats = given
+
+    def __call__(self, world: World) -> Floats:
+        """Give the action of the present step."""
+        action: Floats = self.actions[min(world.index, len(self.actions) - 1)]
+        return action
+
+
+def still(world: World) -> Floats:
+    """Keep the robot where it is told to be: joints, fingertips, or no torque."""
+    if world.action_mode == "joint_torques":
+        return np.zeros(9)
+    name = "end_effector_positions" if "effector" in world.action_mode else "joint_positions"
+    found: Floats = np.array(world[name])
+    return found
+
+
+def as_policy(given: Any) -> Policy:
+    """Turn what a user gives into a policy for one rollout.
+
+    Args:
+        given: A policy, actions, ``"random"``, or None: where the robot begins it stays.
+
+    Raises:
+        ActionError: It is none of these.
+    """
+    if given is None:
+        return _Hold()
+    if isinstance(given, str):
+        if given == "random":
+            return Random()
+        raise ActionError('a policy is a function of the world, actions, "random" or None', given)
+    return given if callable(given) else Sequence(given)
+
+
+class _Hold:
+    """Tells the robot to stay where it was when it was asked for the first time."""
+
+    def __init__(self) -> None:
+        self._action: Floats | None = None
+
+    def __call__(self, world: World) -> Floats:
+        """Give the action of the first step."""
+        if self._action is None:
+            self._action = still(world)
+        return self._action

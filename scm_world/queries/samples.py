@@ -1,0 +1,176 @@
+"""Seeing and doing: episodes drawn from a world, as a table."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.queries.episodes import Episode, rollout
+from scm_world.queries.outcomes import as_outcome, label, read, watched
+from scm_world.queries.plans import Plan
+from scm_world.queries.stages import Stage, threaded
+from scm_world.world import World
+from scm_world.world.requests import merged
+
+STEPS = 25
+"""Control steps of an episode by default: one second at 25 steps a second."""
+
+Progress = Callable[[int, int], None]
+"""Told after each episode how many are done, and how many there will be."""
+
+
+@final
+@dataclass(frozen=True)
+class Setting:
+    """Under which circumstances episodes happen.
+
+    Attributes:
+        policy: Who acts; see ``rollout``.
+        nature: What varies from episode to episode by itself: interventions that are drawn at the
+            beginning, such as ``{"tool_block.mass": "A"}``. What is done counts more.
+        steps: Control steps of an episode.
+        seed: Of the noise; episode i of one seed is the same unit in every question.
+        workers: Threads; the result does not depend on how many.
+    """
+
+    policy: Any = "random"
+    nature: Mapping[str, Any] | None = None
+    steps: int = STEPS
+    seed: int = 0
+    workers: int = 1
+
+    def episode(
+        self, stage: Stage, world: World, do: Mapping[str, Any] | None, number: int, names: Any
+    ) -> Episode:
+        """Let one unit happen.
+
+        Args:
+            stage: Of the world.
+            world: Knows which names are coordinates of one quantity.
+            do: What is done to it.
+            number: Which unit.
+            names: Variables to write down.
+        """
+        plan = Plan(merged(world.declaration, Plan(self.nature), Plan(do)))
+        return rollout(
+            stage,
+            self.policy,
+            seed=self.seed,
+            number=number,
+            do=plan,
+            steps=self.steps,
+            record=names,
+        )
+
+
+@final
+@dataclass(frozen=True)
+class Samples(Mapping[str, Floats]):
+    """What was seen in some episodes, one row for each.
+
+    Attributes:
+        columns: Values by outcome, shape (n, ...).
+        numbers: Which episodes.
+        seed: Of the noise.
+        plan: What was done in each.
+    """
+
+    columns: dict[str, Floats]
+    numbers: tuple[int, ...]
+    seed: int
+    plan: Plan
+
+    def __getitem__(self, name: str) -> Floats:
+        return self.columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Which variables were intervened on: what learners from interventions ask for."""
+        return tuple(self.plan)
+
+    def matrix(self) -> tuple[Floats, tuple[str, ...]]:
+        """Give all numbers as one table, shape (n, m), and the names of its columns."""
+        parts, names = [], []
+        for name, values in self.columns.items():
+            flat = values.reshape(len(self.numbers), -1)
+            parts.append(flat)
+            many = flat.shape[1] > 1
+            names += [f"{name}[{i}]" if many else name for i in range(flat.shape[1])]
+        table = np.concatenate(parts, axis=1) if parts else np.empty((len(self.numbers), 0))
+        return table, tuple(names)
+
+    def to_csv(self, path: Path | str) -> None:
+        """Write the table as CSV, and beside it what was done as JSON."""
+        table, names = self.matrix()
+        target = Path(path)
+        with target.open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(("episode", *names))
+            writer.writerows(
+                (number, *map(repr, row))
+                for number, row in zip(self.numbers, table.tolist(), strict=True)
+            )
+        about = {"seed": self.seed, "plan": self.plan.as_dict(), "targets": list(self.targets)}
+        target.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n")
+
+
+def sample(
+    stage: Stage,
+    world: World,
+    do: Mapping[str, Any] | None,
+    n: int,
+    *,
+    outcomes: Iterable[Any],
+    setting: Setting,
+    first: int = 0,
+    progress: Progress | None = None,
+) -> Samples:
+    """Let episodes happen under an intervention, and read outcomes off them.
+
+    Args:
+        stage: Of the world.
+        world: Is not touched.
+        do: What is done in all of them; None to see only.
+        n: How many.
+        outcomes: What to read off: names of variables, ``Outcome`` or functions of the episode.
+        setting: The circumstances.
+        first: Number of the first episode.
+        progress: Told after each episode.
+    """
+    wanted = [as_outcome(outcome) for outcome in outcomes]
+    names = tuple(dict.fromkeys(name for outcome in wanted for name in watched(outcome)))
+    done = 0
+
+    def one(number: int) -> list[Floats]:
+        nonlocal done
+        episode = setting.episode(stage, world, do, number, names)
+        found = [read(outcome, episode) for outcome in wanted]
+        done += 1
+        if progress is not None:
+            progress(done, n)
+        return found
+
+    numbers = range(first, first + n)
+    rows = threaded(one, numbers, setting.workers)
+    columns = {
+        _column(outcome): np.array([row[i] for row in rows]) for i, outcome in enumerate(wanted)
+    }
+    return Samples(columns, tuple(numbers), setting.seed, Plan(do))
+
+
+def _column(outcome: Any) -> str:
+    text = label(outcome)
+    return text.removeprefix("final ")

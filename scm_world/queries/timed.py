@@ -1,0 +1,174 @@
+"""When interventions happen: at an instant, over a window, on an event."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+from pydantic import Field
+
+from scm_world.errors import UnknownOption
+from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Scale, Shift
+from scm_world.variables.kinds import SPACES
+from scm_world.variables.spaces import Frozen
+from scm_world.world import World
+
+ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural)
+
+
+def as_act(value: Any) -> Any:
+    """Make a plain value a hard intervention, and the name of a space a draw from it.
+
+    Raises:
+        UnknownOption: It is neither numbers nor an intervention.
+    """
+    if isinstance(value, (*ACTS, dict)):  # a dictionary comes from a file
+        return value
+    if isinstance(value, str) and value in SPACES:
+        return Draw(value)
+    given = value if not isinstance(value, np.ndarray) else value.tolist()
+    return Hard(given)
+
+
+def _step(option: str, value: Any, *, least: int = 0) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise UnknownOption(option, value, (f"any whole number of control steps from {least} on",))
+    return int(value)
+
+
+@final
+class At(Frozen):
+    """Intervene at the beginning of one control step.
+
+    Attributes:
+        step: Number of the control step.
+        act: What is done.
+
+    Example:
+        >>> At(50, [0.0, 0.0, 0.1]).step
+        50
+    """
+
+    kind: Literal["at"] = "at"
+    step: int
+    act: Intervention
+
+    def __init__(self, step: Any, act: Any, **fields: Any) -> None:
+        super().__init__(step=_step("At(step)", step), act=as_act(act), **fields)  # type: ignore[call-arg]
+
+
+@final
+class Clamp(Frozen):
+    """Hold a variable during a window of control steps, and hand it back at its end.
+
+    A state is put there again at the beginning of every control step of the window: its
+    mechanism is cut for as long. A parameter is set once, and follows its own mechanism afterwards.
+
+    Attributes:
+        act: What it is held at.
+        start: First control step of the window.
+        stop: The step at which it ends; None for the end of the episode.
+
+    Example:
+        >>> Clamp([0.0, 0.9, -1.7] * 3, 100, 200).stop
+        200
+    """
+
+    kind: Literal["clamp"] = "clamp"
+    act: Intervention
+    start: int = 0
+    stop: int | None = None
+
+    def __init__(self, act: Any, start: Any = 0, stop: Any = None, **fields: Any) -> None:
+        first = _step("Clamp(start)", start)
+        last = None if stop is None else _step("Clamp(stop)", stop, least=first + 1)
+        super().__init__(act=as_act(act), start=first, stop=last, **fields)  # type: ignore[call-arg]
+
+
+@final
+class Contact(Frozen):
+    """The event that two bodies touch.
+
+    Attributes:
+        first: Name of a body, or the beginning of one: ``"robot"`` is any link.
+        second: Likewise.
+    """
+
+    kind: Literal["contact"] = "contact"
+    first: str
+    second: str
+
+    def __init__(self, first: str, second: str, **fields: Any) -> None:
+        super().__init__(first=first, second=second, **fields)  # type: ignore[call-arg]
+
+    def happens(self, world: World) -> bool:
+        """Tell whether they touch now: in the last physics step, with a force."""
+        return any(
+            contact.force > 0.0 and (self._are(*contact.bodies) or self._are(*contact.bodies[::-1]))
+            for contact in world.backend.contacts()
+        )
+
+    def _are(self, one: str, other: str) -> bool:
+        return one.startswith(self.first) and other.startswith(self.second)
+
+
+@final
+class Reaches(Frozen):
+    """The event that a number lies above or below a threshold.
+
+    Attributes:
+        name: Of any variable.
+        above: It happens where the variable is greater.
+        below: It happens where it is smaller.
+        component: Which number of it, where it has several.
+    """
+
+    kind: Literal["reaches"] = "reaches"
+    name: str
+    above: float | None = None
+    below: float | None = None
+    component: int = 0
+
+    def __init__(self, name: str, **fields: Any) -> None:
+        if (fields.get("above") is None) == (fields.get("below") is None):
+            raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
+        super().__init__(name=name, **fields)  # type: ignore[call-arg]
+
+    def happens(self, world: World) -> bool:
+        """Tell whether it is there now."""
+        number = float(np.ravel(world[self.name])[self.component])
+        if self.above is not None:
+            return number > self.above
+        return self.below is not None and number < self.below
+
+
+Event = Annotated[Contact | Reaches, Field(discriminator="kind")]
+
+
+@final
+class On(Frozen):
+    """Intervene at the beginning of the first control step at which an event has happened.
+
+    Attributes:
+        event: ``Contact`` or ``Reaches``.
+        act: What is done.
+
+    Example:
+        >>> On(Contact("robot", "tool_block"), 0.3).act.value
+        0.3
+    """
+
+    kind: Literal["on"] = "on"
+    event: Event
+    act: Intervention
+
+    def __init__(self, event: Any, act: Any, **fields: Any) -> None:
+        super().__init__(event=event, act=as_act(act), **fields)  # type: ignore[call-arg]
+
+
+TIMED = (At, Clamp, On)
+Timed = Annotated[
+    Hard | Shift | Scale | Draw | Mechanism | Natural | At | Clamp | On,
+    Field(discriminator="kind"),
+]
+"""Anything that a plan does to one variable."""
