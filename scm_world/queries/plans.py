@@ -162,7 +162,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 def _parts(value: Any) -> tuple[Any, ...]:
     if isinstance(value, TIMED):
         return (value,)
-    if isinstance(value, list | tuple) and value and all(isinstance(v, TIMED) for v in value):
+    several = isinstance(value, list | tuple) and len(value) > 0
+    if several and all(isinstance(part, (*TIMED, *ACTS)) for part in value):
         return tuple(value)
     return (as_act(value),)
 

@@ -25,7 +25,7 @@ class Stage:
     """
 
     def __init__(self, world: World) -> None:
-        self.recipe = world.__reduce__()
+        self._build, (self._kind, self._task, self._options, _), *_ = world.__reduce__()
         self._free: list[World] = []
         self._lock = threading.Lock()
 
@@ -41,8 +41,7 @@ class Stage:
                 self._free.append(world)
 
     def _make(self) -> World:
-        build, (kind, task, options, _) = self.recipe
-        made: World = build(kind, copy.copy(task), dict(options), None)
+        made: World = self._build(self._kind, copy.copy(self._task), dict(self._options), None)
         return made
 
 

@@ -34,7 +34,6 @@ from scm_world.world.snapshot import SavedInstant, WorldSnapshot
 from scm_world.world.start import beginning, the_backend, the_task, whole_number
 
 
-@final
 class World(Declared):
     """A task as a causal model, with an engine that moves it.
 

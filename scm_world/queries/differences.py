@@ -1,0 +1,221 @@
+"""How two episodes differ, and which of several causes made the difference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.errors import UnknownOption
+from scm_world.queries.episodes import WORKERS, Episode
+from scm_world.queries.outcomes import as_outcome, read
+from scm_world.variables import Draw, Natural
+
+NOISY = ("sensor_noise", "actuator_noise")
+"""Parameters that let noise into an episode while they are not zero."""
+
+
+@final
+@dataclass(frozen=True)
+class Divergence:
+    """How a variable differs between two episodes.
+
+    Attributes:
+        first: The first instant at which it does.
+        largest: The largest difference of a component.
+        at: The instant of that.
+        final: The difference at the end, shape of the variable.
+    """
+
+    first: int
+    largest: float
+    at: int
+    final: Floats
+
+
+@final
+@dataclass(frozen=True)
+class Difference:
+    """How two episodes differ.
+
+    Attributes:
+        variables: Those that do, by name, the earliest first.
+        contacts: Pairs of bodies that touch in one of the two only: instant, pair, and 0 or 1 for
+            the episode in which they do.
+        noise: Draws that exist in one of the two only: name, and 0 or 1 for the episode.
+    """
+
+    variables: Mapping[str, Divergence]
+    contacts: tuple[tuple[int, tuple[str, str], int], ...]
+    noise: tuple[tuple[str, int], ...]
+
+    @property
+    def first(self) -> int | None:
+        """The first instant at which anything differs; None if nothing does."""
+        return min((found.first for found in self.variables.values()), default=None)
+
+    def __str__(self) -> str:
+        if not self.variables:
+            return "no difference"
+        lines = [
+            f"{name}: from {d.first} on, at most {d.largest:.4g} (at {d.at})"
+            for name, d in self.variables.items()
+        ]
+        lines += [f"only in {'ab'[one]}: noise of {name}" for name, one in self.noise]
+        if self.contacts:
+            at, pair, one = self.contacts[0]
+            lines.append(
+                f"{len(self.contacts)} contacts in one only, first {pair[0]}–{pair[1]} in "
+                f"{'ab'[one]} at {at}"
+            )
+        return "\n".join(lines)
+
+
+def compare(
+    one: Episode, other: Episode, names: Iterable[str] | None = None, *, tolerance: float = 0.0
+) -> Difference:
+    """Find out where two episodes differ.
+
+    Args:
+        one: An episode.
+        other: One of as many steps.
+        names: Variables to look at; all that both have if None.
+        tolerance: Differences up to this do not count.
+
+    Raises:
+        UnknownOption: They are not equally long.
+    """
+    if one.steps != other.steps:
+        raise UnknownOption("episode", other, (f"one of {one.steps} steps",))
+    both = [name for name in one.names if name in set(other.names)]
+    wanted = both if names is None else list(names)
+    first, second = one.replay(), other.replay()
+    found = {name: _divergence(one[name], other[name], tolerance) for name in wanted}
+    apart = {name: d for name, d in found.items() if d is not None}
+    contacts = tuple(
+        (step, pair, which)
+        for step, sets in enumerate(zip(first.touching, second.touching, strict=True))
+        for which in (0, 1)
+        for pair in sorted(sets[which] - sets[1 - which])
+    )
+    noise = _noise(one), _noise(other)
+    alone = [(name, which) for which in (0, 1) for name in sorted(noise[which] - noise[1 - which])]
+    ordered = dict(sorted(apart.items(), key=lambda item: item[1].first))
+    return Difference(ordered, contacts, tuple(alone))
+
+
+def _divergence(one: Any, other: Any, tolerance: float) -> Divergence | None:
+    if np.shape(one) != np.shape(other):
+        return Divergence(0, float("inf"), 0, np.asarray(np.inf))
+    apart = np.abs(np.asarray(one, float) - np.asarray(other, float)).reshape(len(one), -1)
+    sizes = apart.max(axis=1, initial=0.0)
+    if not (sizes > tolerance).any():
+        return None
+    at = int(np.argmax(sizes))
+    return Divergence(
+        int(np.argmax(sizes > tolerance)), float(sizes[at]), at, np.asarray(one[-1]) - other[-1]
+    )
+
+
+def _noise(episode: Episode) -> set[str]:
+    """Name the draws of an episode: those of interventions, and of noise that is not zero."""
+    drawn = {
+        name for _, plan in episode.layers for name, act in plan.acts() if isinstance(act, Draw)
+    }
+    return drawn | {name for name in NOISY if np.any(episode[name])}
+
+
+@final
+@dataclass(frozen=True)
+class ButFor:
+    """What an outcome would have been without a cause.
+
+    Attributes:
+        causes: Variables whose values were other ones.
+        outcome: What it is.
+        without: What it would have been.
+    """
+
+    causes: tuple[str, ...]
+    outcome: Floats
+    without: Floats
+
+    @property
+    def mattered(self) -> bool:
+        """Whether the outcome would have been another one."""
+        return not np.array_equal(self.outcome, self.without)
+
+    @property
+    def size(self) -> float:
+        """By how much, at most, over the components."""
+        return float(np.abs(self.outcome - self.without).max(initial=0.0))
+
+    def __str__(self) -> str:
+        verb = "mattered" if self.mattered else "did not matter"
+        return f"{' and '.join(self.causes)} {verb}: {self.outcome} instead of {self.without}"
+
+
+def but_for(
+    episode: Episode,
+    outcome: Any,
+    over: Iterable[str] | Mapping[str, Any] | None = None,
+    *,
+    at: int = 0,
+    most: int = 1,
+    workers: int = WORKERS,
+) -> tuple[ButFor, ...]:
+    """Ask, for each cause, whether the outcome would have been the same without it.
+
+    Args:
+        episode: What happened.
+        outcome: The name of a variable (its final value), an ``Outcome``, or a function.
+        over: Causes, each with the value that it would have had instead; names alone stand for
+            what they would have been by themselves, which only makes sense for what the episode
+            intervened on. All of those if None.
+        at: The control step from which the causes are other ones.
+        most: How many causes are taken away together, at most. A set counts only where no part of
+            it matters by itself.
+        workers: Threads.
+
+    Returns:
+        One entry for each set of causes, those that matter first, the largest first.
+
+    Raises:
+        UnknownOption: A cause without another value was not intervened on.
+    """
+    contrasts = _contrasts(episode, over, at)
+    wanted = as_outcome(outcome)
+    actual = read(wanted, episode)
+    found: list[ButFor] = []
+    for size in range(1, most + 1):
+        decisive = [set(entry.causes) for entry in found if entry.mattered]
+        groups = [
+            group
+            for group in combinations(contrasts, size)
+            if not any(known <= set(group) for known in decisive)
+        ]
+        dos = [{name: contrasts[name] for name in group} for group in groups]
+        others = episode.worlds(dos, at=at, workers=workers)
+        found += [
+            ButFor(group, actual, read(wanted, other))
+            for group, other in zip(groups, others, strict=True)
+        ]
+    return tuple(sorted(found, key=lambda entry: (-entry.size, len(entry.causes))))
+
+
+def _contrasts(
+    episode: Episode, over: Iterable[str] | Mapping[str, Any] | None, at: int
+) -> dict[str, Any]:
+    if isinstance(over, Mapping):
+        return dict(over)
+    done = dict.fromkeys(name for start, plan in episode.layers if start <= at for name in plan)
+    names = tuple(done) if over is None else tuple(over)
+    for name in names:
+        if name not in done:
+            allowed = (*done, f"{{{name!r}: the value that it would have had instead}}")
+            raise UnknownOption("cause", name, allowed)
+    return dict.fromkeys(names, Natural())

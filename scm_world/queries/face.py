@@ -1,0 +1,288 @@
+"""The world that can be asked: seeing, doing, and imagining."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Self, final
+
+from scm_world._types import Floats
+from scm_world.queries import estimates, samples
+from scm_world.queries.courses import Course, Key
+from scm_world.queries.episodes import Episode, rollout
+from scm_world.queries.estimates import Effect
+from scm_world.queries.plans import Plan
+from scm_world.queries.samples import Progress, Samples, Setting
+from scm_world.queries.stages import stage_of
+from scm_world.world import Audit
+from scm_world.world import World as Simulated
+
+
+@final
+class World(Simulated):
+    """A causal model and an engine, to step, to intervene on, and to ask.
+
+    What steps and intervenes is that of ``scm_world.world.World``: it changes this world. What
+    asks (``given``, ``rollout``, ``see``, ``sample``, ``effect``) works on twins and leaves this
+    world as it is.
+
+    Example:
+        >>> world = World("pushing", backend="fake")
+        >>> with world.given({"tool_block.mass": 0.05}) as heavy:
+        ...     episode = heavy.rollout("random", seed=1, steps=3)
+        >>> float(episode["tool_block.mass"][-1])
+        0.05
+        >>> episode.counterfactual({}) == episode
+        True
+    """
+
+    _standing: Plan = Plan()
+    _course: Course
+    _fired: dict[Key, int]
+
+    # --- another world ------------------------------------------------------------------------
+
+    @property
+    def plan(self) -> Plan:
+        """What ``given`` does to every episode of this world."""
+        return self._standing
+
+    def given(self, do: Mapping[str, Any]) -> Self:
+        """Give another world in which this is done too, and leave this one as it is.
+
+        Every episode of the other world begins with it, as do its answers. If an episode is
+        going on it goes on there as well, bit for bit, and what has no time is done at once. As a
+        context manager the other world is closed at the end.
+
+        Args:
+            do: Interventions, with or without a time; ``world.given(a).given(b)`` is
+                ``world.given({**a, **b})``.
+
+        Raises:
+            InterventionError: The intervention was refused.
+        """
+        other = copy.deepcopy(self)
+        other._standing = self._standing.do(do)
+        if other._started:
+            due = Course([(other.index, Plan(do))]).due(other, other.index, {})
+            if due:
+                other.do(due)
+        return other
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle with what is given."""
+        build, arguments = super().__reduce__()
+        return build, arguments, {"_standing": self._standing}
+
+    def reset(
+        self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
+    ) -> Audit | None:
+        """Begin an episode, with what is given; see ``scm_world.world.World.reset``."""
+        if not len(self._standing):
+            return super().reset(seed=seed, episode=episode, do=do)
+        super().reset(seed=seed, episode=episode)
+        acts = {**self._standing.at_start(), **Plan(do).at_start()}
+        self._course, self._fired = Course([(0, self._standing)]), {}
+        due = {**self._course.due(self, 0, self._fired), **acts}
+        return self.do(due) if due else None
+
+    def advance(self, command: Floats) -> None:
+        """Advance one control step, with what is due at its beginning."""
+        if len(self._standing) and self.index:
+            due = self._course.due(self, self.index, self._fired)
+            if due:
+                self.do(due)
+        super().advance(command)
+
+    # --- asking -------------------------------------------------------------------------------
+
+    def rollout(
+        self,
+        policy: Any = None,
+        *,
+        seed: int = 0,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        steps: int | None = None,
+        record: Iterable[str] = (),
+    ) -> Episode:
+        """Let an episode happen, and remember it whole.
+
+        Args:
+            policy: A function of the world that gives an action, shape (9,); actions of shape
+                (9,) or (steps, 9); ``"random"``; or None: the robot stays where it begins.
+            seed: Of the noise.
+            episode: Number of the episode within that noise.
+            do: Interventions, with or without a time.
+            steps: How many control steps; as many as the task has if None.
+            record: Variables to write down on the way; others are found by going through again.
+
+        Raises:
+            InterventionError: An intervention was refused.
+            ActionError: The policy is none, or gave no action.
+        """
+        plan = self._standing.do(do or {})
+        return rollout(
+            stage_of(self), policy, seed=seed, number=episode, do=plan, steps=steps, record=record
+        )
+
+    def see(
+        self,
+        n: int,
+        *,
+        outcomes: Iterable[Any] = ("fractional_success",),
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> Samples:
+        """Watch episodes without doing anything; see ``sample``."""
+        return self.sample({}, n, outcomes=outcomes, progress=progress, **setting)
+
+    def sample(
+        self,
+        do: Mapping[str, Any],
+        n: int,
+        *,
+        outcomes: Iterable[Any] = ("fractional_success",),
+        first: int = 0,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> Samples:
+        """Let episodes happen under an intervention.
+
+        Args:
+            do: What is done in each of them.
+            n: How many.
+            outcomes: Names of variables (their final values), ``Outcome`` or functions of the
+                episode.
+            first: Number of the first one; unit i is the same in every question with one seed.
+            progress: Told after each episode how many are done, and how many there will be.
+            setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
+
+        Raises:
+            InterventionError: An intervention was refused.
+        """
+        return samples.sample(
+            stage_of(self),
+            self,
+            self._standing.do(do),
+            n,
+            outcomes=outcomes,
+            setting=Setting(**setting),
+            first=first,
+            progress=progress,
+        )
+
+    def effect(
+        self,
+        outcome: Any,
+        *,
+        do: Mapping[str, Any],
+        versus: Mapping[str, Any] | None = None,
+        n: int = 100,
+        paired: bool = True,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> Effect:
+        """Estimate how much an intervention changes an outcome.
+
+        Args:
+            outcome: The name of a variable (its final value), an ``Outcome``, or a function of the
+                episode that gives numbers.
+            do: What is done.
+            versus: What it is held against; nothing if None.
+            n: How many units.
+            paired: Whether the same units live through both, with the same noise.
+            progress: Told after each episode.
+            setting: See ``sample``.
+
+        Returns:
+            Mean and 95 % interval of the difference, and by how much pairing pays.
+        """
+        return estimates.effect(
+            stage_of(self),
+            self,
+            outcome,
+            do=self._standing.do(do),
+            versus=self._standing.do(versus or {}),
+            n=n,
+            paired=paired,
+            setting=Setting(**setting),
+            progress=progress,
+        )
+
+    def effect_over(
+        self,
+        outcome: Any,
+        *,
+        name: str,
+        values: Sequence[Any],
+        n: int = 100,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> tuple[Effect, ...]:
+        """Estimate the paired effects of values of a variable, each against the first one.
+
+        Args:
+            outcome: As in ``effect``.
+            name: Of the variable.
+            values: Two or more.
+            n: How many units.
+            progress: Told after each episode.
+            setting: See ``sample``.
+        """
+        return estimates.effect_over(
+            stage_of(self),
+            self,
+            outcome,
+            name=name,
+            values=values,
+            n=n,
+            setting=Setting(**setting),
+            progress=progress,
+        )
+
+    def effect_by(
+        self,
+        outcome: Any,
+        *,
+        do: Mapping[str, Any],
+        versus: Mapping[str, Any] | None = None,
+        by: Any,
+        bins: int = 4,
+        n: int = 200,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> tuple[tuple[tuple[float, float], Effect], ...]:
+        """Estimate paired effects among units that differ in a covariate.
+
+        Args:
+            outcome: As in ``effect``.
+            do: What is done.
+            versus: What it is held against; nothing if None.
+            by: The covariate: like an outcome, one number; read off the world of ``versus``.
+            bins: Into how many groups of equal size the units are sorted.
+            n: How many units, over all groups.
+            progress: Told after each episode.
+            setting: See ``sample``.
+
+        Returns:
+            For each group the ends of the covariate, and the effect.
+        """
+        return estimates.effect_by(
+            stage_of(self),
+            self,
+            outcome,
+            do=self._standing.do(do),
+            versus=self._standing.do(versus or {}),
+            by=by,
+            bins=bins,
+            n=n,
+            setting=Setting(**setting),
+            progress=progress,
+        )
