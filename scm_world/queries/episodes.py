@@ -34,6 +34,7 @@ class Episode:
         number: Of the episode within that noise.
         layers: Plans, each with the control step from which it counts.
         steps: How many control steps it has.
+        trace: What it left behind.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Episode:
         self.stage, self.seed, self.number = stage, seed, number
         self.layers: tuple[Layer, ...] = tuple(layers)
         self.steps = steps
-        self._trace = trace
+        self.trace = trace
         self._all: Trace | None = None
 
     # --- looking ------------------------------------------------------------------------------
@@ -62,22 +63,22 @@ class Episode:
     @property
     def actions(self) -> Floats:
         """What the policy asked for, shape (steps, 9)."""
-        return np.array(self._trace.actions).reshape(self.steps, 9)
+        return np.array(self.trace.actions).reshape(self.steps, 9)
 
     @property
     def audits(self) -> Mapping[int, Audit]:
         """What each intervention did, by control step."""
-        return dict(self._trace.audits)
+        return dict(self.trace.audits)
 
     @property
     def events(self) -> Mapping[str, int]:
         """At which control step events happened that variables waited for, by variable."""
-        return {name: step for (_, name, _), step in self._trace.fired.items()}
+        return {name: step for (_, name, _), step in self.trace.fired.items()}
 
     @property
     def names(self) -> tuple[str, ...]:
         """All variables of the structure at the end."""
-        return tuple(self._trace.declarations[-1][1].model)
+        return tuple(self.trace.declarations[-1][1].model)
 
     def __len__(self) -> int:
         return self.steps
@@ -92,21 +93,21 @@ class Episode:
         Raises:
             UnknownVariable: No variable has this name.
         """
-        if name in self._trace.values:
-            return np.array(self._trace.values[name])
-        declarations = self._trace.declarations
+        if name in self.trace.values:
+            return np.array(self.trace.values[name])
+        declarations = self.trace.declarations
         if len(declarations) == 1 and name in declarations[0][1].slices:
-            return np.array(self._trace.vectors)[:, declarations[0][1].slices[name]]
-        if all(name in values for _, values in self._trace.statics):
+            return np.array(self.trace.vectors)[:, declarations[0][1].slices[name]]
+        if all(name in values for _, values in self.trace.statics):
             return self._parameter(name)
         if not any(name in declaration.model for _, declaration in declarations):
             raise UnknownVariable(name, self.names)
         return np.array(self.replay().values[name])
 
     def _parameter(self, name: str) -> Value:
-        steps = [step for step, _ in self._trace.statics] + [self.steps + 1]
+        steps = [step for step, _ in self.trace.statics] + [self.steps + 1]
         lengths = np.diff(steps)
-        return np.repeat([values[name] for _, values in self._trace.statics], lengths, axis=0)
+        return np.repeat([values[name] for _, values in self.trace.statics], lengths, axis=0)
 
     def final(self, name: str) -> Value:
         """Give a variable at the end; see ``__getitem__``."""
@@ -122,7 +123,7 @@ class Episode:
                     world,
                     trace,
                     Course(self.layers),
-                    Given(self._trace.actions) if self.steps else as_policy(None),
+                    Given(self.trace.actions) if self.steps else as_policy(None),
                     first=0,
                     steps=self.steps,
                     names=(ALL,),
@@ -134,7 +135,7 @@ class Episode:
 
     def __eq__(self, other: object) -> bool:
         """Tell whether all states, parameters and actions are the same, bit for bit."""
-        return isinstance(other, Episode) and _same(self._trace, other._trace)
+        return isinstance(other, Episode) and _same(self.trace, other.trace)
 
     __hash__ = None  # type: ignore[assignment] # compared by content
 
@@ -185,13 +186,13 @@ class Episode:
     def _branch(
         self, world: World, course: Course, at: int, actions: Any, names: tuple[str, ...]
     ) -> Trace:
-        past = Given(self._trace.actions)
-        near = max((step for step in self._trace.snapshots if step <= at), default=0)
-        world.restore(self._trace.snapshots[near])
+        past = Given(self.trace.actions)
+        near = max((step for step in self.trace.snapshots if step <= at), default=0)
+        world.restore(self.trace.snapshots[near])
         if near < at:  # nothing is new until then
-            before, scratch = Course(self.layers), Trace(fired=dict(self._trace.fired))
+            before, scratch = Course(self.layers), Trace(fired=dict(self.trace.fired))
             run(world, scratch, before, past, first=near, steps=at, begun=True)
-        trace = self._trace.until(at)
+        trace = self.trace.until(at)
         trace.values = {name: list(self[name][:at]) for name in names}
         # What is in the snapshot already is asked for again, which changes nothing: interventions
         # at one instant are one intervention.

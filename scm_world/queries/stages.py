@@ -22,10 +22,14 @@ class Stage:
 
     Args:
         world: Is never touched.
+
+    Attributes:
+        task: Of the world.
+        options: What a twin is made with besides.
     """
 
     def __init__(self, world: World) -> None:
-        self._build, (self._kind, self._task, self._options, _), *_ = world.__reduce__()
+        self._build, (self._kind, self.task, self.options, _), *_ = world.__reduce__()
         self._free: list[World] = []
         self._lock = threading.Lock()
 
@@ -41,7 +45,7 @@ class Stage:
                 self._free.append(world)
 
     def _make(self) -> World:
-        made: World = self._build(self._kind, copy.copy(self._task), dict(self._options), None)
+        made: World = self._build(self._kind, copy.copy(self.task), dict(self.options), None)
         return made
 
 

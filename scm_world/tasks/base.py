@@ -41,7 +41,11 @@ class Task(ABC):
         weights: Weight of each reward term, by the name of its variable.
         terms: Reward terms of the user's own.
         start: Where the robot begins, shape (9,) [rad].
+        given: What it was made with.
     """
+
+    given: dict[str, Any]
+    is_named: bool
 
     name: ClassVar[str]
     default_weights: ClassVar[Mapping[str, float]]
@@ -51,6 +55,13 @@ class Task(ABC):
     rest: ClassVar[tuple[float, ...]] = trifinger.REST
     plan: Hashable = None
     conventions: Conventions = CONVENTIONS["scm_world"]
+
+    def __new__(cls, *args: Any, **given: Any) -> Self:
+        """Remember what the task was made with, so that it can be made again from a file."""
+        task = super().__new__(cls)
+        task.given = dict(given)
+        task.is_named = not args  # every argument has its name
+        return task
 
     def __init__(self, **common: Unpack[Common]) -> None:
         unknown = sorted(common.keys() - Common.__annotations__.keys())

@@ -1,0 +1,146 @@
+"""Episodes in files: everything that it takes to live through them again, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
+from scm_world.queries.courses import Course
+from scm_world.queries.episodes import Episode
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import Plan
+from scm_world.queries.policies import Sequence as Given
+from scm_world.queries.stages import Stage, stage_of
+from scm_world.queries.traces import Trace, begin, run
+from scm_world.tasks import TASKS, make_task
+from scm_world.world import World
+
+FORMAT = "scm_world/episode/1"
+
+
+def save_episode(episode: Episode, path: Path | str) -> Path:
+    """Write an episode to one file: a zip archive of numpy arrays and a JSON text.
+
+    It holds task, options, engine, seed, plans, actions, versions, and all states, which the
+    reader compares with. Nothing in it is a pickle.
+
+    Args:
+        episode: What happened.
+        path: Of the file; it gets the ending ``.npz`` if it has another one.
+
+    Raises:
+        ModelError: A plan has a function without a name, or the task arguments that are no
+            numbers and texts.
+    """
+    trace = episode.trace
+    target = Path(path).with_suffix(".npz")
+    part = target.with_name(target.name + ".part")
+    with part.open("wb") as stream:
+        np.savez_compressed(
+            stream,
+            about=np.array(json.dumps(_about(episode))),
+            actions=episode.actions,
+            states=np.concatenate(trace.vectors),
+            lengths=np.array([len(vector) for vector in trace.vectors]),
+        )
+    part.replace(target)
+    return target
+
+
+def _about(episode: Episode) -> dict[str, Any]:
+    task, options = episode.stage.task, dict(episode.stage.options)
+    if not task.is_named:
+        raise ModelError(
+            [f"give the arguments of {task.name!r} by name, so that they can be saved"]
+        )
+    with episode.stage.twin() as world:
+        engine = world.backend.name
+    try:
+        arguments = json.loads(json.dumps(_plain(task.given), allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ModelError([f"an argument of {task.name!r} cannot be written: {error}"]) from None
+    return {
+        "format": FORMAT,
+        "task": task.name,
+        "arguments": arguments,
+        "options": options,
+        "seed": episode.seed,
+        "number": episode.number,
+        "steps": episode.steps,
+        "layers": [[start, plan.as_dict()] for start, plan in episode.layers],
+        "versions": versions(engine),
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(part) for part in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def load_episode(
+    path: Path | str, *, world: World | None = None, trusted: Sequence[str] = ()
+) -> Episode:
+    """Read an episode and live through it again.
+
+    Args:
+        path: Of the file.
+        world: Where it happens, for a task that is not registered; made from the file if None.
+        trusted: Packages whose functions may be mechanisms of its plans.
+
+    Raises:
+        UnreadableFile: It is no episode.
+        UnknownOption: Its task is not registered, and no world is given.
+        SnapshotMismatch: It did not happen again bit for bit: another version, say.
+    """
+    file = Path(path)
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            about = json.loads(str(arrays["about"]))
+            actions, states = arrays["actions"], arrays["states"]
+            lengths = arrays["lengths"]
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        advice = "give a file that save_episode wrote"
+        raise UnreadableFile(str(file), str(error), advice) from None
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise UnreadableFile(str(file), "it is no episode", "give a file that save_episode wrote")
+    stage = stage_of(world) if world is not None else _stage(about)
+    layers = [
+        (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
+    ]
+    trace, course = Trace(), Course(layers)
+    with stage.twin() as twin:
+        begin(twin, about["seed"], about["number"], course, trace)
+        run(twin, trace, course, Given(actions), first=0, steps=about["steps"], begun=True)
+    _compare(trace, np.split(states, np.cumsum(lengths)[:-1]), file, about["versions"])
+    return Episode(
+        stage,
+        seed=about["seed"],
+        number=about["number"],
+        layers=layers,
+        steps=about["steps"],
+        trace=trace,
+    )
+
+
+def _stage(about: dict[str, Any]) -> Stage:
+    if about["task"] not in TASKS:
+        raise UnknownOption("task", about["task"], (*TASKS, "any, with world=World(your task)"))
+    return Stage(World(make_task(about["task"], **about["arguments"]), **about["options"]))
+
+
+def _compare(trace: Trace, states: list[Any], file: Path, made: dict[str, str]) -> None:
+    for step, (now, then) in enumerate(zip(trace.vectors, states, strict=True)):
+        if now.tobytes() != then.tobytes():
+            raise SnapshotMismatch(
+                f"{file} happens otherwise from control step {step} on; it was made with "
+                + ", ".join(f"{name} {version}" for name, version in made.items())
+            )
