@@ -27,8 +27,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from scm_world.discovery.report import versions
 from scm_world.env import IDS
+from scm_world.queries.experiments.versions import versions
 from scm_world.training import MlpPolicy, load_sb2
 
 TIME = "time_left_for_task"

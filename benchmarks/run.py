@@ -22,9 +22,9 @@ import numpy as np
 
 import scm_world as sw
 from scm_world.backends.renderer import now_pixels
-from scm_world.discovery.report import versions
 from scm_world.env import ScmWorldEnv
 from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
+from scm_world.queries.experiments.versions import versions
 from scm_world.scene import Structure, default_scene
 from scm_world.scene.camera import CAMERAS
 from scm_world.scene.kinematics import forward, inverse_kernel

@@ -25,6 +25,8 @@ allowed and what to do::
     │   └── EngineFailure        it produced a state that is not finite
     ├── SnapshotMismatch         a snapshot of another scene
     ├── UnreadableFile           a file that is not what it should be
+    ├── Forbidden                a question that a laboratory does not allow
+    ├── BudgetExhausted          an experiment that costs more than is left
     └── MissingExtra             an optional package that is not installed
 """
 
@@ -352,6 +354,26 @@ class UnreadableFile(ScmWorldError, ValueError):
     def __init__(self, path: str, reason: str, advice: str) -> None:
         self.path, self.reason = path, reason
         super().__init__(f"{path!r} cannot be read: {reason}; {advice}")
+
+
+class Forbidden(ScmWorldError, PermissionError):
+    """A question that a laboratory does not allow; ``allowed`` says what it does."""
+
+    def __init__(self, what: str, allowed: Iterable[str]) -> None:
+        self.what, self.allowed = what, tuple(allowed)
+        shown = ", ".join(self.allowed[:20]) + (", …" if len(self.allowed) > 20 else "")
+        super().__init__(f"this laboratory does not let you {what}; allowed: {shown or 'nothing'}")
+
+
+class BudgetExhausted(ScmWorldError, RuntimeError):
+    """An experiment that costs more episodes (``asked``) than there are left (``left``)."""
+
+    def __init__(self, asked: int, left: int) -> None:
+        self.asked, self.left = asked, left
+        super().__init__(
+            f"the experiment takes {asked} episodes, but {left} are left of the budget; ask for "
+            "fewer, or open a laboratory with a larger budget on the same log"
+        )
 
 
 class MissingExtra(ScmWorldError, ImportError):

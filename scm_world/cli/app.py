@@ -53,6 +53,12 @@ class Format(StrEnum):
     DOT = "dot"
     JSON = "json"
     PNG = "png"
+    HTML = "html"
+    GML = "gml"
+    GRAPHML = "graphml"
+    NODE_LINK = "node-link"
+    DAGITTY = "dagitty"
+    CSV = "csv"
 
 
 Task = Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.")]
@@ -110,6 +116,28 @@ def discover(
 
     options = Options(task, backend, preset, probes, seed, tuple(option or ()))
     raise typer.Exit(run(options, out=out, strict=strict))
+
+
+@app.command()
+def verify(
+    task: Annotated[str, typer.Argument(help="Name of a task, or 'all'.")],
+    backend: Backend = "mujoco",
+    both: Annotated[bool, typer.Option("--both", help="On MuJoCo and Bullet; compare.")] = False,
+    probes: Annotated[int, typer.Option(min=1, help="How many states to try at most.")] = 200,
+    seed: Seed = 0,
+    preset: Preset = "fast",
+    out: Out = None,
+    option: Arguments = None,
+) -> None:
+    """Check the declared causal graph of a task against its physics.
+
+    Exits 1 unless every declared edge is seen and nothing else. 'all' takes small variants of
+    tasks with many blocks. Ctrl-C gives the result so far (exit code 130).
+    """
+    from scm_world.cli.verification import Options, run
+
+    options = Options(task, backend, both, preset, probes, seed, tuple(option or ()))
+    raise typer.Exit(run(options, out=out))
 
 
 @app.command()

@@ -64,7 +64,7 @@ def run(options: Options, *, out: Path | None, strict: bool) -> int:
     task = build(options.task, options.arguments)
     world = World(task, backend=options.backend, preset=options.preset)
     try:
-        with _progress(options.probes) as progress:
+        with shown_progress(options.probes) as progress:
             report = discover(world, probes=options.probes, seed=options.seed, progress=progress)
     finally:
         world.close()
@@ -81,20 +81,21 @@ def run(options: Options, *, out: Path | None, strict: bool) -> int:
 
 
 @contextmanager
-def _progress(probes: int) -> Iterator[Callable[[int, int], None]]:
+def shown_progress(probes: int, about: str = "") -> Iterator[Callable[[int, int], None]]:
     """Show how far it is: a bar on a terminal, a few plain lines elsewhere."""
     terminal = console(stderr=True)
+    lead = f"{about}, " if about else ""
     if not terminal.is_terminal:
         steps = {max(1, round(probes * quarter / 4)) for quarter in range(1, 5)}
         yield (
             lambda done, planned: (
-                terminal.print(f"probe state {done} of {planned}") if done in steps else None
+                terminal.print(f"{lead}probe state {done} of {planned}") if done in steps else None
             )
         )
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-    columns = ("probe states", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (f"{lead}probe states", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=terminal, transient=True) as bar:
         task = bar.add_task("", total=probes)
         yield lambda done, planned: bar.update(task, completed=done, total=planned)

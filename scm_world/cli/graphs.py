@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import typer
 from rich.text import Text
 
 from scm_world.cli.console import PAGE, check_writable, console, keep_whole, show, table, written
 from scm_world.cli.tasks import build, suffix
 from scm_world.discovery.names import braces, by_entity
-from scm_world.graph import SCM, to_dot, to_json
-from scm_world.variables import Affine, Box, Variable
+from scm_world.graph import SCM, to_json
+from scm_world.graph.exchange import causal_graph, space_lines, to_html, write_graph
+from scm_world.variables import Variable
 from scm_world.world import World
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def run(
 
         draw_model(world.model, out, title=f"{task}, as it is declared")
     else:
-        out.write_text(_text(world, format_))
+        out.write_text(_text(world, format_), encoding="utf-8")
     written(console(stderr=True), out)
 
 
@@ -61,13 +61,16 @@ def _to_terminal(world: World, format_: str) -> None:
 
 def _text(world: World, format_: str) -> str:
     match format_:
-        case "dot":
-            return to_dot(world.model) + "\n"
         case "json":
             return to_json(world.model) + "\n"
-    page = io.StringIO()
-    _print(console(file=page, width=PAGE), world.model)
-    return page.getvalue()
+        case "html":
+            title = f"{world.task.name}, as it is declared"
+            return to_html(causal_graph(world.model), title=title) + "\n"
+        case "table":
+            page = io.StringIO()
+            _print(console(file=page, width=PAGE), world.model)
+            return page.getvalue()
+    return write_graph(world.model, format=format_) + "\n"
 
 
 def _print(terminal: Console, model: SCM) -> None:
@@ -110,8 +113,8 @@ def _row(model: SCM, variable: Variable) -> tuple[str, ...]:
         variable.unit,
         shape,
         _default(given),
-        _space(variable.a),
-        _space(variable.b),
+        "\n".join(space_lines(variable.a)),
+        "\n".join(space_lines(variable.b)),
         "\n".join(_parents(model, variable)),
     )
 
@@ -135,33 +138,3 @@ def _parents(model: SCM, variable: Variable) -> list[str]:
             short = by_entity(name for name in model if name in names)
             found.append(f"lag {lag}: {', '.join(short)}")
     return found
-
-
-def _space(space: Any) -> str:
-    """Write a space as it is declared, with the names of the variables it follows."""
-    if space is None:
-        return ""
-    if not isinstance(space, Box):
-        return space.describe((), {})  # type: ignore[no-any-return]
-    lows, highs = (_ends(end) for end in (space.low, space.high))
-    size = max(len(lows), len(highs))
-    lows, highs = (ends * size if len(ends) == 1 else ends for ends in (lows, highs))
-    ends = zip(lows, highs, strict=True)
-    pairs = [low if low == high else f"{low} to {high}" for low, high in ends]
-    if len(set(pairs)) == 1:
-        return pairs[0]
-    finger = pairs[:3]
-    return "\n".join(finger if pairs == finger * (size // 3) else pairs)
-
-
-def _ends(end: Any) -> list[str]:
-    return [_end(part) for part in end] if isinstance(end, tuple) else [_end(end)]
-
-
-def _end(end: Any) -> str:
-    if not isinstance(end, Affine):
-        return f"{float(np.float64(end)):.4g}"
-    index = "" if end.index is None else f"[{end.index}]"
-    scale = "" if end.scale == 1.0 else f"{end.scale:g} "
-    offset = "" if end.offset == 0.0 else f"{end.offset:g} + "
-    return f"{offset}{scale}{end.parent}{index}"

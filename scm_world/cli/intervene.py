@@ -11,9 +11,9 @@ from scm_world._types import Floats, Value, Values
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import PAGE, RESULTS, check_writable, console
 from scm_world.cli.tasks import build, suffix
-from scm_world.discovery.effects import gap
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
+from scm_world.queries.experiments.effects import gap
 from scm_world.scene import Scene
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Audit, World

@@ -14,7 +14,7 @@ from rich.text import Text
 from scm_world._types import Value
 from scm_world.cli.console import keep_whole, plain, show, staged, table, written
 from scm_world.cli.intervene import Outcome, Row
-from scm_world.discovery.report import versions
+from scm_world.queries.experiments.versions import versions
 from scm_world.variables import Draw, Hard, Scale, Shift
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import final
 
-from scm_world.discovery.scores import EdgeKey
+from scm_world.queries.experiments.effects import EdgeKey
 
 _NUMBER = re.compile(r"\d+")
 _LINK = "robot_finger_{}_link_{}."

@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING, Any, final
 
 import networkx as nx
 
+from scm_world.discovery.canvas import FAINT, HEIGHT, INK, WIDTH, blank, save
 from scm_world.discovery.layers import Arrow, Drawing, lay_out
 from scm_world.discovery.names import Families
 from scm_world.discovery.report import DiscoveryReport
-from scm_world.discovery.scores import EdgeKey
 from scm_world.graph import SCM
+from scm_world.queries.experiments.effects import EdgeKey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH, HEIGHT, DPI = 1600, 900, 100  # [pixels], [pixels], [pixels/inch]
 DECLARED, MATCHED, EXTRA, MISSING = "#4a5568", "#1f6fb4", "#f28e2b", "#d62728"
-INK, FAINT = "#222222", "#c9ced6"
 AT_ONCE, LAGGED = "#5f6b7a", "#9a6fb0"
 MARKERS = {0: "o", 1: ">"}
 KINDS = {
@@ -32,23 +31,6 @@ KINDS = {
     "action": "#f7d6d0",
     "fixed": "#e6e6e6",
 }
-
-
-def _figure() -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: Path | str) -> None:
-    """Write the picture whole or not at all."""
-    target = Path(path)
-    part = target.with_name(target.name + ".part")
-    figure.savefig(part, format="png")
-    part.replace(target)
 
 
 # --- the two graphs of a discovery ---------------------------------------------------------------
@@ -141,7 +123,7 @@ def draw_graphs(report: DiscoveryReport, path: Path | str) -> None:
         path: Of the PNG, 1600 x 900 pixels.
     """
     matrix = _Matrix(report)
-    figure = _figure()
+    figure = blank()
     axes = figure.subplots(1, 2, sharey=True)
     figure.subplots_adjust(left=0.155, right=0.992, bottom=0.255, top=0.855, wspace=0.02)
     titles = (
@@ -157,7 +139,7 @@ def draw_graphs(report: DiscoveryReport, path: Path | str) -> None:
     axes[0].set_ylabel("effect", fontsize=11, color=INK)
     _heading(figure, report)
     _legend(figure)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _spot(matrix: _Matrix, cause: str, effect: str, lag: int) -> tuple[float, float]:
@@ -278,7 +260,7 @@ def draw_model(model: SCM, path: Path | str, *, title: str = "") -> None:
         title: What the model is.
     """
     drawing = lay_out(model)
-    figure = _figure()
+    figure = blank()
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set_xlim(0, WIDTH)
     ax.set_ylim(HEIGHT, 0)
@@ -291,7 +273,7 @@ def draw_model(model: SCM, path: Path | str, *, title: str = "") -> None:
     size = f"{len(model)} variables, {len(model.edges)} edges"
     ax.text(20, 62, size, fontsize=12, color=INK)
     _model_legend(ax, drawing)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _arrow(ax: Axes, arrow: Arrow) -> None:

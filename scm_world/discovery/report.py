@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
-import platform
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from scm_world.discovery.scores import EdgeKey, Score
+from scm_world.discovery.scores import Score
+from scm_world.queries.experiments.effects import EdgeKey
 
 FORMAT = "scm_world/discovery/1"
-
-
-def versions(engine: str = "") -> dict[str, str]:
-    """List the versions of everything that decides the result.
-
-    Args:
-        engine: ``"name version"`` of the physics engine, if there is one.
-    """
-    found = {"python": platform.python_version()}
-    for package in ("scm-world", "numpy", "numba", "networkx", "gymnasium", "pydantic"):
-        found[package] = importlib.metadata.version(package)
-    if engine:
-        name, _, version = engine.partition(" ")
-        found[name] = version
-    return found
 
 
 @final

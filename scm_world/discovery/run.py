@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from copy import deepcopy
 from typing import Any
 
-from scm_world.discovery.effects import Effects
-from scm_world.discovery.models import paired_effects
-from scm_world.discovery.paired import Paired
-from scm_world.discovery.probes import probes as probe_states
-from scm_world.discovery.report import DiscoveryReport, versions
+from scm_world.discovery.report import DiscoveryReport
 from scm_world.discovery.scores import score
-from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
+from scm_world.queries.experiments.effects import Effects
+from scm_world.queries.experiments.models import paired_effects
+from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import probes as probe_states
+from scm_world.queries.experiments.series import Progress, Series, checked_count
+from scm_world.queries.experiments.versions import versions
 from scm_world.world import World
-
-RESOLUTION = 1e-12
-"""Differences below it are not told from rounding, where the floor itself is exactly zero."""
-
-FACTOR = 10.0
-"""How far above the floor an effect must lie."""
 
 
 def discover(
@@ -29,7 +22,7 @@ def discover(
     *,
     probes: int = 32,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     **options: Any,
 ) -> DiscoveryReport:
     """Recover a causal graph by paired single-target interventions, and score it.
@@ -57,8 +50,7 @@ def discover(
         >>> discover(model, probes=2).score.shd
         0
     """
-    if not isinstance(probes, int) or probes < 1:
-        raise UnknownOption("number of probes", probes, ("any whole number from 1 on",))
+    checked_count("number of probes", probes)
     started = time.perf_counter()
     if isinstance(system, SCM):
         effects = paired_effects(system, probes=probes, seed=seed)
@@ -80,20 +72,11 @@ def discover(
 
 
 def _experiments(
-    world: World, probes: int, seed: int, progress: Callable[[int, int], None] | None
+    world: World, probes: int, seed: int, progress: Progress | None
 ) -> tuple[Effects, int]:
-    paired = Paired(world, seed)
-    done, finished = 0, paired.effects
-    try:
-        for number, probe in enumerate(probe_states(world, probes, seed)):
-            paired.run(number, probe)
-            done, finished = number + 1, deepcopy(paired.effects)
-            if progress is not None:
-                progress(done, probes)
-    except KeyboardInterrupt:
-        if done == 0:
-            raise
-    return finished, done
+    series = Series(Paired(world, seed), probes, progress)
+    series.run(probe_states(world, probes, seed))
+    return series.effects, series.done
 
 
 def _report(
@@ -105,7 +88,7 @@ def _report(
     about: dict[str, str],
     started: float,
 ) -> DiscoveryReport:
-    threshold = max(FACTOR * effects.floor, RESOLUTION)
+    threshold = effects.threshold
     found = effects.found(threshold)
     declared = {edge.key for edge in model.edges}
     inert = [size for key, size in effects.largest.items() if key not in found]

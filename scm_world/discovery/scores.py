@@ -6,8 +6,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
-EdgeKey = tuple[str, str, int]
-"""Cause, effect, lag."""
+from scm_world.queries.experiments.effects import EdgeKey
 
 
 @final

@@ -11,6 +11,8 @@ import networkx as nx
 from pydantic import TypeAdapter, ValidationError
 
 from scm_world.errors import InterventionError, ModelError
+from scm_world.graph.exchange import dot
+from scm_world.graph.exchange.model import causal_graph
 from scm_world.graph.scm import SCM
 from scm_world.graph.views import summary
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
@@ -154,24 +156,9 @@ def from_networkx(graph: nx.DiGraph, *, trusted: Sequence[str] = ()) -> SCM:
     return from_dict(plain, trusted=trusted)
 
 
-_SHAPES = {
-    "exogenous": "ellipse",
-    "derived": "box",
-    "measured": "octagon",
-    "action": "diamond",
-    "fixed": "plaintext",
-}
-
-
 def to_dot(model: SCM) -> str:
-    """Write the summary graph in the DOT language; lagged edges are dashed."""
-    lines = ["digraph scm {", "  rankdir=LR;"]
-    for name in model:
-        variable: Any = model[name]
-        label = f"{name}\\n[{variable.unit}]"
-        lines.append(f'  "{name}" [shape={_SHAPES[variable.kind]}, label="{label}"];')
-    for edge in model.edges:
-        style = "dashed" if edge.lag else "solid"
-        when = f', label="{edge.when}"' if edge.when else ""
-        lines.append(f'  "{edge.cause}" -> "{edge.effect}" [style={style}{when}];')
-    return "\n".join([*lines, "}"])
+    """Write the summary graph in the DOT language; lagged edges are dashed.
+
+    ``scm_world.graph.exchange`` writes DOT that can be read back.
+    """
+    return dot.to_dot(causal_graph(model), attributes=False)

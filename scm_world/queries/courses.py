@@ -85,7 +85,7 @@ def _due(
         case Clamp():
             act = _held(part, step, name, world)
         case On():
-            if key not in fired and part.event.happens(world):
+            if step > start and key not in fired and part.event.happens(world):
                 fired[key] = step
             act = part.act if fired.get(key) == step else None
         case _ if isinstance(part, ACTS):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Self, final
 
 from scm_world._types import Floats
@@ -37,8 +38,8 @@ class World(Simulated):
     """
 
     _standing: Plan = Plan()
-    _course: Course
-    _fired: dict[Key, int]
+    _course: Course = Course(())
+    _fired: Mapping[Key, int] = MappingProxyType({})
 
     # --- another world ------------------------------------------------------------------------
 
@@ -64,7 +65,9 @@ class World(Simulated):
         other = copy.deepcopy(self)
         other._standing = self._standing.do(do)
         if other._started:
-            due = Course([(other.index, Plan(do))]).due(other, other.index, {})
+            other._course = Course([*self._course.layers, (other.index, Plan(do))])
+            other._fired = fired = dict(self._fired)
+            due = other._course.due(other, other.index, fired)
             if due:
                 other.do(due)
         return other
@@ -78,7 +81,15 @@ class World(Simulated):
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle with what is given."""
         build, arguments = super().__reduce__()
-        return build, arguments, {"_standing": self._standing}
+        return (
+            build,
+            arguments,
+            {
+                "_standing": self._standing,
+                "_course": self._course,
+                "_fired": dict(self._fired),
+            },
+        )
 
     def reset(
         self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
@@ -88,14 +99,17 @@ class World(Simulated):
             return super().reset(seed=seed, episode=episode, do=do)
         super().reset(seed=seed, episode=episode)
         acts = {**self._standing.at_start(), **Plan(do).at_start()}
-        self._course, self._fired = Course([(0, self._standing)]), {}
-        due = {**self._course.due(self, 0, self._fired), **acts}
+        fired: dict[Key, int] = {}
+        self._course, self._fired = Course([(0, self._standing)]), fired
+        due = {**self._course.due(self, 0, fired), **acts}
         return self.do(due) if due else None
 
     def advance(self, command: Floats) -> None:
         """Advance one control step, with what is due at its beginning."""
         if len(self._standing) and self.index:
-            due = self._course.due(self, self.index, self._fired)
+            fired = dict(self._fired)
+            due = self._course.due(self, self.index, fired)
+            self._fired = fired
             if due:
                 self.do(due)
         super().advance(command)

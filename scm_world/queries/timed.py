@@ -147,7 +147,7 @@ Event = Annotated[Contact | Reaches, Field(discriminator="kind")]
 
 @final
 class On(Frozen):
-    """Intervene at the beginning of the first control step at which an event has happened.
+    """Intervene at the first control step, after the plan began, at which something is the case.
 
     Attributes:
         event: ``Contact`` or ``Reaches``.

@@ -87,6 +87,9 @@ def run(
         begun: Whether what is due at ``first`` has been done already.
     """
     wanted = tuple(names)
+    for name in wanted:
+        if name != ALL:
+            world.model.declared(name)  # or there is no such variable
     version = -1
     for step in range(first, steps + 1):
         if (step < steps or step == first) and not (begun and step == first):

@@ -101,7 +101,7 @@ def test_missing_edges_are_marked_and_strict_fails() -> None:
 
 def test_an_interrupted_discovery_reports_what_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C after the first probe state gives a partial report and exit code 130."""
-    from scm_world.discovery.paired import Paired
+    from scm_world.queries.experiments.paired import Paired
 
     run = Paired.run
 
@@ -122,7 +122,7 @@ def test_interrupted_before_the_first_probe_state_writes_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Ctrl-C before there is anything to report is one line and exit code 130."""
-    from scm_world.discovery.paired import Paired
+    from scm_world.queries.experiments.paired import Paired
 
     def interrupted(self: Paired, number: int, probe: Any) -> None:
         raise KeyboardInterrupt

@@ -12,8 +12,8 @@ from scm_world.discovery import DiscoveryReport, discover, score
 from scm_world.discovery.layers import lay_out
 from scm_world.discovery.names import Families, braces, by_entity
 from scm_world.discovery.plots import EXTRA, MATCHED, MISSING, draw_graphs, draw_model
-from scm_world.discovery.scores import EdgeKey
 from scm_world.graph import SCM
+from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.variables import Derived, Exogenous, Linear, Parent
 from scm_world.world import World
 

@@ -6,15 +6,15 @@ All choices are drawn from keyed noise: probe i of a seed is the same, whatever 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.discovery.placing import Dice, joints_for
-from scm_world.discovery.scenarios import AT_START, Scenario, scenarios
 from scm_world.errors import InterventionError
+from scm_world.queries.experiments.placing import Dice, joints_for
+from scm_world.queries.experiments.scenarios import AT_START, Scenario, scenarios
 from scm_world.variables import Noise
 from scm_world.world import World, WorldSnapshot
 
@@ -37,22 +37,24 @@ class Probe:
     action: Floats
 
 
-def probes(world: World, n: int, seed: int) -> Iterator[Probe]:
+def probes(world: World, n: int, seed: int, *, settled: bool = True) -> Iterator[Probe]:
     """Prepare probe states one after another.
 
     Args:
         world: To experiment with; it is reset for each probe.
         n: How many.
         seed: Of the choices.
+        settled: Whether control steps may be taken first. Without them a probe state is made of
+            the same numbers on every engine.
     """
     noise = Noise(seed)
     world.reset(seed=seed)
     kinds = scenarios(world)
     for number in range(n):
-        yield _prepared(world, kinds[number % len(kinds)], noise, number)
+        yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
 
 
-def _prepared(world: World, scenario: Scenario, noise: Noise, number: int) -> Probe:
+def _prepared(world: World, scenario: Scenario, noise: Noise, number: int, settled: bool) -> Probe:
     for attempt in range(ATTEMPTS):
         dice = Dice(noise, number, attempt)
         world.reset(seed=number)
@@ -61,10 +63,11 @@ def _prepared(world: World, scenario: Scenario, noise: Noise, number: int) -> Pr
             world.do(states)
         except InterventionError:
             continue
-        return _settled(world, scenario, drive, dice)
+        return _settled(world, scenario if settled else replace(scenario, steps=0), drive, dice)
     world.reset(seed=number)
     dice = Dice(noise, number)
-    return _settled(world, AT_START, AT_START.prepare(world, dice)[1], dice)
+    start = AT_START if settled else replace(AT_START, steps=0)
+    return _settled(world, start, AT_START.prepare(world, dice)[1], dice)
 
 
 def _settled(world: World, scenario: Scenario, drive: Floats, dice: Dice) -> Probe:

@@ -18,10 +18,10 @@ from typing import final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.discovery.effects import Effects, gap
-from scm_world.discovery.mechanisms import see_mechanisms
-from scm_world.discovery.probes import Probe
 from scm_world.errors import InterventionError
+from scm_world.queries.experiments.effects import EdgeKey, Effects, Response, Setting, gap
+from scm_world.queries.experiments.mechanisms import see_mechanisms
+from scm_world.queries.experiments.probes import Probe
 from scm_world.variables import Box, Categories, Integers, Measured, Noise, Rotations, Variable
 from scm_world.world import World
 
@@ -45,12 +45,14 @@ class Paired:
     Args:
         world: It is restored to the probe before every experiment.
         seed: Of the values that targets are set to.
+        responses: Whether to keep every effect of every probe state.
     """
 
-    def __init__(self, world: World, seed: int) -> None:
+    def __init__(self, world: World, seed: int, *, responses: bool = False) -> None:
         self._world = world
         self._noise = Noise(seed)
-        self.effects = Effects()
+        kept: dict[tuple[EdgeKey, int], Response] = {}
+        self.effects = Effects(responses=kept if responses else None)
         model = world.model
         self.targets = tuple(
             v.name
@@ -68,6 +70,13 @@ class Paired:
             if isinstance(v, Measured) and v.mechanism is None and not v.settable
         )
         self._readouts = (*reported, *self._computed)
+        self._readers = tuple(
+            {
+                name: frozenset(p.name for p in model.declared(name).all_parents if p.lag == lag)
+                for name in self._computed
+            }
+            for lag in (0, 1)
+        )
         self._pool: dict[str, list[Value]] = {name: [] for name in self._readouts}
 
     def run(self, number: int, probe: Probe) -> None:
@@ -79,6 +88,7 @@ class Paired:
         for target in self.targets:
             self._experiment(target)
         self._vary_action()
+        self._doing(None)
         if number < TRIED_ALONE:
             see_mechanisms(self._world, self._at_once, self.effects, self._noise, number)
         for name in self._readouts:
@@ -87,6 +97,10 @@ class Paired:
             self._pool[name] = self._pool[name][-SEEN_ELSEWHERE:]
 
     # --- the pieces of an experiment ----------------------------------------------------------
+
+    def _doing(self, change: Floats | None) -> None:
+        """Say what is being done, so that what is seen can be told where it was seen."""
+        self.effects.setting = Setting(self._number, self._probe.kind, change)
 
     def _restored(self) -> dict[str, Value]:
         self._world.restore(self._probe.snapshot)
@@ -110,6 +124,7 @@ class Paired:
 
     def _changed(self, target: str, value: Value) -> bool:
         """Do the experiments with one value of a target; tell whether all could be done."""
+        self._doing(np.ravel(value) - np.ravel(self._at_once[target]))
         try:
             self._see_target(target, value)
         except InterventionError:
@@ -185,7 +200,7 @@ class Paired:
             self._hold(target, value, moved)
         after, _ = self._advanced(self._probe.action)
         for name in self._states.intersection(after):
-            self.effects.see(target, name, 1, gap(after[name], self._later[name]))
+            self.effects.see(target, name, 1, after[name], self._later[name])
 
     def _differing(self, target: str, held: list[str]) -> list[str]:
         """Name what is not as it was, although it could be."""
@@ -219,8 +234,7 @@ class Paired:
         for name in moved:
             others = [other for other in moved if other != name]
             self._hold(target, value, (*deciding, *others))
-            size = gap(self._world[name], self._at_once[name])
-            self.effects.see(target, name, 0, size)
+            self.effects.see(target, name, 0, self._world[name], self._at_once[name])
 
     def _see_computed(self, cause: str, moved: list[str], alone: Values) -> None:
         """Evaluate each computed variable with all other computed ones at their old values."""
@@ -228,8 +242,8 @@ class Paired:
         if cause in self._computed:
             known[cause] = alone[cause]
         for name in moved:
-            size = gap(self._evaluate(name, known, self._earlier), self._at_once[name])
-            self.effects.see(cause, name, 0, size)
+            value = self._evaluate(name, known, self._earlier)
+            self.effects.see(cause, name, 0, value, self._at_once[name])
 
     def _evaluate(self, name: str, known: Values, previous: Values) -> Value:
         return self._world.model.solve(known, previous=previous, only=(name,))[name]
@@ -242,21 +256,26 @@ class Paired:
     def _compare_later(self, cause: str, after: Values, memory: Values) -> None:
         for name in after:
             if name in self._states:
-                self.effects.see(cause, name, 1, gap(after[name], self._later[name]))
+                self.effects.see(cause, name, 1, after[name], self._later[name])
         self._see_memory(cause, memory)
 
     def _see_memory(self, cause: str, memory: Values) -> None:
-        """Find computed variables that depend on the cause one step ago."""
+        """Find computed variables that depend on the cause one step ago.
+
+        A mechanism is handed its declared causes only, so the others need not be evaluated.
+        """
         own = {**self._memory, **({cause: memory[cause]} if cause in memory else {})}
         for name in self._computed:
-            size = gap(self._evaluate(name, self._later, own), self._later[name])
-            self.effects.see(cause, name, 1, size)
+            if cause in self._readers[1][name]:
+                value = self._evaluate(name, self._later, own)
+                self.effects.see(cause, name, 1, value, self._later[name])
 
     def _undo(self, target: str, value: Value) -> None:
         """Do and undo: whatever remains is not an effect but noise of the apparatus."""
         self._world.restore(self._probe.snapshot)
         self._world.do({target: value})
         self._world.do({target: self._at_once[target]})
+        self.effects.undone.add(target)
         after, _ = self._advanced(self._probe.action)
         worst = max(gap(after[name], self._later[name]) for name in after)
         self.effects.floor = max(self.effects.floor, worst)
@@ -265,7 +284,9 @@ class Paired:
         self._world.restore(self._probe.snapshot)
         spread = self._world.action_high - self._world.action_low
         unit = self._noise.uniforms("action", n=9, episode=self._number)[0]
-        after, memory = self._advanced(self._probe.action + 0.1 * spread * (unit - 0.5))
+        change = 0.1 * spread * (unit - 0.5)
+        self._doing(change)
+        after, memory = self._advanced(self._probe.action + change)
         self._compare_later("action", after, memory)
 
     def _vary_readout(self, cause: str) -> None:
@@ -273,8 +294,8 @@ class Paired:
 
         No experiment in the world can do this; it is done in the model of the readouts.
         """
+        others = [name for name, causes in self._readers[0].items() if cause in causes]
         for value in self._pool[cause]:
             known = {**self._at_once, cause: value}
-            others = [name for name in self._computed if name != cause]
             self._see_computed(cause, others, known)
             self._see_memory(cause, {**self._memory, cause: value})

@@ -14,7 +14,8 @@ from typing import final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.discovery.placing import (
+from scm_world.errors import InterventionError
+from scm_world.queries.experiments.placing import (
     CLEARANCE,
     HIGHEST,
     TIP,
@@ -31,7 +32,6 @@ from scm_world.discovery.placing import (
     top,
     touched,
 )
-from scm_world.errors import InterventionError
 from scm_world.scene.scene import WALL_RADIUS
 from scm_world.variables import catalogue as numbers
 from scm_world.world import World

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.discovery.effects import Effects, gap
 from scm_world.graph import SCM, Moment
+from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.variables import Box, Categories, Integers, Noise, Variable
 
 
@@ -55,7 +55,7 @@ def _compare(
         if lag == 0 and name == cause:
             continue
         value = model.solve(known, previous=previous, moment=at, only=(name,))[name]
-        effects.see(cause, name, lag, gap(value, unit[name]))
+        effects.see(cause, name, lag, value, unit[name])
 
 
 def _another(variable: Variable, value: Value, values: Values, noise: Noise, number: int) -> Value:

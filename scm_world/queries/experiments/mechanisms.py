@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.discovery.effects import Effects, gap
+from scm_world.queries.experiments.effects import Effects
 from scm_world.variables import Derived, Exogenous, Noise, Variable
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import World
@@ -49,7 +49,7 @@ def _compare(world: World, child: Derived, base: Values, other: Values, effects:
     for parent in child.parents:
         known = {**base, parent.name: other[parent.name]}
         after = world.model.solve(known, only=(child.name,))[child.name]
-        effects.see(parent.name, child.name, 0, gap(after, before))
+        effects.see(parent.name, child.name, 0, after, before)
 
 
 def _mechanisms(world: World) -> Iterator[Derived]:

@@ -1,0 +1,205 @@
+"""Graphs of other causal libraries. They are loaded when they are needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, final
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.errors import MissingExtra, UnknownOption
+from scm_world.graph.exchange.model import CausalGraph, Node, causal_graph
+from scm_world.graph.exchange.networks import bare, from_digraph
+from scm_world.graph.exchange.registry import reading
+from scm_world.graph.exchange.slices import View, read_as, seen_as
+from scm_world.graph.scm import SCM
+from scm_world.graph.structure import Edge
+
+RIGHT, LEFT, NONE = "-->", "<--", ""
+
+
+def _load(module: str, library: str) -> Any:
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingExtra(library, library) from error
+
+
+def _acyclic(source: CausalGraph | SCM, view: View, library: str) -> CausalGraph:
+    if view == "lagged":
+        raise UnknownOption("view", view, ("summary", "two_slice"))
+    graph = seen_as(causal_graph(source), view)
+    graph.check_acyclic(library)
+    return graph
+
+
+def _read(make: Callable[[], CausalGraph], view: View, what: str) -> CausalGraph:
+    with reading("the graph", what):
+        return read_as(make(), view)
+
+
+# --- tigramite -----------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class TigramiteGraph:
+    """What tigramite's functions take as ``graph`` and ``var_names``.
+
+    Attributes:
+        graph: Shape (n, n, max lag + 1), dtype ``<U3``. ``graph[i, j, lag]`` is ``"-->"`` if i acts
+            on j; ``graph[j, i, 0]`` is then ``"<--"`` for lag 0. Elsewhere it is empty.
+        var_names: The names, in order.
+    """
+
+    graph: NDArray[np.str_]
+    var_names: tuple[str, ...]
+
+
+def to_tigramite(source: CausalGraph | SCM) -> TigramiteGraph:
+    """Write a graph as tigramite does; nothing needs to be installed.
+
+    Raises:
+        ModelError: Edges of lag 0 form a cycle, as in a summary graph.
+
+    Example:
+        >>> found = to_tigramite(CausalGraph((Node("x"), Node("y")), (Edge("x", "y", 1),)))
+        >>> found.graph.shape, str(found.graph[0, 1, 1])
+        ((2, 2, 2), '-->')
+    """
+    graph = causal_graph(source)
+    graph.check_acyclic("tigramite", lag=0)
+    at = {name: i for i, name in enumerate(graph.names)}
+    array = np.full((len(at), len(at), graph.max_lag + 1), NONE, dtype="<U3")
+    for edge in graph.edges:
+        cause, effect = at[edge.cause], at[edge.effect]
+        array[cause, effect, edge.lag] = RIGHT
+        if edge.lag == 0:
+            array[effect, cause, 0] = LEFT
+    return TigramiteGraph(array, graph.names)
+
+
+def from_tigramite(graph: NDArray[np.str_], var_names: Sequence[str]) -> CausalGraph:
+    """Read a graph of tigramite.
+
+    Args:
+        graph: Strings, shape (n, n, max lag + 1).
+        var_names: The n names.
+
+    Raises:
+        UnreadableFile: The shape is another one, or an edge is not directed.
+    """
+    return _read(lambda: _from_array(np.asarray(graph), tuple(var_names)), "lagged", "graph")
+
+
+def _from_array(array: NDArray[np.str_], names: tuple[str, ...]) -> CausalGraph:
+    if array.ndim != 3 or array.shape[:2] != (len(names), len(names)):
+        raise ValueError(f"expected shape ({len(names)}, {len(names)}, lags), got {array.shape}")
+    edges = []
+    for i, j, lag in np.argwhere(array != NONE).tolist():
+        mark, back = str(array[i, j, lag]), str(array[j, i, 0])
+        where = f"{mark!r} from {names[i]!r} to {names[j]!r}, lag {lag}"
+        if mark not in ((RIGHT, LEFT) if lag == 0 else (RIGHT,)):
+            raise ValueError(f"{where}, is no directed edge")
+        if lag == 0 and {mark, back} != {RIGHT, LEFT}:
+            raise ValueError(f"{where}, does not fit {back!r} in the other direction")
+        if mark == RIGHT:
+            edges.append(Edge(names[i], names[j], lag))
+    return CausalGraph(tuple(map(Node, names)), tuple(edges))
+
+
+# --- causal-learn --------------------------------------------------------------------------------
+
+
+def to_causal_learn(source: CausalGraph | SCM, *, view: View = "two_slice") -> Any:
+    """Write a graph as a ``causallearn.graph.GeneralGraph``.
+
+    Raises:
+        MissingExtra: causal-learn is not installed.
+        ModelError: The view has a cycle.
+        UnknownOption: There is no such view.
+    """
+    graph = _acyclic(source, view, "causal-learn")
+    general = _load("causallearn.graph.GeneralGraph", "causal-learn").GeneralGraph
+    node = _load("causallearn.graph.GraphNode", "causal-learn").GraphNode
+    nodes = {name: node(name) for name in graph.names}
+    made = general(list(nodes.values()))
+    for edge in graph.edges:
+        made.add_directed_edge(nodes[edge.cause], nodes[edge.effect])
+    return made
+
+
+def from_causal_learn(graph: Any, *, view: View = "two_slice") -> CausalGraph:
+    """Read a graph of causal-learn.
+
+    Raises:
+        UnreadableFile: An edge is not directed, or the slices do not fit together.
+    """
+    return _read(lambda: _from_general(graph), view, "graph")
+
+
+def _from_general(graph: Any) -> CausalGraph:
+    nodes = tuple(Node(node.get_name()) for node in graph.get_nodes())
+    edges = []
+    for edge in graph.get_graph_edges():
+        ends = {str(edge.get_endpoint1()), str(edge.get_endpoint2())}
+        if ends != {"TAIL", "ARROW"}:
+            raise ValueError(f"{str(edge)!r} is no directed edge")
+        names = (edge.get_node1().get_name(), edge.get_node2().get_name())
+        forward = str(edge.get_endpoint2()) == "ARROW"
+        edges.append(Edge(*(names if forward else names[::-1])))
+    return CausalGraph(nodes, tuple(edges))
+
+
+# --- pgmpy and DoWhy -----------------------------------------------------------------------------
+
+
+def to_pgmpy(source: CausalGraph | SCM, *, view: View = "two_slice") -> Any:
+    """Write a graph as a ``pgmpy.base.DAG``; its ``edges()`` make any Bayesian network of pgmpy.
+
+    Raises:
+        MissingExtra: pgmpy is not installed.
+        ModelError: The view has a cycle.
+        UnknownOption: There is no such view.
+    """
+    graph = _acyclic(source, view, "pgmpy")
+    made = _load("pgmpy.base", "pgmpy").DAG()
+    made.add_nodes_from(graph.names)
+    made.add_edges_from((edge.cause, edge.effect) for edge in graph.edges)
+    return made
+
+
+def from_pgmpy(graph: nx.DiGraph, *, view: View = "two_slice") -> CausalGraph:
+    """Read a DAG or a Bayesian network of pgmpy.
+
+    Raises:
+        UnreadableFile: It is none, or the slices do not fit together.
+    """
+    return _read(lambda: from_digraph(graph), view, "directed graph")
+
+
+def to_dowhy(source: CausalGraph | SCM, *, view: View = "two_slice") -> nx.DiGraph:
+    """Write a graph as DoWhy takes it; nothing needs to be installed.
+
+    Returns:
+        A networkx graph for ``dowhy.CausalModel(graph=…)`` and the models of ``dowhy.gcm``. For the
+        GML text that ``CausalModel`` also takes: ``write_graph(…, format="gml", view=…)``.
+
+    Raises:
+        ModelError: The view has a cycle.
+        UnknownOption: There is no such view.
+
+    Example:
+        >>> graph = CausalGraph((Node("x"), Node("y")), (Edge("x", "y", 1),))
+        >>> list(to_dowhy(graph).edges), list(to_dowhy(graph, view="summary").edges)
+        ([('x@-1', 'y')], [('x', 'y')])
+    """
+    return bare(_acyclic(source, view, "DoWhy"))
+
+
+from_dowhy = from_pgmpy
+"""Read a networkx graph; see ``from_pgmpy``."""

@@ -1,0 +1,39 @@
+"""Questions to a world: what follows, what would have followed, and whether the graph is right."""
+
+from scm_world.queries.differences import ButFor, Difference, Divergence, but_for, compare
+from scm_world.queries.episode_files import load_episode, save_episode
+from scm_world.queries.episodes import Episode
+from scm_world.queries.estimates import Effect
+from scm_world.queries.face import World
+from scm_world.queries.laboratory import Laboratory, intervention_data
+from scm_world.queries.outcomes import Outcome
+from scm_world.queries.plans import Plan, do
+from scm_world.queries.policies import Random
+from scm_world.queries.samples import Samples, Setting
+from scm_world.queries.timed import At, Clamp, Contact, On, Reaches
+
+__all__ = [
+    "At",
+    "ButFor",
+    "Clamp",
+    "Contact",
+    "Difference",
+    "Divergence",
+    "Effect",
+    "Episode",
+    "Laboratory",
+    "On",
+    "Outcome",
+    "Plan",
+    "Random",
+    "Reaches",
+    "Samples",
+    "Setting",
+    "World",
+    "but_for",
+    "compare",
+    "do",
+    "intervention_data",
+    "load_episode",
+    "save_episode",
+]

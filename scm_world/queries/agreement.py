@@ -1,0 +1,218 @@
+"""In what two engines agree, as data."""
+
+from __future__ import annotations
+
+from typing import Literal, final
+
+from scm_world.queries.experiments.effects import FACTOR, EdgeKey
+from scm_world.queries.verification import Report, Row, Verification, arrow, listed, written
+
+SAME = 0.95
+"""Share of the comparable edges whose sign must be the same."""
+
+FACTORS = (0.0, 1.0, 3.0, FACTOR)
+"""How far effects lie above the floor between the engines, in the shares that are reported."""
+
+
+@final
+class Sign(Report):
+    """One comparison of an effect on two engines.
+
+    Attributes:
+        cause: The variable that was changed.
+        effect: The variable that answered.
+        lag: 0 or 1.
+        probe: Number of the probe state.
+        component: Of the effect, flattened: the one that answered most.
+        moves: Whether the engine decides the effect; else it is computed, alike on both.
+        answers: Difference of this component on each engine, for an increase of the cause.
+        apart: By how much the engines differ in this effect without any change: their floor.
+    """
+
+    cause: str
+    effect: str
+    lag: int
+    probe: int
+    component: int
+    moves: bool
+    answers: tuple[float, float]
+    apart: float
+
+    @property
+    def key(self) -> EdgeKey:
+        """Cause, effect and lag."""
+        return self.cause, self.effect, self.lag
+
+    @property
+    def equal(self) -> bool:
+        """Whether both answers have one sign."""
+        return (self.answers[0] > 0) == (self.answers[1] > 0)
+
+    def clear(self, factor: float = FACTOR) -> bool:
+        """Tell whether both answers lie well above what the engines differ by anyway."""
+        return min(map(abs, self.answers)) > factor * self.apart
+
+
+@final
+class EdgeSigns(Report):
+    """The comparisons of one edge.
+
+    Attributes:
+        cause: The variable that was changed.
+        effect: The variable that answered.
+        lag: 0 or 1.
+        compared: In how many probe states it was seen on both engines.
+        clear: In how many of them both effects lie well above the floor between the engines.
+        equal: In how many of the clear ones both have one sign.
+    """
+
+    cause: str
+    effect: str
+    lag: int
+    compared: int
+    clear: int
+    equal: int
+
+    @property
+    def same(self) -> bool | None:
+        """Whether the sign is the same in most of the clear comparisons; None if none is."""
+        return 2 * self.equal > self.clear if self.clear else None
+
+
+@final
+class Share(Report):
+    """Equal signs of what the engine decides, among effects of some clarity.
+
+    Attributes:
+        factor: How far above the floor between the engines both effects lie.
+        compared: Comparisons, one per edge and probe state.
+        equal: Those with one sign.
+        edges: Edges with such a comparison.
+        edges_equal: Edges whose sign is the same in most of them.
+    """
+
+    factor: float
+    compared: int
+    equal: int
+    edges: int
+    edges_equal: int
+
+
+@final
+class Agreement(Report):
+    """Two verifications of one task, and the signs of its effects on both engines.
+
+    Attributes:
+        format: Of the file.
+        task: Name of the task.
+        backends: Names of the engines.
+        verifications: Of each engine that was reached: both, unless it was interrupted.
+        interrupted: Whether it was stopped (Ctrl-C) before it was through.
+        probes: In how many probe states signs were compared.
+        signs: Every comparison.
+        seconds: Wall time, of the verifications too.
+    """
+
+    format: Literal["scm_world/agreement/1"] = "scm_world/agreement/1"
+    task: str
+    backends: tuple[str, str]
+    verifications: tuple[Verification, ...]
+    interrupted: bool
+    probes: int
+    signs: tuple[Sign, ...]
+    seconds: float
+
+    @property
+    def only(self) -> dict[str, tuple[EdgeKey, ...]]:
+        """List edges that were seen on one engine only, by its name."""
+        if len(self.verifications) < 2:
+            return {}
+        one, other = (set(found.seen) for found in self.verifications)
+        first, second = self.backends
+        return {first: tuple(sorted(one - other)), second: tuple(sorted(other - one))}
+
+    def edges(self, factor: float = FACTOR, *, moving: bool = False) -> tuple[EdgeSigns, ...]:
+        """Make the table of edges.
+
+        Args:
+            factor: How far above the floor between the engines an effect is clear.
+            moving: Whether to leave out effects that are computed, alike on both engines.
+        """
+        by_edge: dict[EdgeKey, list[Sign]] = {}
+        for sign in self.signs:
+            if sign.moves or not moving:
+                by_edge.setdefault(sign.key, []).append(sign)
+        return tuple(_together(key, found, factor) for key, found in sorted(by_edge.items()))
+
+    def at(self, factor: float) -> Share:
+        """Count equal signs of what the engine decides, among effects of some clarity."""
+        clear = [edge for edge in self.edges(factor, moving=True) if edge.clear]
+        return Share(
+            factor=factor,
+            compared=sum(edge.clear for edge in clear),
+            equal=sum(edge.equal for edge in clear),
+            edges=len(clear),
+            edges_equal=sum(bool(edge.same) for edge in clear),
+        )
+
+    @property
+    def share(self) -> float:
+        """Comparable edges into what the engine decides with the same sign; 1 if there is none."""
+        found = self.at(FACTOR)
+        return found.edges_equal / found.edges if found.edges else 1.0
+
+    @property
+    def opposite(self) -> tuple[EdgeKey, ...]:
+        """List edges whose clear effects do not have the same sign in most probe states."""
+        return tuple((e.cause, e.effect, e.lag) for e in self.edges() if e.same is False)
+
+    @property
+    def passed(self) -> bool:
+        """Whether both verifications passed and signs agree."""
+        verified = all(found.passed for found in self.verifications)
+        return verified and self.share >= SAME and not self.interrupted
+
+    def rows(self) -> tuple[Row, ...]:
+        """List the numbers, what they mean, and whether they are good."""
+        only = [
+            (f"edges on {name} only", listed(map(arrow, edges)), not edges)
+            for name, edges in self.only.items()
+        ]
+        shares = [_row(self.at(factor), self.share >= SAME) for factor in FACTORS]
+        return (
+            *only,
+            ("probe states with signs", str(self.probes), None),
+            *shares,
+            ("sign not the same", listed(map(arrow, self.opposite)), None),
+            *([("interrupted", "yes", False)] if self.interrupted else []),
+            ("seconds", f"{self.seconds:.1f}", None),
+            ("passed", "yes" if self.passed else "no", self.passed),
+        )
+
+    def __str__(self) -> str:
+        title = f"Agreement of {' and '.join(self.backends)} on {self.task}"
+        return "\n\n".join([*map(str, self.verifications), written(title, self.rows())])
+
+
+def _together(key: EdgeKey, signs: list[Sign], factor: float) -> EdgeSigns:
+    cause, effect, lag = key
+    clear = [sign for sign in signs if sign.clear(factor)]
+    equal = sum(sign.equal for sign in clear)
+    return EdgeSigns(
+        cause=cause, effect=effect, lag=lag, compared=len(signs), clear=len(clear), equal=equal
+    )
+
+
+def _row(share: Share, good: bool) -> Row:
+    name = f"same sign, effects > {share.factor:g} x engines' gap"
+    edges = (
+        f"{share.edges_equal} of {share.edges} edges ({_percent(share.edges_equal, share.edges)})"
+    )
+    each = (
+        f"{share.equal} of {share.compared} comparisons ({_percent(share.equal, share.compared)})"
+    )
+    return name, f"{edges}, {each}", good if share.factor == FACTOR else None
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f} %" if whole else "none"

@@ -1,0 +1,1 @@
+"""Paired experiments: one variable changed, and everything else kept."""

@@ -1,0 +1,127 @@
+"""Effects of experiments, and how large they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+
+EdgeKey = tuple[str, str, int]
+"""Cause, effect, lag."""
+
+RESOLUTION = 1e-12
+"""Differences below it are not told from rounding, where the floor itself is exactly zero."""
+
+FACTOR = 10.0
+"""How far above the floor an effect must lie."""
+
+
+@final
+@dataclass(frozen=True)
+class Setting:
+    """What was done when something was seen.
+
+    Attributes:
+        probe: Number of the probe state.
+        kind: How the probe state came about.
+        change: By how much the cause was moved; None where no world was intervened on.
+    """
+
+    probe: int
+    kind: str
+    change: Floats | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Response:
+    """How an effect answered to a change of its cause.
+
+    Attributes:
+        change: Of the cause, flattened.
+        answer: Difference of the effect, flattened.
+        base: Value of the effect without the change, flattened.
+    """
+
+    change: Floats
+    answer: Floats
+    base: Floats
+
+
+@final
+@dataclass
+class Effects:
+    """The largest effect seen so far on each ordered pair.
+
+    Attributes:
+        largest: By cause, effect and lag.
+        settings: Where the largest effect of each pair was seen, if it is not zero.
+        floor: Largest difference after something was done and undone.
+        undone: Targets that were changed and put back.
+        rollouts: Control steps simulated in an experiment of their own.
+        refused: Targets for which no feasible value was found, with how often.
+        setting: What is being done now.
+        responses: By pair and probe, if they are wanted; else None.
+    """
+
+    largest: dict[EdgeKey, float] = field(default_factory=dict)
+    settings: dict[EdgeKey, Setting] = field(default_factory=dict)
+    floor: float = 0.0
+    undone: set[str] = field(default_factory=set)
+    rollouts: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+    setting: Setting | None = None
+    responses: dict[tuple[EdgeKey, int], Response] | None = None
+
+    def see(self, cause: str, effect: str, lag: int, after: Value, before: Value) -> None:
+        """Remember a difference if it is the largest of its pair."""
+        key, size = (cause, effect, lag), gap(after, before)
+        if size > self.largest.get(key, -1.0):
+            self.largest[key] = size
+            if size > 0.0 and self.setting is not None:
+                self.settings[key] = self.setting
+        if self.responses is not None and size > 0.0:
+            self._respond(self.responses, key, np.ravel(after), np.ravel(before))
+
+    def _respond(
+        self,
+        responses: dict[tuple[EdgeKey, int], Response],
+        key: EdgeKey,
+        after: Floats,
+        before: Floats,
+    ) -> None:
+        setting = self.setting
+        if setting is not None and setting.change is not None:
+            responses[key, setting.probe] = Response(setting.change, after - before, before)
+
+    @property
+    def threshold(self) -> float:
+        """What an effect must exceed, given the floor."""
+        return max(FACTOR * self.floor, RESOLUTION)
+
+    def found(self, threshold: float) -> set[EdgeKey]:
+        """List the pairs whose effect exceeds a threshold."""
+        return {key for key, size in self.largest.items() if size > threshold}
+
+    def copy(self) -> Effects:
+        """Keep what was seen so far."""
+        return replace(
+            self,
+            largest=dict(self.largest),
+            settings=dict(self.settings),
+            undone=set(self.undone),
+            refused=dict(self.refused),
+            responses=None if self.responses is None else dict(self.responses),
+        )
+
+
+def gap(a: Value, b: Value) -> float:
+    """Compute the largest difference of two values; NaN counts as infinite."""
+    x, y = np.asarray(a), np.asarray(b)
+    if (x == y).all():
+        return 0.0
+    size = float(np.max(np.abs(x.astype(float) - y)))
+    return size if size == size else np.inf

@@ -1,0 +1,21 @@
+"""What a result depends on beside the code: versions."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+
+
+def versions(engine: str = "") -> dict[str, str]:
+    """List the versions of everything that decides the result.
+
+    Args:
+        engine: ``"name version"`` of the physics engine, if there is one.
+    """
+    found = {"python": platform.python_version()}
+    for package in ("scm-world", "numpy", "numba", "networkx", "gymnasium", "pydantic"):
+        found[package] = importlib.metadata.version(package)
+    if engine:
+        name, _, version = engine.partition(" ")
+        found[name] = version
+    return found

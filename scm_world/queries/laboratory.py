@@ -1,0 +1,297 @@
+"""A world with permissions, a budget and a log: what a discovery algorithm or an agent gets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.errors import BudgetExhausted, Forbidden, UnknownOption
+from scm_world.queries.journal import Journal, Record
+from scm_world.queries.outcomes import Outcome
+from scm_world.queries.plans import Plan
+from scm_world.queries.samples import Samples, Setting, sample
+from scm_world.queries.stages import Stage, stage_of
+from scm_world.variables import Fixed
+from scm_world.world import World
+from scm_world.world.start import whole_number
+
+QUESTIONS = ("see", "do", "counterfactual")
+
+
+@final
+class Laboratory:
+    """Experiments on a world, without a look at its graph.
+
+    Every experiment is checked before it begins, and written to the log when it has ended; a
+    laboratory that is opened with the log of an earlier one goes on where that one was.
+
+    Args:
+        world: Is not touched.
+        allow: Which questions may be asked: ``"see"``, ``"do"``, ``"counterfactual"``.
+        visible: Patterns of the variables that may be seen, such as ``"tool_block.*"``.
+        settable: Patterns of those that may be set.
+        budget: How many episodes there are in all; without end if None.
+        outcomes: What an experiment reports: names of visible variables (their final values) or
+            ``Outcome``; the final values of all that is visible if None.
+        log: File to write to; a line of JSON for each experiment.
+        setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
+
+    Raises:
+        UnknownOption: A pattern matches nothing, or a question does not exist.
+        UnreadableFile: The log is one of another laboratory.
+
+    Example:
+        >>> from scm_world.queries.face import World
+        >>> world = World("pushing", backend="fake")
+        >>> lab = Laboratory(world, settable=["*.mass"], visible=["tool_block.*"], budget=10)
+        >>> found = lab.do({"tool_block.mass": 0.05}, n=4)
+        >>> found["tool_block.mass"].shape, lab.remaining
+        ((4,), 6)
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        allow: Iterable[str] = QUESTIONS,
+        visible: Iterable[str] = ("*",),
+        settable: Iterable[str] = ("*",),
+        budget: int | None = None,
+        outcomes: Iterable[Any] | None = None,
+        log: Path | str | None = None,
+        **setting: Any,
+    ) -> None:
+        self.allow = tuple(allow)
+        for question in self.allow:
+            if question not in QUESTIONS:
+                raise UnknownOption("question", question, QUESTIONS)
+        self._world: World = world
+        self._stage: Stage = stage_of(world)
+        self._setting = Setting(**setting)
+        model = world.model
+        everything = tuple(n for n in model if not isinstance(model.declared(n), Fixed))
+        can_be_set = tuple(n for n in model if model.declared(model.target(n)).settable)
+        self.visible = _matching("visible", visible, everything)
+        self.settable = _matching("settable", settable, can_be_set)
+        self.budget = None if budget is None else whole_number("budget", budget, least=0)
+        self.outcomes = self._reported(outcomes)
+        self._journal = Journal(log, self._terms())
+
+    def _reported(self, outcomes: Iterable[Any] | None) -> tuple[Outcome, ...]:
+        wanted = self.visible if outcomes is None else tuple(outcomes)
+        found = tuple(given if isinstance(given, Outcome) else Outcome(given) for given in wanted)
+        for outcome in found:
+            if outcome.name not in self.visible:
+                raise Forbidden(f"see {outcome.name}", self.visible)
+        return found
+
+    def _terms(self) -> dict[str, Any]:
+        """Say what has to be the same for a log to be gone on with."""
+        setting = self._setting
+        return {
+            "task": self._world.task.name,
+            "engine": self._world.backend.name,
+            "seed": setting.seed,
+            "steps": setting.steps,
+            "policy": setting.policy if isinstance(setting.policy, str) else "given",
+            "nature": Plan(setting.nature).as_dict()["do"],
+            "outcomes": [outcome.model_dump() for outcome in self.outcomes],
+        }
+
+    # --- the books ----------------------------------------------------------------------------
+
+    @property
+    def spent(self) -> int:
+        """How many episodes were used."""
+        return sum(record.episodes for record in self._journal.records)
+
+    @property
+    def remaining(self) -> int | None:
+        """How many are left; None if there is no end."""
+        return None if self.budget is None else self.budget - self.spent
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """All experiments, in their order."""
+        return tuple(self._journal.records)
+
+    # --- experiments --------------------------------------------------------------------------
+
+    def see(self, n: int) -> Samples:
+        """Watch new episodes.
+
+        Raises:
+            Forbidden: This question is not allowed.
+            BudgetExhausted: There are fewer episodes left.
+        """
+        return self._experiment("see", {}, n)
+
+    def do(self, request: Mapping[str, Any], n: int = 1, *, row: int | None = None) -> Samples:
+        """Intervene in new episodes.
+
+        Args:
+            request: Interventions, with or without a time.
+            n: How many episodes.
+            row: Of a protocol, for the log.
+
+        Raises:
+            Forbidden: This question is not allowed, or something may not be set.
+            BudgetExhausted: There are fewer episodes left.
+            InterventionError: The intervention was refused; that costs nothing.
+        """
+        return self._experiment("do", request, n, row=row)
+
+    def counterfactual(
+        self, unit: int, request: Mapping[str, Any], *, at: int = 0
+    ) -> dict[str, Floats]:
+        """Ask what a unit that was seen would have come to under another intervention.
+
+        Args:
+            unit: Number of an episode of an earlier experiment.
+            request: What is done.
+            at: From which control step on.
+
+        Returns:
+            The reported outcomes of that unit as it would have been.
+
+        Raises:
+            Forbidden: As in ``do``, or the unit was never seen.
+            BudgetExhausted: No episode is left.
+        """
+        self._permit("counterfactual", request, 1)
+        plan = self._plan_of(unit)
+        names = tuple(dict.fromkeys(outcome.name for outcome in self.outcomes))
+        episode = self._setting.episode(self._stage, self._world, plan, unit, ())
+        other = episode.counterfactual(request, at=at, record=names)
+        columns = {_key(outcome): outcome.of(other) for outcome in self.outcomes}
+        held = Samples(
+            {k: v[None] for k, v in columns.items()}, (unit,), self._setting.seed, Plan(request)
+        )
+        self._journal.write("counterfactual", held, at=at)
+        return columns
+
+    def run(self, protocol: Path | str | Iterable[Mapping[str, Any]]) -> tuple[Samples, ...]:
+        """Carry out a protocol: a table of settings in, a data set out.
+
+        Args:
+            protocol: A CSV file whose columns are variables (``name[i]`` for a component) and,
+                if wanted, ``n``, or rows of the same kind; an empty cell leaves a variable alone.
+                Rows that the log has already are not carried out again.
+
+        Raises:
+            UnknownOption: A cell is no number.
+            Forbidden: As in ``do``; before anything is carried out.
+            BudgetExhausted: Likewise, for the whole table.
+        """
+        from scm_world.queries.protocols import read_protocol
+
+        rows = read_protocol(protocol, self._world.model)
+        done = {r.row: r for r in self._journal.records if r.row is not None}
+        for index, (request, _) in enumerate(rows):
+            if index in done and done[index].samples.plan != Plan(request):
+                raise UnknownOption(
+                    "protocol", f"row {index}", ("the one that the log began with",)
+                )
+        todo = [(i, *row) for i, row in enumerate(rows) if i not in done]
+        for _, request, n in todo:
+            self._permit("do" if request else "see", request, n)
+        self._afford(sum(n for _, _, n in todo))
+        for index, request, n in todo:
+            self._experiment("do" if request else "see", request, n, row=index)
+        found = {r.row: r.samples for r in self._journal.records if r.row is not None}
+        return tuple(found[index] for index in range(len(rows)))
+
+    def _experiment(
+        self, kind: str, request: Mapping[str, Any], n: int, *, row: int | None = None
+    ) -> Samples:
+        count = whole_number("n", n, least=1)
+        self._permit(kind, request, count)
+        first = self._journal.next_unit
+        found = sample(
+            self._stage,
+            self._world,
+            request,
+            count,
+            outcomes=self.outcomes,
+            setting=self._setting,
+            first=first,
+        )
+        named = Samples(
+            {_key(o): values for o, values in zip(self.outcomes, found.values(), strict=True)},
+            found.numbers,
+            found.seed,
+            found.plan,
+        )
+        self._journal.write(kind, named, row=row)
+        return named
+
+    # --- permissions --------------------------------------------------------------------------
+
+    def _permit(self, kind: str, request: Mapping[str, Any], n: int) -> None:
+        if kind not in self.allow:
+            raise Forbidden(kind, self.allow)
+        plan = Plan(request)
+        for name in plan:
+            if name not in self.settable:
+                raise Forbidden(f"set {name}", self.settable)
+        for name, part in plan.timed():
+            watched = getattr(getattr(part, "event", None), "name", None)
+            if watched is not None and watched not in self.visible:
+                raise Forbidden(f"wait with {name} for {watched}", self.visible)
+        for name, act in plan.acts():
+            for parent in getattr(act, "parents", ()):
+                if parent.name not in self.visible:
+                    raise Forbidden(f"let {name} follow {parent.name}", self.visible)
+        self._afford(n)
+
+    def _afford(self, n: int) -> None:
+        left = self.remaining
+        if left is not None and n > left:
+            raise BudgetExhausted(n, left)
+
+    def _plan_of(self, unit: int) -> Plan:
+        for record in self._journal.records:
+            if record.kind != "counterfactual" and unit in record.samples.numbers:
+                return record.samples.plan
+        raise Forbidden(f"imagine unit {unit}, which was never seen", self._units())
+
+    def _units(self) -> Sequence[str]:
+        last = self._journal.next_unit
+        return (f"units 0 to {last - 1}",) if last else ("none yet: see or do something first",)
+
+
+def _key(outcome: Outcome) -> str:
+    return str(outcome).removeprefix("final ")
+
+
+def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:
+    given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
+    for pattern in given:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise UnknownOption(option, pattern, names)
+    return tuple(n for n in names if any(fnmatchcase(n, pattern) for pattern in given))
+
+
+def intervention_data(
+    experiments: Iterable[Samples], names: Sequence[str]
+) -> tuple[list[Floats], list[list[int]]]:
+    """Give experiments the way learners from interventions take them.
+
+    Args:
+        experiments: What was seen and done.
+        names: Columns; each a number.
+
+    Returns:
+        One table of shape (n, m) for each experiment, and the numbers of the columns that it
+        intervened on.
+    """
+    tables, targets = [], []
+    for found in experiments:
+        tables.append(np.column_stack([np.asarray(found[name], float) for name in names]))
+        targets.append([i for i, name in enumerate(names) if name in found.plan])
+    return tables, targets

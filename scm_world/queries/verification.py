@@ -1,0 +1,225 @@
+"""What a verification found, as data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import accumulate
+from typing import Literal, Self, final
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from scm_world.errors import UnreadableFile
+from scm_world.queries.experiments.effects import EdgeKey
+
+SHOWN = 10  # edges that are written out in a table
+Row = tuple[str, str, bool | None]
+"""What a number means, the number, and whether it is good; None where it is neither."""
+
+
+class Report(BaseModel):
+    """Data that can be written as JSON and read back without loss."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    def to_json(self) -> str:
+        """Write the report as JSON."""
+        return self.model_dump_json(indent=1) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read what ``to_json`` wrote.
+
+        Raises:
+            UnreadableFile: It is something else.
+        """
+        try:
+            return cls.model_validate_json(text)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            raise UnreadableFile(cls.__name__, reason, "give what to_json() wrote") from None
+
+
+@final
+class Fired(Report):
+    """A declared edge that moved its child.
+
+    Attributes:
+        cause: The variable that was changed.
+        effect: The variable that answered.
+        lag: 0 or 1.
+        after: How many probe states it took.
+        largest: Largest effect seen, in the unit of the child.
+    """
+
+    cause: str
+    effect: str
+    lag: int
+    after: int
+    largest: float
+
+    @property
+    def key(self) -> EdgeKey:
+        """Cause, effect and lag."""
+        return self.cause, self.effect, self.lag
+
+
+@final
+class Undeclared(Report):
+    """An effect without an edge.
+
+    Attributes:
+        cause: The variable that was changed.
+        effect: The variable that should not have answered.
+        lag: 0 or 1.
+        size: Largest effect seen, in the unit of the child.
+        probe: Number of the probe state in which it was seen.
+        kind: How this probe state came about.
+        change: By how much the cause was moved, flattened; empty if no world was intervened on.
+    """
+
+    cause: str
+    effect: str
+    lag: int
+    size: float
+    probe: int
+    kind: str
+    change: tuple[float, ...]
+
+    @property
+    def key(self) -> EdgeKey:
+        """Cause, effect and lag."""
+        return self.cause, self.effect, self.lag
+
+    def __str__(self) -> str:
+        where = f"{self.size:.3g} in probe {self.probe} ({self.kind})"
+        return f"{arrow(self.key)}: {where}"
+
+
+@final
+class Verification(Report):
+    """A declared graph, held against the physics that is said to have it.
+
+    Attributes:
+        format: Of the file.
+        task: Name of the task.
+        arguments: What the task was made with, each as ``name=value``, where that is known.
+        backend: Name of the engine.
+        preset: Its numerical settings.
+        seed: Of the experiments.
+        probes: Probe states that were used.
+        planned: How many there may have been.
+        interrupted: Whether it was stopped (Ctrl-C) before it was through.
+        rollouts: Control steps simulated in an experiment of their own.
+        floor: Largest difference one step after something was changed and put back.
+        threshold: An effect must exceed it.
+        settable: How many variables ``do`` accepts.
+        untried: Those of them for which no feasible value was found in any probe state.
+        fired: Declared edges that were seen.
+        never_fired: Declared edges that were not.
+        undeclared: Effects without an edge.
+        colors: Edges from a color to something that moves, declared or seen.
+        seconds: Wall time.
+        versions: Of everything that decides the result.
+    """
+
+    format: Literal["scm_world/verification/1"] = "scm_world/verification/1"
+    task: str
+    arguments: tuple[str, ...] = ()
+    backend: str
+    preset: str
+    seed: int
+    probes: int
+    planned: int
+    interrupted: bool
+    rollouts: int
+    floor: float
+    threshold: float
+    settable: int
+    untried: tuple[str, ...]
+    fired: tuple[Fired, ...]
+    never_fired: tuple[EdgeKey, ...]
+    undeclared: tuple[Undeclared, ...]
+    colors: tuple[EdgeKey, ...]
+    seconds: float
+    versions: dict[str, str]
+
+    @property
+    def declared(self) -> int:
+        """How many edges are declared."""
+        return len(self.fired) + len(self.never_fired)
+
+    @property
+    def seen(self) -> tuple[EdgeKey, ...]:
+        """List the edges that were seen, declared or not."""
+        return (*(edge.key for edge in self.fired), *(edge.key for edge in self.undeclared))
+
+    @property
+    def share(self) -> float:
+        """Declared edges that were seen, as a fraction; 1 if none is declared."""
+        return len(self.fired) / self.declared if self.declared else 1.0
+
+    @property
+    def coverage(self) -> tuple[int, ...]:
+        """How many declared edges had been seen after each probe state."""
+        new = [0] * self.probes
+        for edge in self.fired:
+            new[edge.after - 1] += 1
+        return tuple(accumulate(new))
+
+    @property
+    def passed(self) -> bool:
+        """Whether every declared edge was seen, and nothing else; and undoing leaves no trace."""
+        wrong = self.undeclared or self.never_fired or self.colors or self.interrupted
+        return self.floor == 0.0 and not wrong
+
+    def rows(self) -> tuple[Row, ...]:
+        """List the numbers, what they mean, and whether they are good."""
+        states = f"{self.probes} of at most {self.planned}"
+        found = (
+            f"{len(self.fired)} of {self.declared} ({100 * self.share:.2f} %)",
+            self.share == 1,
+        )
+        return (
+            ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
+            ("preset, seed", f"{self.preset}, {self.seed}", None),
+            ("probe states", states + ": interrupted" * self.interrupted, None),
+            ("rollouts", f"{self.rollouts:,}", None),
+            ("floor (do and undo)", f"{self.floor:g}", self.floor == 0.0),
+            ("settable variables", str(self.settable), None),
+            ("never feasible", listed(self.untried), None),
+            ("declared edges seen", *found),
+            ("never seen", listed(map(arrow, self.never_fired)), not self.never_fired),
+            ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
+            ("colors that move something", listed(map(arrow, self.colors)), not self.colors),
+            ("seconds", f"{self.seconds:.1f}", None),
+            ("passed", "yes" if self.passed else "no", self.passed),
+        )
+
+    def __str__(self) -> str:
+        return written(f"Verification of {self.task} on {self.backend}", self.rows())
+
+
+def arrow(key: EdgeKey) -> str:
+    """Write an edge.
+
+    Example:
+        >>> arrow(("gravity", "block.linear_velocity", 1))
+        'gravity -> block.linear_velocity (lag 1)'
+    """
+    cause, effect, lag = key
+    return f"{cause} -> {effect} (lag {lag})"
+
+
+def listed(items: Iterable[object]) -> str:
+    """Count things and name the first of them, one per line."""
+    found = [str(item) for item in items]
+    more = [f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else []
+    return "\n".join([str(len(found)), *found[:SHOWN], *more])
+
+
+def written(title: str, rows: tuple[Row, ...]) -> str:
+    """Write rows as plain text, continued lines below their first one."""
+    width = max(len(name) for name, _, _ in rows)
+    indent = "\n" + " " * (width + 4)
+    lines = (f"  {name:<{width}}  {value.replace(chr(10), indent)}" for name, value, _ in rows)
+    return "\n".join([title, *lines])

@@ -1,0 +1,214 @@
+"""Verification: every declared edge must move its child, every other one must leave it alone."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, final
+
+from scm_world.errors import UnknownOption
+from scm_world.queries.agreement import Agreement, Sign
+from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import probes as probe_states
+from scm_world.queries.experiments.series import Progress, Series, checked_count
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.signs import compare_signs
+from scm_world.queries.verification import Fired, Undeclared, Verification
+from scm_world.tasks import Task
+from scm_world.variables import Measured
+from scm_world.world import World
+
+MOST, LEAST = 200, 16
+"""How many probe states there are at most, and how many even if every edge was seen before."""
+
+
+def verify(
+    system: World | Task | str,
+    *,
+    probes: int = MOST,
+    least: int = LEAST,
+    seed: int = 0,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Verification:
+    """Check the declared graph of a task against the physics that realises it.
+
+    From many probe states one variable at a time is changed, everything else kept, and whatever
+    differs afterwards is held against the declared edges. It ends when every declared edge was
+    seen. It may be interrupted (Ctrl-C); the report then covers the probe states that were
+    finished.
+
+    Args:
+        system: A world, a task, or the name of one.
+        probes: How many states to experiment in at most.
+        least: How many even if every declared edge has been seen before.
+        seed: Of states and values.
+        progress: Called with (finished, planned) after each probe state.
+        options: Arguments of ``World``, such as ``backend``, unless ``system`` is one.
+
+    Raises:
+        UnknownOption: ``probes`` or ``least`` is not a positive whole number, there are options
+            for a world that is made, or a name does not exist.
+
+    Example:
+        >>> found = verify("reaching", backend="fake", probes=1)
+        >>> found.floor, found.undeclared, found.passed  # without physics nothing moves
+        (0.0, (), False)
+    """
+    checked_count("number of probes", probes)
+    checked_count("least number of probes", least)
+    if isinstance(system, World):
+        if options:
+            raise UnknownOption("option for a world that is made", next(iter(options)), ())
+        return _verified(system, probes, least, seed, progress)
+    world = World(system, **options)
+    try:
+        return _verified(world, probes, least, seed, progress)
+    finally:
+        world.close()
+
+
+def verify_engines(
+    task: Task | str,
+    *,
+    backends: tuple[str, str] = ("mujoco", "bullet"),
+    probes: int = MOST,
+    least: int = LEAST,
+    seed: int = 0,
+    progress: Callable[[str], Progress | None] | None = None,
+    **options: Any,
+) -> Agreement:
+    """Verify a task on two engines, and compare the signs of its effects.
+
+    It may be interrupted (Ctrl-C); the report then has what is finished.
+
+    Signs are compared from probe states that are made of the same numbers on both engines, over
+    one control step. Two engines differ by something even where nothing was changed; only effects
+    well above this are comparable.
+
+    Args:
+        task: A task, or the name of one.
+        backends: Names of the engines.
+        probes: How many states to experiment in at most.
+        least: How many even if every declared edge has been seen before; signs are compared in
+            as many.
+        seed: Of states and values.
+        progress: Called with the name of each engine, and last with ``"signs"``; gives what is
+            called with (finished, planned) after each probe state.
+        options: Arguments of ``World``, without ``backend``.
+
+    Raises:
+        UnknownOption: See ``verify``.
+        MissingEngine: One of the engines is not installed.
+    """
+    started = time.perf_counter()
+
+    def told(name: str) -> Progress | None:
+        return None if progress is None else progress(name)
+
+    compared = min(least, probes)
+    limits: dict[str, Any] = {"probes": probes, "least": least, "seed": seed}
+    reports: list[Verification] = []
+    for name in backends:
+        reports.append(verify(task, progress=told(name), **limits, backend=name, **options))
+        if reports[-1].interrupted:
+            break
+    signs: tuple[Sign, ...] | None = None
+    if not reports[-1].interrupted:
+        with contextlib.suppress(KeyboardInterrupt):
+            signs = compare_signs(task, backends, compared, seed, told("signs"), options)
+    return Agreement(
+        task=reports[0].task,
+        backends=backends,
+        verifications=tuple(reports),
+        interrupted=signs is None,
+        probes=0 if signs is None else compared,
+        signs=signs or (),
+        seconds=time.perf_counter() - started,
+    )
+
+
+@final
+class _Watch:
+    """Notes after how many probe states each declared edge was first seen.
+
+    Args:
+        declared: The edges.
+        least: When it is early to end.
+    """
+
+    def __init__(self, declared: Iterable[EdgeKey], least: int) -> None:
+        self.missing, self.after = set(declared), dict[EdgeKey, int]()
+        self._least = least
+
+    def __call__(self, effects: Effects, done: int) -> bool:
+        """Look for edges that are seen now; tell whether it is enough."""
+        new = self.missing & effects.found(effects.threshold)
+        self.missing -= new
+        self.after.update(dict.fromkeys(new, done))
+        return not self.missing and done >= self._least
+
+
+def _verified(
+    world: World, probes: int, least: int, seed: int, progress: Progress | None
+) -> Verification:
+    started = time.perf_counter()
+    declared = tuple(edge.key for edge in world.model.edges)
+    measured = {v.name for v in world.model.variables if isinstance(v, Measured)}
+    watch, paired = _Watch(declared, least), Paired(world, seed)
+    series = Series(paired, probes, progress)
+    series.run(probe_states(world, probes, seed), watch)
+    effects, done = series.effects, series.done
+    found = effects.found(effects.threshold)
+    colors = {edge for edge in {*found, *declared} if _is_color(edge[0]) and edge[1] in measured}
+    return Verification(
+        task=world.task.name,
+        backend=world.backend.name,
+        preset=world.options.preset,
+        seed=seed,
+        probes=done,
+        planned=probes,
+        interrupted=done < probes and (bool(watch.missing) or done < least),
+        rollouts=effects.rollouts,
+        floor=effects.floor,
+        threshold=effects.threshold,
+        settable=len(paired.targets),
+        untried=tuple(sorted(set(paired.targets) - effects.undone)),
+        fired=tuple(_fired(key, effects, watch) for key in sorted(found & set(declared))),
+        never_fired=tuple(sorted(set(declared) - found)),
+        undeclared=tuple(_undeclared(key, effects) for key in sorted(found - set(declared))),
+        colors=tuple(sorted(colors)),
+        seconds=time.perf_counter() - started,
+        versions=versions(f"{world.backend.name} {world.backend.version}"),
+    )
+
+
+def _is_color(name: str) -> bool:
+    return name.endswith("color")
+
+
+def _fired(key: EdgeKey, effects: Effects, watch: _Watch) -> Fired:
+    cause, effect, lag = key
+    return Fired(
+        cause=cause,
+        effect=effect,
+        lag=lag,
+        after=watch.after[key],
+        largest=effects.largest[key],
+    )
+
+
+def _undeclared(key: EdgeKey, effects: Effects) -> Undeclared:
+    (cause, effect, lag), setting = key, effects.settings[key]
+    change = () if setting.change is None else tuple(setting.change.tolist())
+    return Undeclared(
+        cause=cause,
+        effect=effect,
+        lag=lag,
+        size=effects.largest[key],
+        probe=setting.probe,
+        kind=setting.kind,
+        change=change,
+    )

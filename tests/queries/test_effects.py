@@ -1,0 +1,194 @@
+"""Facts about seeing, doing, effects, differences and causes of outcomes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scm_world.errors import InterventionError, SnapshotMismatch, UnknownOption, UnreadableFile
+from scm_world.queries import (
+    Episode,
+    Outcome,
+    World,
+    but_for,
+    compare,
+    load_episode,
+    save_episode,
+)
+from scm_world.queries.estimates import difference, t_quantile
+from scm_world.tasks import Pushing
+
+NATURE = {"tool_block.mass": "A", "tool_block.cylindrical_position": "A"}
+SLIDE = {"tool_block.linear_velocity": [0.4, 0.0, 0.0]}
+
+
+def slid(episode: Episode) -> float:
+    """Measure how far the block slid along x [m]."""
+    place = episode["tool_block.cartesian_position"]
+    return float(place[-1, 0] - place[0, 0])
+
+
+def test_quantiles_are_those_of_the_tables() -> None:
+    """Student's t to half a percent."""
+    for degrees, table in ((4, 2.776), (10, 2.228), (30, 2.042), (120, 1.980)):
+        assert t_quantile(0.975, degrees) == pytest.approx(table, rel=5e-3)
+
+
+def test_intervals_cover_the_truth() -> None:
+    """In 95 of 100 cases, paired or not, and pairing pays as much as is said."""
+    random, hits = np.random.default_rng(0), np.zeros(2)
+    for _ in range(400):
+        unit = random.normal(0.0, 3.0, 12)
+        one, other = unit + 1.0 + random.normal(0.0, 1.0, 12), unit + random.normal(0.0, 1.0, 12)
+        for paired in (0, 1):
+            _, low, high, ratio = difference(one, other, paired=bool(paired))
+            hits[paired] += low <= 1.0 <= high
+    assert ratio > 2.0
+    assert 0.92 < hits[1] / 400 < 0.98
+    assert hits[0] / 400 > 0.98  # of pairs taken for strangers: too wide
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "bullet"])
+def test_more_friction_stops_a_block_sooner(backend: str) -> None:
+    """The effect has its sign, the pairs need far fewer units, and both agree."""
+    world = World("pushing", backend=backend)
+    acts = {"do": {**SLIDE, "floor_friction": 0.6}, "versus": {**SLIDE, "floor_friction": 0.4}}
+    nature = {"tool_block.mass": "A", "tool_block.friction": "A"}
+    paired = world.effect(slid, **acts, n=12, nature=nature, steps=15, policy=None)
+    apart = world.effect(slid, **acts, n=24, nature=nature, steps=15, policy=None, paired=False)
+    assert paired.high < 0.0
+    assert paired.variance_ratio > 3.0
+    assert apart.low < paired.mean < apart.high
+    assert json.loads(paired.to_json())["n"] == 12
+    assert "n = 12 paired" in str(paired)
+
+
+def test_colors_have_no_effect_at_all() -> None:
+    """Not a small one: none, in every unit, and the interval is a point."""
+    found = World("pushing").effect(
+        "tool_block.cartesian_position", do={"tool_block.color": [0.9, 0.1, 0.1]}, n=4, steps=8
+    )
+    assert not found.mean.any()
+    assert not found.excludes_zero
+    assert (found.high == 0.0).all()
+
+
+def test_units_are_the_same_in_every_question() -> None:
+    """Episode i of a seed is one unit, however many are asked for, by however many threads."""
+    world = World("pushing", backend="fake")
+    outcomes = ["tool_block.mass", Outcome("reward", "sum"), slid]
+    ten = world.see(10, outcomes=outcomes, nature=NATURE, steps=3)
+    last = world.sample({}, 3, first=7, outcomes=outcomes, nature=NATURE, steps=3, workers=3)
+    assert [*ten] == ["tool_block.mass", "sum reward", "slid"]
+    for name in ten:
+        np.testing.assert_array_equal(ten[name][7:], last[name])
+    assert len(np.unique(ten["tool_block.mass"])) == 10
+
+
+def test_a_table_goes_to_a_file(tmp_path: Path) -> None:
+    """Numbers without loss, and what was done beside them."""
+    found = World("pushing", backend="fake").sample(
+        {"tool_block.mass": "B"}, 3, outcomes=["tool_block.mass", "joint_positions"], steps=2
+    )
+    found.to_csv(tmp_path / "table.csv")
+    table = np.loadtxt(tmp_path / "table.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(table[:, 1:], found.matrix()[0])
+    assert json.loads((tmp_path / "table.json").read_text())["targets"] == ["tool_block.mass"]
+
+
+def test_effects_over_values_and_by_a_covariate() -> None:
+    """Each value against the first; each group of units by itself."""
+    world = World("pushing")
+    over = world.effect_over(
+        "reward", name="tool_block.mass", values=[0.02, 0.02, 0.1], n=3, steps=6
+    )
+    assert over[0].mean == 0.0
+    assert len(over) == 2
+    place = Outcome("tool_block.cylindrical_position", "first", 0)
+    groups = world.effect_by(
+        slid, do=SLIDE, by=place, bins=2, n=8, nature=NATURE, steps=6, policy=None
+    )
+    assert groups[0][0][1] <= groups[1][0][0]
+    assert all(effect.low > 0.0 for _, effect in groups)
+    assert sum(effect.n for _, effect in groups) == 8
+
+
+def test_two_episodes_are_compared() -> None:
+    """What differs, since when, which contacts and which noise are in one only."""
+    world = World("pushing")
+    one = world.rollout(steps=10, do=SLIDE)
+    assert str(compare(one, one.counterfactual({}))) == "no difference"
+    other = one.counterfactual({"floor_friction": "B", "floor_color": [1.0, 0.0, 0.0]}, at=3)
+    apart = compare(one, other)
+    assert apart.first == 3
+    assert apart.variables["floor_friction"].first == 3
+    assert apart.variables["tool_block.linear_velocity"].first == 4
+    assert "goal_block.size" not in apart.variables
+    assert apart.noise == (("floor_friction", 1),)
+    high = one.counterfactual({"tool_block.linear_velocity": [0.0, 0.0, 2.0]}, at=5)
+    assert (6, ("floor", "tool_block"), 0) in compare(one, high).contacts
+    assert compare(one, other, ["floor_color"], tolerance=2.0).variables == {}
+    with pytest.raises(UnknownOption, match="10 steps"):
+        compare(one, world.rollout(steps=9))
+
+
+def test_causes_are_told_from_what_did_not_matter() -> None:
+    """But for the speed the block would not have moved; the color is innocent."""
+    world = World("pushing")
+    episode = world.rollout(steps=8, do={**SLIDE, "floor_color": [1.0, 0.0, 0.0]})
+    first, last = but_for(episode, slid)
+    assert (first.causes, last.causes) == (("tool_block.linear_velocity",), ("floor_color",))
+    assert first.mattered
+    assert not last.mattered
+    assert abs(first.without) < 1e-3
+    pair = but_for(
+        episode,
+        lambda e: slid(e) > 0.01,
+        {"floor_friction": 0.1, "tool_block.mass": 0.1},
+        most=2,
+    )
+    assert [entry.causes for entry in pair if len(entry.causes) == 2] == [
+        ("floor_friction", "tool_block.mass")
+    ]
+    with pytest.raises(UnknownOption, match="cause"):
+        but_for(episode, slid, ["gravity"])
+
+
+@pytest.mark.parametrize("outcome", [3, None, lambda e: "far", lambda e: math.nan, "nobody"])
+def test_what_is_no_outcome_is_refused(outcome: object) -> None:
+    """With what it can be."""
+    with pytest.raises((UnknownOption, InterventionError)):
+        World("pushing", backend="fake").effect(outcome, do=SLIDE, n=2, steps=2)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "bullet"])
+def test_an_episode_in_a_file_happens_again(tmp_path: Path, backend: str) -> None:
+    """Bit for bit, with its task's arguments, its plans and its branches."""
+    world = World(Pushing(tool_block_mass=0.05), backend=backend, frame_skip=5)
+    episode = world.rollout("random", seed=2, episode=5, steps=9, do={"floor_friction": "A"})
+    branch = episode.counterfactual({"gravity": [0.0, 0.0, -5.0]}, at=4)
+    again = load_episode(save_episode(branch, tmp_path / "branch"))
+    assert again == branch
+    assert again != episode
+    assert again.counterfactual({}, at=6) == branch
+    assert again.stage.options["frame_skip"] == 5
+
+
+def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
+    """So is one whose states did not come about again."""
+    (tmp_path / "text.npz").write_text("no")
+    with pytest.raises(UnreadableFile, match="save_episode"):
+        load_episode(tmp_path / "text.npz")
+    with pytest.raises(UnreadableFile):
+        load_episode(tmp_path / "missing.npz")
+    path = save_episode(World("pushing").rollout(steps=3), tmp_path / "one")
+    with np.load(path) as found:
+        arrays = dict(found)
+    arrays["states"][-1] += 1e-16 + 1e-9
+    np.savez(path, **arrays)
+    with pytest.raises(SnapshotMismatch, match="control step 3"):
+        load_episode(path)

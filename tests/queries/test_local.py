@@ -1,0 +1,271 @@
+"""Local causal graphs: which body acts on which in one control step."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from scm_world.backends.base import Contact
+from scm_world.errors import NotReset, UnknownOption
+from scm_world.queries.local import (
+    RULES,
+    LocalEpisode,
+    LocalGraph,
+    LocalReport,
+    RuleScore,
+    local_episode,
+    local_graph,
+    local_report,
+    paired_truth,
+)
+from scm_world.queries.local_graphs import islands, reached
+from scm_world.queries.local_truth import FINGERS, Listener, listening
+from scm_world.scene import trifinger
+from scm_world.scene.kinematics import inverse
+from scm_world.world import World
+
+NEEDS_BULLET = pytest.mark.skipif(
+    importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
+)
+ENGINES = ["mujoco", pytest.param("bullet", marks=NEEDS_BULLET)]
+FINGER, ONE, TWO = FINGERS[0], "tool_block_1", "tool_block_2"
+TIP = trifinger.COLLISION["tip"].radius  # [m]
+HALF = 0.0325  # [m] of a block's edge
+
+_WORLDS: dict[str, World] = {}
+
+
+def begin(engine: str) -> World:
+    """Give a world with two blocks at the start of an episode."""
+    if engine not in _WORLDS:
+        mode = "end_effector_positions"
+        _WORLDS[engine] = World("stacking2", backend=engine, action_mode=mode)
+    _WORLDS[engine].reset(seed=0)
+    return _WORLDS[engine]
+
+
+def place(world: World, tip: np.ndarray, one: list[float], two: list[float]) -> np.ndarray:
+    """Put the first fingertip and both blocks somewhere, the other fingers out of the way.
+
+    Returns:
+        The fingertip positions, shape (9,).
+    """
+    tips = world["end_effector_positions"].reshape(3, 3).copy()
+    tips[0] = tip
+    joints = inverse(tips.ravel(), float(world["robot_height"]), np.array(trifinger.REST))
+    world.do(
+        {
+            "joint_positions": joints.joint_positions,
+            f"{ONE}.cartesian_position": one,
+            f"{TWO}.cartesian_position": two,
+        }
+    )
+    return tips.ravel()
+
+
+def among(*bodies: str) -> set[tuple[str, str]]:
+    """List all edges among some bodies."""
+    return set(itertools.permutations(bodies, 2))
+
+
+def pushed(world: World) -> np.ndarray:
+    """Let the first finger push the first block; the other lies elsewhere."""
+    near = np.array([0.0, HALF + TIP + 3e-4, HALF])
+    return place(world, near, [0.0, 0.0, HALF], [0.0, -0.16, HALF])
+
+
+def stacked(world: World) -> np.ndarray:
+    """Stand one block on the other."""
+    world.do({f"{ONE}.cartesian_position": [0, 0, HALF]})
+    world.do({f"{TWO}.cartesian_position": [0, 0, 3 * HALF]})
+    return world["end_effector_positions"]
+
+
+def alone(world: World) -> np.ndarray:
+    """Let one block fall, while the other stands far from it."""
+    away = {f"{ONE}.cartesian_position": [0.0, -0.14, HALF]}
+    world.do({f"{TWO}.cartesian_position": [0.0, 0.0, 0.2], **away})
+    return world["end_effector_positions"]
+
+
+def chained(world: World) -> np.ndarray:
+    """Let the first finger push the first block, and that one the second."""
+    near = np.array([0.0, HALF + TIP + 3e-4, HALF])
+    return place(world, near, [0.0, 0.0, HALF], [0.0, -2 * HALF - 3e-4, HALF])
+
+
+def onward(tips: np.ndarray, steps: int) -> list[np.ndarray]:
+    """List actions that move the first finger at 10 cm/s, so that it stays with what it pushes."""
+    return [tips - np.array([0.0, 0.004 * (t + 1), *[0.0] * 7]) for t in range(steps)]
+
+
+SCENES = {
+    pushed: among(FINGER, ONE),
+    stacked: among(ONE, TWO),
+    alone: set(),
+    chained: among(FINGER, ONE, TWO),
+}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
+def test_hand_made_scenes(engine: str, scene: Callable[[World], np.ndarray]) -> None:
+    """Contacts and experiments both say what anyone sees."""
+    world = begin(engine)
+    *actions, action = onward(scene(world), 4)
+    for earlier in actions:
+        world.step(earlier)
+    truth = paired_truth(world, action)
+    assert truth.floor == 0.0
+    assert set(truth.edges) == SCENES[scene]
+    assert set(local_graph(world, action).edges) == SCENES[scene]
+    assert set(local_graph(world, action, rule="listed").edges) == SCENES[scene]
+
+
+def contact(first: str, second: str, force: float = 1.0) -> Contact:
+    """Let two bodies touch."""
+    return Contact((first, second), np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, force)
+
+
+def causes(names: Iterable[str], *steps: list[Contact]) -> dict[str, str]:
+    """Say from which bodies each is reached, in short."""
+    found = reached(tuple(names), steps)
+    return {body: "".join(sorted(from_)) for body, from_ in found.items()}
+
+
+def test_what_passes_through_others_arrives_within_one_physics_step() -> None:
+    """An island is everything that touches, directly or through others."""
+    assert causes("abc", [contact("a", "b"), contact("b", "c")]) == dict.fromkeys("abc", "abc")
+
+
+def test_contacts_act_in_the_order_of_time() -> None:
+    """If b lets go of a before it meets c, then a acts on c, and c does not act on a."""
+    found = causes("abc", [contact("a", "b")], [contact("b", "c")])
+    assert found == {"a": "ab", "b": "abc", "c": "abc"}
+
+
+def test_what_stands_still_joins_no_island() -> None:
+    """Two blocks on one floor are apart, and links of one finger are one body."""
+    on_floor = [contact("a", "floor"), contact("floor", "b")]
+    assert causes("ab", on_floor) == {"a": "a", "b": "b"}
+    links = [contact(f"{FINGER}_link_3", "a"), contact("b", f"{FINGER}_link_2")]
+    assert islands((FINGER, "a", "b"), links) == [{FINGER, "a", "b"}]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_asking_changes_nothing(engine: str) -> None:
+    """The world goes on bit for bit as if nobody had asked, and lists the same contacts."""
+    futures = []
+    for asked in (False, True):
+        world = begin(engine)
+        action = onward(chained(world), 1)[0]
+        world.step(action)
+        before = world.values()
+        touching = [(c.bodies, c.depth, c.force) for c in world.backend.contacts()]
+        if asked:
+            local_graph(world)
+            local_graph(world, action)
+            paired_truth(world, action)
+            local_episode(world, lambda w: w["end_effector_positions"], 2)
+            local_report(world, [action] * 2, 2)
+            now = world.values()
+            assert all(before[name].tobytes() == now[name].tobytes() for name in now)
+        world.do({f"{TWO}.mass": 0.05})
+        later = [(c.bodies, c.depth, c.force) for c in world.backend.contacts()]
+        assert later == touching
+        for _ in range(3):
+            world.step(action)
+        futures.append(world.current()[1].vector.tobytes())
+    assert futures[0] == futures[1]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_listening_changes_nothing(engine: str) -> None:
+    """Ten physics steps one by one lead where ten at once lead."""
+    world = begin(engine)
+    action = onward(chained(world), 1)[0]
+    before = world.snapshot()
+    world.step(action)
+    at_once = world.current()[1].vector.copy()
+    world.restore(before)
+    with listening(world) as heard:
+        world.step(action)
+    assert len(heard.contacts) == 10
+    assert not isinstance(world.backend, Listener)
+    np.testing.assert_array_equal(world.current()[1].vector, at_once)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_asking_twice_gives_the_same(engine: str) -> None:
+    """Graphs, effects and reports are functions of the world and the action."""
+    world = begin(engine)
+    action = onward(pushed(world), 1)[0]
+    first, second = paired_truth(world, action), paired_truth(world, action)
+    assert first == second
+    assert first.effects == second.effects
+    reports = [local_report(world, [action] * 3, 3, every=2) for _ in range(2)]
+    assert reports[0].scores == reports[1].scores
+    assert reports[0].steps == 2
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_rule_is_right_in_a_push(engine: str) -> None:
+    """Contacts that press say exactly what the experiments say."""
+    world = begin(engine)
+    report = local_report(world, onward(chained(world), 6), 6)
+    assert report.floor == 0.0
+    assert report.scores["pressing"].f1 == report.own_scores["pressing"].f1 == 1.0
+    assert report.scores["pressing"].right > 30
+
+
+def test_an_episode_unrolls_to_a_dag(tmp_path: Path) -> None:
+    """Arrows lead from one slice to the next; graphs survive JSON."""
+    world = begin("mujoco")
+    actions = onward(pushed(world), 3)
+    episode = local_episode(world, actions, 3)
+    drawn = episode.unrolled()
+    assert nx.is_directed_acyclic_graph(drawn)
+    assert drawn.number_of_nodes() == 5 * 4
+    assert drawn.number_of_edges() == sum(len(graph.edges) + 5 for graph in episode.graphs)
+    assert drawn.has_edge((FINGER, 1), (ONE, 2))
+    assert ("floor", ONE) in episode.graphs[1].context
+    assert episode.graphs[1].graph().nodes["floor"] == {"moves": False}
+    assert episode.graphs[1].parents(ONE) == (FINGER,)
+    episode.save(tmp_path / "episode.json")
+    read = json.loads((tmp_path / "episode.json").read_text())
+    assert LocalEpisode.from_dict(read) == episode
+    assert LocalGraph.from_dict(read["graphs"][0]) == episode.graphs[0]
+
+
+def test_a_report_survives_json(tmp_path: Path) -> None:
+    """What is read is what was written."""
+    world = begin("mujoco")
+    report = local_report(world, onward(pushed(world), 4), 4, every=2)
+    report.save(tmp_path / "report.json")
+    read = json.loads((tmp_path / "report.json").read_text())
+    assert LocalReport.from_dict(read) == report
+    assert set(read["scores"]) == set(read["own_scores"]) == set(RULES)
+    assert str(report).startswith("stacking2 on mujoco")
+
+
+def test_scores_add_up() -> None:
+    """Rates are those of the summed counts, and one where there is nothing to find."""
+    score = RuleScore(3, 1, 0) + RuleScore(0, 0, 2)
+    assert (score.precision, score.recall) == (0.75, 0.6)
+    assert score.f1 == pytest.approx(2 / 3)
+    assert (RuleScore().precision, RuleScore().recall, RuleScore().f1) == (1.0, 1.0, 1.0)
+
+
+def test_what_cannot_be_asked() -> None:
+    """There must be an episode, and the rule must exist."""
+    with pytest.raises(NotReset):
+        local_graph(World("pushing"))
+    with pytest.raises(UnknownOption, match="rule"):
+        local_graph(begin("mujoco"), rule="touching")

@@ -1,0 +1,313 @@
+"""The declared graph is checked, not believed."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from typer.testing import CliRunner
+
+from scm_world.cli import app
+from scm_world.cli.tasks import build
+from scm_world.cli.verification import SMALL
+from scm_world.discovery.coverage import draw_verification
+from scm_world.entities import Composition
+from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.queries.agreement import Agreement, Sign
+from scm_world.queries.verification import Verification
+from scm_world.queries.verify import verify, verify_engines
+from scm_world.tasks import TASKS
+from scm_world.variables import Parent
+from scm_world.variables.kinds import Variable
+from scm_world.world import World
+
+HAS_BULLET = importlib.util.find_spec("pybullet") is not None
+ENGINES = ["mujoco"] + (["bullet"] if HAS_BULLET else [])
+needs_both = pytest.mark.skipif(not HAS_BULLET, reason="Bullet is not installed")
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def pushing(request: pytest.FixtureRequest) -> Verification:
+    """Verify pushing with few probe states."""
+    return verify("pushing", backend=request.param, probes=4)
+
+
+def test_pushing_has_no_undeclared_effect(pushing: Verification) -> None:
+    """Four probe states see nine tenths of the edges, nothing else, and leave no trace."""
+    assert pushing.undeclared == ()
+    assert pushing.colors == ()
+    assert pushing.floor == 0.0
+    assert pushing.untried == ()
+    assert pushing.share > 0.9
+    assert pushing.passed == (pushing.never_fired == ())
+
+
+def test_coverage_ends_with_what_was_seen(pushing: Verification) -> None:
+    """The curve has one number per probe state, never falls, and ends with all that fired."""
+    assert len(pushing.coverage) == pushing.probes == 4
+    assert list(pushing.coverage) == sorted(pushing.coverage)
+    assert pushing.coverage[-1] == len(pushing.fired)
+    assert len(pushing.fired) + len(pushing.never_fired) == pushing.declared
+
+
+def test_a_report_survives_json(pushing: Verification) -> None:
+    """Written and read back, a report is the same; anything else is refused."""
+    assert Verification.from_json(pushing.to_json()) == pushing
+    with pytest.raises(UnreadableFile, match="to_json"):
+        Verification.from_json("{}")
+
+
+def test_a_report_prints_its_numbers(pushing: Verification) -> None:
+    """The table names the engine, the floor, and what was seen."""
+    text = str(pushing)
+    for words in ("floor (do and undo)", f"of {pushing.declared}", f"on {pushing.backend}"):
+        assert words in text
+
+
+def test_pushing_on_one_engine_is_verified() -> None:
+    """Every declared edge is seen before the probe states run out, and then it ends."""
+    found = verify("pushing")
+    assert found.passed, str(found)
+    assert 16 <= found.probes < 40
+
+
+def tampered(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., Any]) -> World:
+    """Build a pushing world that declares other parents of one variable."""
+    honest = Composition.variables
+
+    def variables(self: Composition) -> tuple[Variable, ...]:
+        return tuple(
+            v.model_copy(update={"parents": tuple(change(v.all_parents))}) if v.name == name else v
+            for v in honest(self)
+        )
+
+    monkeypatch.setattr(Composition, "variables", variables)
+    return World("pushing")
+
+
+def test_a_missing_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the declaration leaves out is named, with its size and where it was seen."""
+    name = "tool_block.linear_velocity"
+    world = tampered(monkeypatch, name, lambda parents: [p for p in parents if p.name != "gravity"])
+    found = verify(world, probes=3)
+    (edge,) = found.undeclared
+    assert edge.key == ("gravity", name, 1)
+    assert edge.size > 1e-3
+    assert edge.probe in range(3)
+    assert len(edge.change) == 3
+    assert edge.kind
+    assert not found.passed
+    assert "gravity -> tool_block.linear_velocity (lag 1): " in str(found)
+
+
+def test_a_superfluous_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An edge that physics does not have never fires; one from a color is wrong anyway."""
+    name = "tool_block.linear_velocity"
+    extra = Parent("tool_block.color", 1)
+    found = verify(tampered(monkeypatch, name, lambda parents: [*parents, extra]), probes=2)
+    edge = ("tool_block.color", name, 1)
+    assert edge in found.never_fired
+    assert found.colors == (edge,)
+    assert not found.passed
+    assert "tool_block.color -> tool_block.linear_velocity (lag 1)" in str(found)
+
+
+def test_results_depend_on_the_seed_alone() -> None:
+    """Two runs with one seed agree in everything but the time."""
+    one, two = (verify("reaching", probes=2, seed=5) for _ in range(2))
+    same = {"seconds": 0.0}
+    assert one.model_copy(update=same) == two.model_copy(update=same)
+
+
+def test_it_ends_early_but_not_too_early() -> None:
+    """With everything seen it ends at the least number of probe states."""
+    told: list[tuple[int, int]] = []
+    found = verify("reaching", probes=60, least=18, progress=lambda *at: told.append(at))
+    assert found.never_fired == ()
+    assert (found.probes, found.planned, found.interrupted) == (18, 60, False)
+    assert told[0] == (1, 60)
+    assert told[-1] == (18, 18)
+
+
+def test_interruption_keeps_what_was_found() -> None:
+    """Ctrl-C gives a report of the probe states that were finished, which has not passed."""
+
+    def stop(done: int, planned: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    found = verify("reaching", backend="fake", probes=5, progress=stop)
+    assert (found.probes, found.interrupted, found.passed) == (2, True, False)
+    both = verify_engines(
+        "reaching", backends=("fake", "fake"), probes=5, progress=lambda name: stop
+    )
+    assert (len(both.verifications), both.interrupted, both.passed) == (1, True, False)
+    assert both.only == {}
+
+
+@pytest.mark.parametrize("wrong", [{"probes": 0}, {"least": 0}, {"probes": 1.5}])
+def test_numbers_must_be_positive(wrong: dict[str, Any]) -> None:
+    """A number of probe states below one is refused."""
+    with pytest.raises(UnknownOption, match="number of probes"):
+        verify("reaching", backend="fake", **wrong)
+
+
+def test_a_world_takes_no_options() -> None:
+    """Options of a world that is made already would be ignored, so they are refused."""
+    with pytest.raises(UnknownOption, match="world that is made"):
+        verify(World("reaching", backend="fake"), backend="mujoco", probes=1)
+
+
+# --- two engines ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def agreement() -> Agreement:
+    """Verify pushing on both engines with few probe states."""
+    if not HAS_BULLET:
+        pytest.skip("Bullet is not installed")
+    return verify_engines("pushing", probes=4)
+
+
+def test_engines_agree_on_the_sign_of_clear_effects(agreement: Agreement) -> None:
+    """What lies well above the floor between the engines has one sign on both."""
+    found = agreement.at(10.0)
+    assert found.edges > 30
+    assert agreement.share >= 0.95
+    assert agreement.at(0.0).edges > found.edges
+
+
+def test_the_table_of_edges_counts_every_comparison(agreement: Agreement) -> None:
+    """Per edge: compared, of which clear, of which equal; gravity pulls down on both."""
+    edges = agreement.edges()
+    assert sum(edge.compared for edge in edges) == len(agreement.signs)
+    assert all(edge.equal <= edge.clear <= edge.compared for edge in edges)
+    falls = [
+        sign
+        for sign in agreement.signs
+        if sign.key == ("gravity", "tool_block.cartesian_position", 1) and sign.clear()
+    ]
+    assert all(sign.equal for sign in falls)
+
+
+def test_an_agreement_survives_json_and_prints(agreement: Agreement) -> None:
+    """Written and read back, it is the same; the text has both engines."""
+    assert Agreement.from_json(agreement.to_json()) == agreement
+    assert "Agreement of mujoco and bullet on pushing" in str(agreement)
+
+
+def test_an_engine_agrees_with_itself() -> None:
+    """The same engine twice: every edge on both, every sign the same, no floor between them."""
+    found = verify_engines("reaching", backends=("mujoco", "mujoco"), probes=2)
+    share = found.at(10.0)
+    assert all(edges == () for edges in found.only.values())
+    assert all(sign.apart == 0.0 for sign in found.signs)
+    assert share.edges_equal == share.edges > 0
+
+
+def test_clear_effects_lie_above_what_engines_differ_by() -> None:
+    """An effect of 3 with engines 0.2 apart is clear; with 0.4 it is not."""
+    about: dict[str, Any] = {"cause": "a", "effect": "b", "lag": 1, "probe": 0, "component": 0}
+    near = Sign(**about, moves=True, answers=(3.0, -4.0), apart=0.2)
+    far = Sign(**about, moves=True, answers=(3.0, 4.0), apart=0.4)
+    assert (near.clear(), near.equal) == (True, False)
+    assert (far.clear(), far.equal) == (False, True)
+
+
+# --- pictures and commands -----------------------------------------------------------------------
+
+
+def test_verifications_are_drawn(tmp_path: Path, pushing: Verification) -> None:
+    """One engine is a picture of the usual size."""
+    draw_verification(pushing, tmp_path / "verify.png")
+    picture = imread(tmp_path / "verify.png")
+    assert picture.shape[:2] == (900, 1600)
+    assert np.ptp(picture) > 0.5
+
+
+def test_agreements_are_drawn(tmp_path: Path, agreement: Agreement) -> None:
+    """So are two."""
+    draw_verification(agreement, tmp_path / "verify.png")
+    assert imread(tmp_path / "verify.png").shape[:2] == (900, 1600)
+
+
+@pytest.fixture
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+
+@pytest.mark.usefixtures("_elsewhere")
+def test_the_command_writes_a_report_and_a_picture() -> None:
+    """Without physics edges are never seen: it says so, writes both files and exits 1."""
+    arguments = ("verify", "reaching", "--backend", "fake", "--probes", "1", "--seed", "3")
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 1, result.output
+    assert "Verification of reaching on fake" in result.stdout
+    folder = Path("scm-world-results/verify-reaching-fake-seed3")
+    found = Verification.from_json((folder / "report.json").read_text())
+    assert (found.seed, found.probes) == (3, 1)
+    assert imread(folder / "verify.png").shape[:2] == (900, 1600)
+
+
+@pytest.mark.usefixtures("_elsewhere")
+def test_the_command_exits_0_where_all_is_well() -> None:
+    """A task whose edges are all seen has passed."""
+    result = CliRunner().invoke(app, ["verify", "reaching", "--out", "here"])
+    assert result.exit_code == 0, result.output
+    assert Verification.from_json(Path("here/report.json").read_text()).passed
+
+
+@needs_both
+@pytest.mark.usefixtures("_elsewhere")
+def test_the_command_compares_engines() -> None:
+    """With --both the report is that of two engines."""
+    result = CliRunner().invoke(app, ["verify", "reaching", "--both", "--probes", "2"])
+    report = Path("scm-world-results/verify-reaching-both-seed0/report.json")
+    found = Agreement.from_json(report.read_text())
+    assert found.backends == ("mujoco", "bullet")
+    assert result.exit_code == int(not found.passed)
+    assert "Agreement of mujoco and bullet" in result.stdout
+
+
+@pytest.mark.usefixtures("_elsewhere")
+def test_the_command_verifies_all_tasks_and_keeps_what_is_finished(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All tasks have a folder each; Ctrl-C in the third keeps two of them, and exits 130."""
+    from scm_world.queries.experiments.paired import Paired
+
+    run = Paired.run
+
+    def interrupted(self: Paired, number: int, probe: Any) -> None:
+        if self.targets and "goal_block.cartesian_position" in self.targets:
+            seen.add(id(self))
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        run(self, number, probe)
+
+    seen: set[int] = set()
+    monkeypatch.setattr(Paired, "run", interrupted)
+    arguments = ["verify", "all", "--backend", "fake", "--probes", "1", "--out", "here"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 130, result.output
+    assert sorted(path.name for path in Path("here").iterdir()) == ["pushing", "reaching"]
+    assert "All verifications" in result.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_is_verified_on_both_engines(task: str) -> None:
+    """Two hundred probe states see 99 % of the edges, nothing undeclared, and equal signs."""
+    found = verify_engines(build(task, SMALL.get(task, ())))
+    for report in found.verifications:
+        assert report.undeclared == ()
+        assert report.colors == ()
+        assert report.floor == 0.0
+        assert report.share >= 0.99, report.never_fired
+    assert found.share >= 0.95, found.opposite
