@@ -79,6 +79,17 @@ Out = Annotated[
 ]
 
 
+Acts = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="NAME=VALUE...",
+        help="A number, a list 1,2,3 or [1,2,3], shift:0.1, scale:2, or draw:A.",
+    ),
+]
+Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
+Policy = Annotated[str, typer.Option(help="random, or still: the robot stays where it begins.")]
+
+
 def _version(wanted: bool) -> None:
     if wanted:
         from scm_world import __version__
@@ -160,13 +171,7 @@ def graph(
 @app.command()
 def do(
     task: Task,
-    assignments: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="NAME=VALUE...",
-            help="A number, a list 1,2,3 or [1,2,3], shift:0.1, scale:2, or draw:A.",
-        ),
-    ],
+    assignments: Acts,
     backend: Backend = "mujoco",
     steps: Annotated[int, typer.Option(min=0, help="Control steps to run afterwards.")] = 25,
     seed: Seed = 0,
@@ -185,6 +190,69 @@ def do(
 
     options = Options(task, backend, preset, seed, steps, space, tuple(option or ()))
     raise typer.Exit(run(assignments, options, show_all=show_all, out=out))
+
+
+@app.command()
+def effect(
+    task: Task,
+    outcome: Annotated[str, typer.Argument(help="Name of a variable, or of a component: name[2].")],
+    assignments: Acts,
+    versus: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="What it is held against; nothing by default."),
+    ] = None,
+    nature: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="What varies by itself, such as NAME=draw:A."),
+    ] = None,
+    how: Annotated[
+        str, typer.Option(help="final, change, mean, max, min, sum or first.")
+    ] = "final",
+    n: Annotated[int, typer.Option("-n", min=2, help="How many units.")] = 100,
+    unpaired: Annotated[bool, typer.Option("--unpaired", help="Compare different units.")] = False,
+    steps: Steps = 25,
+    policy: Policy = "random",
+    backend: Backend = "mujoco",
+    seed: Seed = 0,
+    preset: Preset = "fast",
+    out: Out = None,
+    option: Arguments = None,
+) -> None:
+    """Estimate how much an intervention changes an outcome, with a 95 % interval."""
+    from scm_world.cli.questions import Circumstances, ask_effect, read_outcome
+
+    where = Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ()))
+    code = ask_effect(
+        where,
+        read_outcome(outcome, how),
+        assignments,
+        versus=versus or (),
+        nature=nature or (),
+        n=n,
+        paired=not unpaired,
+        out=out,
+    )
+    raise typer.Exit(code)
+
+
+@app.command()
+def counterfactual(
+    task: Task,
+    assignments: Acts,
+    at: Annotated[int, typer.Option(min=0, help="The control step at which it is done.")] = 0,
+    steps: Steps = 25,
+    policy: Policy = "random",
+    backend: Backend = "mujoco",
+    seed: Seed = 0,
+    preset: Preset = "fast",
+    out: Out = None,
+    option: Arguments = None,
+) -> None:
+    """Let an episode happen, and happen otherwise with the same noise; compare them."""
+    from scm_world.cli.questions import Circumstances, ask_counterfactual
+
+    where = Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ()))
+    raise typer.Exit(ask_counterfactual(where, assignments, at=at, out=out))
 
 
 @app.command()

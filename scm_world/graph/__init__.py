@@ -12,7 +12,14 @@ from scm_world.graph.files import (
 )
 from scm_world.graph.scm import SCM, flatten
 from scm_world.graph.structure import Edge, Structure
-from scm_world.graph.views import contemporaneous, d_separated, summary, two_slice, unrolled
+from scm_world.graph.views import (
+    contemporaneous,
+    d_separated,
+    episode_outcome,
+    summary,
+    two_slice,
+    unrolled,
+)
 
 __all__ = [
     "SCM",
@@ -21,6 +28,7 @@ __all__ = [
     "Structure",
     "contemporaneous",
     "d_separated",
+    "episode_outcome",
     "flatten",
     "from_dict",
     "from_json",

@@ -74,6 +74,49 @@ def two_slice(model: SCM) -> nx.DiGraph:
     return unrolled(model, 2)
 
 
+def episode_outcome(
+    model: SCM, outcomes: Iterable[str], *, starts: Iterable[str] = ()
+) -> nx.DiGraph:
+    """Give the static graph of one episode: parameters, starting states, and what it ends with.
+
+    Time is folded up: a parameter is a cause of an outcome where a path leads from one to the
+    other that passes no further parameter.
+
+    Args:
+        model: With or without interventions.
+        outcomes: States or readouts, at the end.
+        starts: States that vary at the beginning.
+
+    Returns:
+        A directed acyclic graph. A starting state has the name of the variable with ``@0``.
+
+    Example:
+        >>> from scm_world.variables import Exogenous, Measured, Parent
+        >>> model = SCM([
+        ...     Exogenous(name="mass"), Exogenous(name="color"),
+        ...     Measured(name="speed", parents=("mass", Parent("speed", 1))),
+        ... ])
+        >>> sorted(episode_outcome(model, ["speed"], starts=["speed"]).edges)
+        [('mass', 'speed'), ('speed@0', 'speed')]
+    """
+    parameters = [name for name in model if model.declared(name).role == "parameter"]
+    follow = summary(model)
+    graph = nx.DiGraph()
+    graph.add_nodes_from(parameters)
+    graph.add_edges_from(
+        (edge.cause, edge.effect)
+        for edge in model.edges
+        if edge.cause in graph and edge.effect in graph and edge.when != "set"
+    )
+    moving = follow.subgraph([name for name in follow if name not in graph])
+    for outcome in outcomes:
+        causes = {model.declared(outcome).name, *nx.ancestors(moving, outcome)}
+        direct = {p for name in causes for p in follow.predecessors(name) if p in graph}
+        graph.add_edges_from((parameter, outcome) for parameter in sorted(direct))
+        graph.add_edges_from((f"{name}@0", outcome) for name in starts if name in causes)
+    return graph
+
+
 def d_separated(
     model: SCM, x: Iterable[Node], y: Iterable[Node], given: Iterable[Node] = ()
 ) -> bool:

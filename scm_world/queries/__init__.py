@@ -1,26 +1,39 @@
 """Questions to a world: what follows, what would have followed, and whether the graph is right."""
 
+from scm_world.queries.agreement import Agreement
 from scm_world.queries.differences import ButFor, Difference, Divergence, but_for, compare
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
 from scm_world.queries.face import World
+from scm_world.queries.identification import (
+    Check,
+    Identification,
+    check_backdoor,
+    identify,
+    nature_graph,
+)
 from scm_world.queries.laboratory import Laboratory, intervention_data
 from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.policies import Random
 from scm_world.queries.samples import Samples, Setting
 from scm_world.queries.timed import At, Clamp, Contact, On, Reaches
+from scm_world.queries.verification import Verification
+from scm_world.queries.verify import verify, verify_engines
 
 __all__ = [
+    "Agreement",
     "At",
     "ButFor",
+    "Check",
     "Clamp",
     "Contact",
     "Difference",
     "Divergence",
     "Effect",
     "Episode",
+    "Identification",
     "Laboratory",
     "On",
     "Outcome",
@@ -29,11 +42,17 @@ __all__ = [
     "Reaches",
     "Samples",
     "Setting",
+    "Verification",
     "World",
     "but_for",
+    "check_backdoor",
     "compare",
     "do",
+    "identify",
     "intervention_data",
     "load_episode",
+    "nature_graph",
     "save_episode",
+    "verify",
+    "verify_engines",
 ]
