@@ -2,6 +2,18 @@
 
 ``python benchmarks/local_graph.py`` plays every scene of every task on every engine, prints one
 table and the errors, and with ``--out DIR`` keeps every report as JSON. It takes a few minutes.
+
+``python benchmarks/local_graph.py --seeds 3``, MuJoCo 4.0.0, pybullet 3.2.7, all tasks and scenes:
+
+======  =====  =====  =====  =========  ===========  ==========  ===========  ===============
+engine  steps  edges  floor  listed F1  pressing P   pressing R  pressing F1  own pressing F1
+======  =====  =====  =====  =========  ===========  ==========  ===========  ===============
+mujoco  2250   14061  0.0    0.9826     1.0000       0.9937      0.9968       0.9968
+bullet  2250   16048  0.0    0.9688     1.0000       0.9874      0.9937       0.9913
+======  =====  =====  =====  =========  ===========  ==========  ===========  ===============
+
+``own`` takes the contacts of the world itself, not of the scene built anew; see
+``docs/local_graphs.md``.
 """
 
 from __future__ import annotations
@@ -175,7 +187,9 @@ def _sum(reports: list[LocalReport]) -> LocalReport:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(TASKS))
     parser.add_argument("--engines", nargs="+", default=["mujoco", "bullet"])
     parser.add_argument("--steps", type=int, default=60)
@@ -184,6 +198,8 @@ def main() -> None:
     parser.add_argument("--errors", type=int, default=0, help="how many errors to print")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
+    if asked.out:
+        asked.out.mkdir(parents=True, exist_ok=True)
     names = ["scene", "steps", "edges", "floor"]
     names += [f"{rule} {rate}" for rule in ("listed", "pressing") for rate in ("P", "R", "F1")]
     names += [f"{rule} F1" for rule in list(RULES)[2:]]

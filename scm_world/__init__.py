@@ -17,6 +17,18 @@ if TYPE_CHECKING:
     from scm_world.errors import ScmWorldError
     from scm_world.geometry import load_hull
     from scm_world.graph import SCM
+    from scm_world.queries import (
+        At,
+        Clamp,
+        Contact,
+        Laboratory,
+        On,
+        Outcome,
+        Plan,
+        Reaches,
+        World,
+        do,
+    )
     from scm_world.tasks import Task, make_task
     from scm_world.variables import (
         Action,
@@ -27,11 +39,12 @@ if TYPE_CHECKING:
         Fixed,
         Linear,
         Measured,
+        Mechanism,
+        Natural,
         Parent,
         Scale,
         Shift,
     )
-    from scm_world.world import World
 
 __version__ = "0.1.0"
 
@@ -43,7 +56,6 @@ _HOMES = {
     "ScmWorldEnv": "env",
     "ScmWorldError": "errors",
     "Task": "tasks",
-    "World": "world",
     "discover": "discovery",
     "load_hull": "geometry",
     "make_task": "tasks",
@@ -57,28 +69,55 @@ _HOMES = {
             "Fixed",
             "Linear",
             "Measured",
+            "Mechanism",
+            "Natural",
             "Parent",
             "Scale",
             "Shift",
         ),
         "variables",
     ),
+    **dict.fromkeys(
+        (
+            "At",
+            "Clamp",
+            "Contact",
+            "Laboratory",
+            "On",
+            "Outcome",
+            "Plan",
+            "Reaches",
+            "World",
+            "do",
+        ),
+        "queries",
+    ),
 }
 
 __all__ = [
     "SCM",
     "Action",
+    "At",
     "Box",
+    "Clamp",
+    "Contact",
     "DeltaAction",
     "Derived",
     "Draw",
     "Exogenous",
     "Fixed",
+    "Laboratory",
     "Linear",
     "Measured",
+    "Mechanism",
     "MovingAverageAction",
+    "Natural",
     "ObjectSelector",
+    "On",
+    "Outcome",
     "Parent",
+    "Plan",
+    "Reaches",
     "Scale",
     "ScmWorldEnv",
     "ScmWorldError",
@@ -86,6 +125,7 @@ __all__ = [
     "Task",
     "World",
     "discover",
+    "do",
     "load_hull",
     "make_task",
 ]

@@ -356,7 +356,7 @@ class UnreadableFile(ScmWorldError, ValueError):
         super().__init__(f"{path!r} cannot be read: {reason}; {advice}")
 
 
-class Forbidden(ScmWorldError, PermissionError):
+class Forbidden(ScmWorldError, RuntimeError):
     """A question that a laboratory does not allow; ``allowed`` says what it does."""
 
     def __init__(self, what: str, allowed: Iterable[str]) -> None:
@@ -392,9 +392,11 @@ class MissingExtra(ScmWorldError, ImportError):
 
 __all__ = [
     "ActionError",
+    "BudgetExhausted",
     "ConflictingTargets",
     "EngineError",
     "EngineFailure",
+    "Forbidden",
     "Infeasible",
     "InterventionError",
     "MissingEngine",

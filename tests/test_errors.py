@@ -12,9 +12,11 @@ import pytest
 from scm_world import errors
 from scm_world.errors import (
     ActionError,
+    BudgetExhausted,
     ConflictingTargets,
     EngineError,
     EngineFailure,
+    Forbidden,
     Infeasible,
     InterventionError,
     MissingEngine,
@@ -118,6 +120,17 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         UnknownOption("task", "pushin", ["reaching", "pushing"]),
         "no task is named 'pushin'; did you mean 'pushing'?; there are: reaching, pushing",
         {"option": "task", "value": "pushin", "choices": ("reaching", "pushing")},
+    ),
+    (
+        Forbidden("set gravity", ["floor_friction"]),
+        "this laboratory does not let you set gravity; allowed: floor_friction",
+        {"what": "set gravity", "allowed": ("floor_friction",)},
+    ),
+    (
+        BudgetExhausted(3, 2),
+        "the experiment takes 3 episodes, but 2 are left of the budget; ask for fewer, or open a "
+        "laboratory with a larger budget on the same log",
+        {"asked": 3, "left": 2},
     ),
     (
         UnreadableFile("p.zip", "it is no zip archive", "give another one"),

@@ -111,15 +111,20 @@ def _front_doors(
 ) -> Iterator[tuple[str, ...]]:
     try:
         base = importlib.import_module("pgmpy.base")
-        inference = importlib.import_module("pgmpy.inference")
+        doors = importlib.import_module("pgmpy.identification")
     except ImportError as error:
         raise MissingExtra("pgmpy", "pgmpy") from error
     kept = nx.ancestors(graph, outcome) | nx.ancestors(graph, treatment) | {outcome, treatment}
+    between = nx.descendants(graph, treatment) & nx.ancestors(graph, outcome) & watched
     part = graph.subgraph(kept)
-    dag: Any = base.DAG(list(part.edges))
-    dag.latents = {node for node in part if node not in watched | {treatment, outcome}}
-    sets = inference.CausalInference(dag).get_all_frontdoor_adjustment_sets(treatment, outcome)
-    yield from sorted(tuple(sorted(found)) for found in sets if set(found) <= watched)
+    dag = base.DAG(
+        list(part.edges),
+        latents=set(part) - between - {treatment, outcome},
+        roles={"exposures": treatment, "outcomes": outcome},
+    )
+    found, is_there = doors.Frontdoor(variant="all").identify(dag)
+    if is_there:
+        yield from sorted(tuple(sorted(one.get_role("frontdoor"))) for one in found)
 
 
 @final
