@@ -7,7 +7,7 @@ from typing import Any
 
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.graph import flatten
-from scm_world.variables import Draw
+from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
@@ -20,9 +20,18 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
         >>> asked({"tool_block": {"mass": "A", "friction": 0.7}})
         {'tool_block.mass': Draw(kind='draw', source='A'), 'tool_block.friction': 0.7}
     """
+    flat = flatten(given or {})
+    for name, value in flat.items():
+        if isinstance(value, Null):
+            raise InterventionError(
+                f"do({name}): an environment observes all that its task has; take something away "
+                "in a World instead",
+                variable=name,
+                value=value,
+            )
     return {
         name: Draw(value) if isinstance(value, str) and value in SPACES else value
-        for name, value in flatten(given or {}).items()
+        for name, value in flat.items()
     }
 
 

@@ -9,7 +9,17 @@ import numpy as np
 
 from scm_world.errors import InterventionError, UnknownVariable
 from scm_world.graph.evaluate import Act, source_of
-from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Scale, Shift, Variable
+from scm_world.variables import (
+    Draw,
+    Hard,
+    Intervention,
+    Mechanism,
+    Natural,
+    Null,
+    Scale,
+    Shift,
+    Variable,
+)
 from scm_world.variables.checks import check_bounds, check_draw, coerce
 
 
@@ -41,6 +51,13 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
             return value
         case Natural():
             return value
+        case Null():
+            raise InterventionError(
+                f"do({variable.name}): a variable cannot be taken away, an entity can: "
+                f"do({variable.name.partition('.')[0]})",
+                variable=variable.name,
+                value=value,
+            )
         case Shift() | Scale():
             by = value.by if np.ndim(value.by) else np.full(variable.shape, value.by)
             coerce(variable, by)

@@ -8,12 +8,12 @@ import numpy as np
 from pydantic import Field
 
 from scm_world.errors import UnknownOption
-from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Scale, Shift
+from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Null, Scale, Shift
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
 from scm_world.world import World
 
-ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural)
+ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural, Null)
 
 
 def as_act(value: Any) -> Any:
@@ -82,6 +82,9 @@ class Clamp(Frozen):
     def __init__(self, act: Any, start: Any = 0, stop: Any = None, **fields: Any) -> None:
         first = _step("Clamp(start)", start)
         last = None if stop is None else _step("Clamp(stop)", stop, least=first + 1)
+        if isinstance(act, Null):
+            allowed = ("a value or an intervention on a variable", "At(step, Null())")
+            raise UnknownOption("Clamp(act)", act, allowed)
         super().__init__(act=as_act(act), start=first, stop=last, **fields)  # type: ignore[call-arg]
 
 
@@ -168,7 +171,7 @@ class On(Frozen):
 
 TIMED = (At, Clamp, On)
 Timed = Annotated[
-    Hard | Shift | Scale | Draw | Mechanism | Natural | At | Clamp | On,
+    Hard | Shift | Scale | Draw | Mechanism | Natural | Null | At | Clamp | On,
     Field(discriminator="kind"),
 ]
 """Anything that a plan does to one variable."""

@@ -37,6 +37,7 @@ class Task(ABC):
         decided_by: The shared variables that decide what stands in the world.
         goal_causes: The variables that a new goal is drawn for.
         plan: What stands in the world, as ``arrange`` has it; None where that is always the same.
+        absent: Entities that an intervention took away.
         conventions: Ours or the predecessor's.
         weights: Weight of each reward term, by the name of its variable.
         terms: Reward terms of the user's own.
@@ -54,6 +55,7 @@ class Task(ABC):
     goal_causes: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = trifinger.REST
     plan: Hashable = None
+    absent: frozenset[str] = frozenset()
     conventions: Conventions = CONVENTIONS["scm_world"]
 
     def __new__(cls, *args: Any, **given: Any) -> Self:

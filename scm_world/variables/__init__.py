@@ -8,6 +8,7 @@ from scm_world.variables.interventions import (
     Intervention,
     Mechanism,
     Natural,
+    Null,
     Scale,
     Shift,
 )
@@ -60,6 +61,7 @@ __all__ = [
     "Natural",
     "Noise",
     "Normal",
+    "Null",
     "Parent",
     "Rotations",
     "Scale",

@@ -124,8 +124,19 @@ class Natural(Frozen):
     kind: Literal["natural"] = "natural"
 
 
+@final
+class Null(Frozen):
+    """An entity is not there: asked for by its name, not by a variable of it.
+
+    A block, an obstacle or a goal is taken out of the world and of its graph, with everything that
+    is computed from it. It comes back with the next episode.
+    """
+
+    kind: Literal["null"] = "null"
+
+
 Intervention = Annotated[
-    Hard | Shift | Scale | Draw | Mechanism | Natural, Field(discriminator="kind")
+    Hard | Shift | Scale | Draw | Mechanism | Natural | Null, Field(discriminator="kind")
 ]
 """Anything that ``do`` accepts, once a plain value has become ``Hard``."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, final
@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.entities import ACTIONS, PRESET_NAMES, Clock, Composition, Looks, Robot, Stage
+from scm_world.entities import ACTIONS, PRESET_NAMES, Clock, Entity, Looks, Robot, Stage
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.scene import (
@@ -26,6 +26,7 @@ from scm_world.scene import (
 from scm_world.tasks import Conventions, Task, conventions
 from scm_world.variables import Derived, Exogenous, Measured
 from scm_world.variables import catalogue as numbers
+from scm_world.world.absence import put_together, remaining
 from scm_world.world.readouts import computed_order, static_order
 from scm_world.world.start import whole_number
 
@@ -106,15 +107,14 @@ class Declaration:
 
     def __init__(self, task: Task, options: Options, steps: int) -> None:
         self.task = task
-        entities = (
+        entities: tuple[Entity, ...] = (
             Robot(options.action_mode, task.start),
             Stage(options.preset),
             Looks(),
             Clock(steps, options.control_period),
             *task.entities(),
         )
-        self.composition = Composition(entities, tuple(task.shared()), task.decided_by)
-        variables = [*self.composition.variables(), *task.readouts()]
+        self.composition, variables = remaining(entities, task)
         self.model = SCM(options.conventions.adapt(variables))
         self.slices = self.composition.slices()
         self.parameter_keys = self.composition.parameters()
@@ -131,6 +131,11 @@ class Declaration:
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._structures: dict[str, Structure] = {}
         self._constants: dict[str, dict[ParameterKey, Floats]] = {}
+
+    @property
+    def plan(self) -> Hashable:
+        """What stands in the world, and what was taken out of it."""
+        return put_together(self.task.plan, self.task.absent)
 
     @property
     def n_blocks(self) -> int:

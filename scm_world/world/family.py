@@ -16,6 +16,7 @@ from scm_world.errors import ModelError
 from scm_world.graph import SCM, Moment
 from scm_world.tasks import Task
 from scm_world.variables import Intervention, Variable
+from scm_world.world.absence import taken_apart
 from scm_world.world.declaration import Declaration, Options
 from scm_world.world.start import refuse_impossible
 
@@ -56,7 +57,9 @@ class Family:
         """Give the declaration of a structure."""
         found = self._declarations.get(plan)
         if found is None:
-            task = self.task.at(plan, self.options.conventions)
+            inner, absent = taken_apart(plan)
+            task = self.task.at(inner, self.options.conventions)
+            task.absent = absent
             with _refused(task):
                 found = self._declarations[plan] = Declaration(task, self.options, self.steps)
             while len(self._declarations) > KEPT:

@@ -28,6 +28,7 @@ from scm_world.variables import (
     Measured,
     Mechanism,
     Natural,
+    Null,
     Rotations,
     Shift,
 )
@@ -96,6 +97,8 @@ def accept(
     accepted: Requests = {}
     problems: list[InterventionError] = []
     for name, value in flatten(request).items():
+        if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
+            continue
         try:
             act = _accept(instant, name, value)
             target = model.target(name)
@@ -157,9 +160,10 @@ def propose(
         problems += draft.check(accepted, space)
     raise_all(problems)
     asked = tuple(name for name, _ in accepted.values())
-    frozen = {
+    nulls = {n: (n, act) for n, act in flatten(request).items() if isinstance(act, Null)}
+    frozen: Requests = {
         target: draft.frozen(target, *named) if target in model else named
-        for target, named in requests.items()
+        for target, named in {**requests, **nulls}.items()
     }
     return Proposal(
         instant.declaration, draft.model, draft.static, draft.state, draft.index, frozen, asked
@@ -294,7 +298,7 @@ class _Draft:
         elif isinstance(act, Mechanism):
             values = {**self.static, **self._world.states(self._instant.state)}
             value = followed(requested, act, values)
-        elif isinstance(act, Natural):
+        elif isinstance(act, Natural | Null):
             value = self._coordinates(target, name)
         elif isinstance(act, Draw):
             source = requested.space(act.source) if isinstance(act.source, str) else act.source

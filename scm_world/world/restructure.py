@@ -12,6 +12,7 @@ from scm_world.graph import SCM, Moment, flatten
 from scm_world.scene import PhysicalState
 from scm_world.scene.state import ROBOT_SIZE
 from scm_world.variables import Exogenous, Intervention, Measured
+from scm_world.world.absence import put_together, taken_away
 from scm_world.world.declaration import Declaration
 from scm_world.world.family import Family
 
@@ -27,12 +28,20 @@ def restructured(
     What exists before and after keeps its values, its state and the interventions on it; what is
     new begins as at the start of an episode. Where the structure stays, so does the instant.
     """
-    if not len(family.head):
-        return instant
-    acts = dict(instant.requests.values())
-    acts |= _structural(family, instant, request)
-    declaration = family.after(acts, instant.model, instant.static, moment)
-    if declaration is None or declaration is instant.declaration:
+    present = instant.declaration
+    flat = flatten(request)
+    asked = [(name, act) for name, act in instant.requests.values()]
+    gone = taken_away(flat, asked, present.composition.entities)
+    declaration: Declaration | None = None
+    if len(family.head):
+        acts = dict(instant.requests.values())
+        acts |= _structural(family, instant, request)
+        declaration = family.after(acts, instant.model, instant.static, moment)
+    absent = present.task.absent | gone
+    if absent:
+        plan = (declaration or present).task.plan
+        declaration = family.declaration(put_together(plan, absent))
+    if declaration is None or declaration is present:
         return instant
     model = _held(instant.model, declaration)
     static = _static(instant, declaration, model, moment)

@@ -39,7 +39,7 @@ class SavedInstant:
             instant.index,
             dict(instant.requests),
             instant.at_start,
-            instant.declaration.task.plan,
+            instant.declaration.plan,
         )
 
     def instant(self, family: Family) -> Instant:

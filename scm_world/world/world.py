@@ -368,7 +368,7 @@ class World(Declared):
             episode=self.episode,
             world=self.identity,
             instant=None if self._instant is None else SavedInstant.of(self._instant),
-            plan=self.task.plan,
+            plan=self.declaration.plan,
         )
 
     def restore(self, snapshot: WorldSnapshot) -> None:
