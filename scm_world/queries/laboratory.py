@@ -188,7 +188,7 @@ class Laboratory:
             Forbidden: As in ``do``; before anything is carried out.
             BudgetExhausted: Likewise, for the whole table.
         """
-        from scm_world.queries.protocols import read_protocol
+        from scm_world.queries.tables import read_protocol
 
         rows = read_protocol(protocol, self._world.model)
         done = {r.row: r for r in self._journal.records if r.row is not None}

@@ -18,6 +18,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.stages import Stage, threaded
 from scm_world.world import World
 from scm_world.world.requests import merged
+from scm_world.world.start import whole_number
 
 STEPS = 25
 """Control steps of an episode by default: one second at 25 steps a second."""
@@ -150,6 +151,7 @@ def sample(
         first: Number of the first episode.
         progress: Told after each episode.
     """
+    count = whole_number("n", n, least=1)
     wanted = [as_outcome(outcome) for outcome in outcomes]
     names = tuple(dict.fromkeys(name for outcome in wanted for name in watched(outcome)))
     done = 0
@@ -160,10 +162,10 @@ def sample(
         found = [read(outcome, episode) for outcome in wanted]
         done += 1
         if progress is not None:
-            progress(done, n)
+            progress(done, count)
         return found
 
-    numbers = range(first, first + n)
+    numbers = range(first, first + count)
     rows = threaded(one, numbers, setting.workers)
     columns = {
         _column(outcome): np.array([row[i] for row in rows]) for i, outcome in enumerate(wanted)

@@ -96,6 +96,32 @@ class Undeclared(Report):
 
 
 @final
+class LocalShare(Report):
+    """How well contacts with force tell who acts on whom within a control step.
+
+    Attributes:
+        steps: Control steps that were held against paired experiments.
+        right: Edges that were predicted and are true.
+        extra: Predicted but not true.
+        missed: True but not predicted.
+    """
+
+    steps: int
+    right: int
+    extra: int
+    missed: int
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of precision and recall; 1 if there was nothing to predict."""
+        wrong = self.extra + self.missed
+        return 2 * self.right / (2 * self.right + wrong) if self.right + wrong else 1.0
+
+    def __str__(self) -> str:
+        return f"{self.f1:.3f} ({self.right + self.missed} edges in {self.steps} control steps)"
+
+
+@final
 class Verification(Report):
     """A declared graph, held against the physics that is said to have it.
 
@@ -118,6 +144,8 @@ class Verification(Report):
         never_fired: Declared edges that were not.
         undeclared: Effects without an edge.
         colors: Edges from a color to something that moves, declared or seen.
+        local: Local graphs from contacts, held against paired experiments in one episode; None
+            without physics, or if it was stopped before.
         seconds: Wall time.
         versions: Of everything that decides the result.
     """
@@ -140,6 +168,7 @@ class Verification(Report):
     never_fired: tuple[EdgeKey, ...]
     undeclared: tuple[Undeclared, ...]
     colors: tuple[EdgeKey, ...]
+    local: LocalShare | None = None
     seconds: float
     versions: dict[str, str]
 
@@ -191,6 +220,7 @@ class Verification(Report):
             ("never seen", listed(map(arrow, self.never_fired)), not self.never_fired),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
             ("colors that move something", listed(map(arrow, self.colors)), not self.colors),
+            ("local graphs, F1", "-" if self.local is None else str(self.local), None),
             ("seconds", f"{self.seconds:.1f}", None),
             ("passed", "yes" if self.passed else "no", self.passed),
         )

@@ -14,11 +14,19 @@ from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.series import Progress, Series, checked_count
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.local import local_report
+from scm_world.queries.policies import Random
 from scm_world.queries.signs import compare_signs
-from scm_world.queries.verification import Fired, Undeclared, Verification
+from scm_world.queries.verification import Fired, LocalShare, Undeclared, Verification
 from scm_world.tasks import Task
 from scm_world.variables import Measured
 from scm_world.world import World
+
+LOCAL_STEPS, LOCAL_EVERY = 50, 4
+"""How long the episode is in which local graphs are tried, and one of how many steps is."""
+
+PRESSING = "pressing"
+"""The rule of local graphs: contacts with force."""
 
 MOST, LEAST = 200, 16
 """How many probe states there are at most, and how many even if every edge was seen before."""
@@ -163,6 +171,8 @@ def _verified(
     effects, done = series.effects, series.done
     found = effects.found(effects.threshold)
     colors = {edge for edge in {*found, *declared} if _is_color(edge[0]) and edge[1] in measured}
+    interrupted = done < probes and (bool(watch.missing) or done < least)
+    local = None if interrupted else _local(world, seed)
     return Verification(
         task=world.task.name,
         backend=world.backend.name,
@@ -170,7 +180,7 @@ def _verified(
         seed=seed,
         probes=done,
         planned=probes,
-        interrupted=done < probes and (bool(watch.missing) or done < least),
+        interrupted=interrupted,
         rollouts=effects.rollouts,
         floor=effects.floor,
         threshold=effects.threshold,
@@ -180,9 +190,24 @@ def _verified(
         never_fired=tuple(sorted(set(declared) - found)),
         undeclared=tuple(_undeclared(key, effects) for key in sorted(found - set(declared))),
         colors=tuple(sorted(colors)),
+        local=local,
         seconds=time.perf_counter() - started,
         versions=versions(f"{world.backend.name} {world.backend.version}"),
     )
+
+
+def _local(world: World, seed: int) -> LocalShare | None:
+    """Hold local graphs against paired experiments while the robot moves at random."""
+    if not world.backend.capabilities.physics:
+        return None
+    with contextlib.suppress(KeyboardInterrupt):
+        world.reset(seed=seed)
+        report = local_report(world, Random(every=5), LOCAL_STEPS, every=LOCAL_EVERY)
+        score = report.scores[PRESSING]
+        return LocalShare(
+            steps=report.steps, right=score.right, extra=score.extra, missed=score.missed
+        )
+    return None
 
 
 def _is_color(name: str) -> bool:

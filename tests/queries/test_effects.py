@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +178,17 @@ def test_an_episode_in_a_file_happens_again(tmp_path: Path, backend: str) -> Non
     assert again != episode
     assert again.counterfactual({}, at=6) == branch
     assert again.stage.options["frame_skip"] == 5
+    ask = (
+        "import sys; from scm_world.queries import load_episode; "
+        "print(load_episode(sys.argv[1]).trace.vectors[-1].tobytes().hex())"
+    )
+    elsewhere = subprocess.run(  # noqa: S603 # our own
+        [sys.executable, "-c", ask, str(tmp_path / "branch.npz")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert elsewhere.stdout.strip() == branch.trace.vectors[-1].tobytes().hex()
 
 
 def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
