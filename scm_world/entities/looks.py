@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import final
 
-from scm_world._types import Values
+from scm_world._types import Floats, Values
 from scm_world.entities.base import Entity
 from scm_world.geometry import from_rotation_vector, to_rotation_vector
 from scm_world.scene import Light
@@ -67,19 +67,7 @@ class Looks(Entity):
             default=tuple(orientation),
             doc="Quaternion (x, y, z, w) of its axes right, down and forward.",
         )
-        x, y, z = to_rotation_vector(orientation).tolist()
-        turned = Box((x - _TURN, y - _TURN, z - _TURN), (x + _TURN, y + _TURN, z + _TURN))
-        yield Derived(
-            name=f"{name}.euler_orientation",
-            unit="rad",
-            shape=(3,),
-            a=turned,
-            b=Box((x - _TURN, y - _TURN, z + _TURN), (x + _TURN, y + _TURN, z + 3.0 * _TURN)),
-            parents=(f"{name}.orientation",),
-            mechanism=to_rotation_vector,
-            inverse=from_rotation_vector,
-            doc="Orientation as a rotation vector; setting it sets the quaternion.",
-        )
+        yield _turned(name, to_rotation_vector(orientation))
         yield Exogenous(
             name=f"{name}.field_of_view",
             unit="deg",
@@ -94,6 +82,24 @@ class Looks(Entity):
         """Describe the light."""
         x, y, z = values["light_direction"].tolist()
         return Light((x, y, z), float(values["light_ambient"]))
+
+
+def _turned(camera: str, usual: Floats) -> Variable:
+    """Declare the orientation of a camera as a rotation vector, near the usual one [rad]."""
+    low, high = usual - _TURN, usual + _TURN
+    far_low, far_high = low.copy(), high.copy()
+    far_low[2], far_high[2] = high[2], usual[2] + 3.0 * _TURN
+    return Derived(
+        name=f"{camera}.euler_orientation",
+        unit="rad",
+        shape=(3,),
+        a=Box(tuple(low.tolist()), tuple(high.tolist())),
+        b=Box(tuple(far_low.tolist()), tuple(far_high.tolist())),
+        parents=(f"{camera}.orientation",),
+        mechanism=to_rotation_vector,
+        inverse=from_rotation_vector,
+        doc="Orientation as a rotation vector; setting it sets the quaternion.",
+    )
 
 
 def cameras(values: Values) -> tuple[Camera, ...]:

@@ -240,10 +240,7 @@ class World(Declared):
         self.advance(clipped(action, *self.declaration.action_bounds, self._action_unit))
 
     def advance(self, command: Floats) -> None:
-        """Advance one control step with an action that is nine finite numbers in its range.
-
-        For loops that cannot wait; ``step`` checks and clips.
-        """
+        """Advance one control step with nine finite numbers in their range; see ``step``."""
         self._require_episode()
         if self._action_is_held:
             known = {**self._now, **self.evaluate(self._inputs), "action": command}
