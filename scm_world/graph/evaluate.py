@@ -156,7 +156,8 @@ class Evaluator:
     ) -> Value:
         """Compute what another mechanism makes of a variable."""
         requested = act.requested
-        value = np.asarray(given.function.bind()(*self._arguments(given.parents, values, previous)))
+        arguments = map(np.array, self._arguments(given.parents, values, previous))  # copies
+        value = np.asarray(given.function.bind()(*arguments))
         if value.shape[value.ndim - len(requested.shape) :] != requested.shape:
             try:
                 value = requested.array(value)

@@ -55,24 +55,40 @@ class Course:
         if self._is_simple and step not in self._starts:
             return {}
         found: dict[str, Intervention] = {}
-        for number, name, start, parts in self._owners(step):
+        for number, name, start, parts in self._owners(step, world):
+            released = False
             for index, part in enumerate(parts):
-                key = (number, name, index)
-                act = _due(part, step, start, name, world, fired, key)
-                if act is not None:
+                act = _due(part, step, start, name, world, fired, (number, name, index))
+                if isinstance(part, Clamp) and isinstance(act, Natural) and step == part.stop:
+                    released = True
+                elif act is not None:
                     found[name] = act
+            if released and name not in found:
+                found[name] = _still_held(parts, step)
         return found
 
-    def _owners(self, step: int) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
-        last = {
-            name: number
-            for number, (start, plan) in enumerate(self.layers)
-            if start <= step
-            for name in plan
-        }
-        for name, number in last.items():
+    def _owners(self, step: int, world: World) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
+        """List what counts at a step: of each quantity the last plan that names it."""
+        last: dict[str, tuple[int, dict[str, None]]] = {}
+        for number, (start, plan) in enumerate(self.layers):
+            for name in plan if start <= step else ():
+                target = world.model.target(name) if name in world.model else name
+                if last.get(target, (-1, {}))[0] != number:
+                    last[target] = (number, {})
+                last[target][1][name] = None
+        for number, names in last.values():
             start, plan = self.layers[number]
-            yield number, name, start, plan[name]
+            yield from ((number, name, start, plan[name]) for name in names)
+
+
+def _still_held(parts: tuple[Any, ...], step: int) -> Intervention:
+    """Say what holds where a window ends: a window around it, or the variable's own mechanism."""
+    for part in parts:
+        is_open = isinstance(part, Clamp) and part.start <= step
+        if is_open and (part.stop is None or step < part.stop):
+            held: Intervention = part.act
+            return held
+    return Natural()
 
 
 def _due(

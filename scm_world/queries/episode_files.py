@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zipfile
 from collections.abc import Sequence
@@ -39,7 +40,9 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
             numbers and texts.
     """
     trace = episode.trace
-    target = Path(path).with_suffix(".npz")
+    target = Path(path)
+    if target.suffix != ".npz":
+        target = target.with_name(target.name + ".npz")
     part = target.with_name(target.name + ".part")
     with part.open("wb") as stream:
         np.savez_compressed(
@@ -74,8 +77,23 @@ def _about(episode: Episode) -> dict[str, Any]:
         "number": episode.number,
         "steps": episode.steps,
         "layers": [[start, plan.as_dict()] for start, plan in episode.layers],
+        "parameters": _digest(episode.trace),
         "versions": versions(engine),
     }
+
+
+def _digest(trace: Trace) -> str:
+    """Sum up all values of parameters, at all times."""
+    found = hashlib.sha256()
+    last: dict[str, Any] = {}
+    for step, values in trace.statics:
+        if last.keys() == values.keys() and all(np.array_equal(last[n], values[n]) for n in last):
+            continue
+        last = values
+        found.update(str(step).encode())
+        for name in sorted(values):
+            found.update(name.encode() + np.asarray(values[name]).tobytes())
+    return found.hexdigest()
 
 
 def _plain(value: Any) -> Any:
@@ -120,6 +138,8 @@ def load_episode(
     with stage.twin() as twin:
         begin(twin, about["seed"], about["number"], course, trace)
         run(twin, trace, course, Given(actions), first=0, steps=about["steps"], begun=True)
+    if _digest(trace) != about["parameters"]:
+        raise SnapshotMismatch(f"{file} happens with other parameters than it did")
     _compare(trace, np.split(states, np.cumsum(lengths)[:-1]), file, about["versions"])
     return Episode(
         stage,

@@ -14,7 +14,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.policies import Sequence as Given
 from scm_world.queries.policies import as_policy
 from scm_world.queries.stages import Stage, threaded
-from scm_world.queries.traces import ALL, Trace, begin, run
+from scm_world.queries.traces import ALL, Trace, as_names, begin, run
 from scm_world.world import Audit, World
 from scm_world.world.start import whole_number
 
@@ -173,7 +173,7 @@ class Episode:
         step = int(at)
         layers = (*self.layers, (step, Plan(do)))
         with self.stage.twin() as world:
-            trace = self._branch(world, Course(layers), step, actions, tuple(record))
+            trace = self._branch(world, Course(layers), step, actions, as_names(record))
         return Episode(
             self.stage,
             seed=self.seed,
@@ -187,21 +187,27 @@ class Episode:
         self, world: World, course: Course, at: int, actions: Any, names: tuple[str, ...]
     ) -> Trace:
         past = Given(self.trace.actions)
-        near = max((step for step in self.trace.snapshots if step <= at), default=0)
-        world.restore(self.trace.snapshots[near])
-        if near < at:  # nothing is new until then
+        trace = self.trace.until(at)
+        if at == 0:
+            world.reset(seed=self.seed, episode=self.number)
+        else:  # snapshots are taken after what was done: go on from an earlier one
+            near = max(step for step in self.trace.snapshots if step < at)
+            world.restore(self.trace.snapshots[near])
             before, scratch = Course(self.layers), Trace(fired=dict(self.trace.fired))
             run(world, scratch, before, past, first=near, steps=at, begun=True)
-        trace = self.trace.until(at)
+        names = tuple(name for name in names if self._is_whole(name, at))
         trace.values = {name: list(self[name][:at]) for name in names}
-        # What is in the snapshot already is asked for again, which changes nothing: interventions
-        # at one instant are one intervention.
         due = course.due(world, at, trace.fired)
         if due:
             trace.audits[at] = world.do(due)
         policy = past if _is_replay(actions) else as_policy(actions)
         run(world, trace, course, policy, first=at, steps=self.steps, names=names, begun=True)
         return trace
+
+    def _is_whole(self, name: str, at: int) -> bool:
+        """Tell whether a variable is there at every instant before one."""
+        there = (d for step, d in self.trace.declarations if step < max(at, 1))
+        return all(name in declaration.model for declaration in there)
 
     def worlds(
         self,
@@ -221,7 +227,7 @@ class Episode:
             record: Variables to write down on the way.
             workers: Threads; the result does not depend on how many.
         """
-        names = tuple(record)
+        names = as_names(record)
 
         def one(do: Mapping[str, Any]) -> Episode:
             return self.counterfactual(do, at=at, actions=actions, record=names)
@@ -261,7 +267,8 @@ def rollout(
         begin(world, seed, number, course, trace)
         length = world.max_episode_length if steps is None else steps
         count = whole_number("steps", length, least=1)
-        run(world, trace, course, as_policy(policy), first=0, steps=count, names=record, begun=True)
+        names = as_names(record)
+        run(world, trace, course, as_policy(policy), first=0, steps=count, names=names, begun=True)
     return Episode(stage, seed=seed, number=number, layers=[(0, plan)], steps=count, trace=trace)
 
 

@@ -24,7 +24,7 @@ CONFIDENCE = 0.95
 
 
 def t_quantile(probability: float, degrees: int) -> float:
-    """Approximate a quantile of Student's t distribution, to 0.5 % from 4 degrees on.
+    """Give a quantile of Student's t distribution, to 1 % at 3 degrees and 0.5 % above.
 
     Args:
         probability: Between 0 and 1.
@@ -37,6 +37,10 @@ def t_quantile(probability: float, degrees: int) -> float:
         >>> round(t_quantile(0.975, 10), 2), round(t_quantile(0.975, 1000), 2)
         (2.23, 1.96)
     """
+    if degrees == 1:
+        return math.tan(math.pi * (probability - 0.5))
+    if degrees == 2:
+        return (2.0 * probability - 1.0) / math.sqrt(2.0 * probability * (1.0 - probability))
     z = NormalDist().inv_cdf(probability)
     terms = (
         (z**3 + z) / 4.0,
@@ -246,6 +250,7 @@ def effect_over(
     *,
     name: str,
     values: Sequence[Any],
+    given: Plan,
     n: int,
     setting: Setting,
     progress: Progress | None = None,
@@ -262,7 +267,13 @@ def effect_over(
                 progress(before + done, len(values) * count)
 
         found = sample(
-            stage, world, {name: value}, count, outcomes=(wanted,), setting=setting, progress=told
+            stage,
+            world,
+            given.do({name: value}),
+            count,
+            outcomes=(wanted,),
+            setting=setting,
+            progress=told,
         )
         columns.append(next(iter(found.values())))
     base = {name: values[0]}

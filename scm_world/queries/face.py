@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Self, final
 
@@ -15,8 +16,9 @@ from scm_world.queries.estimates import Effect
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Progress, Samples, Setting
 from scm_world.queries.stages import stage_of
-from scm_world.world import Audit
+from scm_world.world import Audit, WorldSnapshot
 from scm_world.world import World as Simulated
+from scm_world.world.requests import merged
 
 
 @final
@@ -63,7 +65,7 @@ class World(Simulated):
             InterventionError: The intervention was refused.
         """
         other = copy.deepcopy(self)
-        other._standing = self._standing.do(do)
+        other._standing = self._with(do)
         if other._started:
             other._course = Course([*self._course.layers, (other.index, Plan(do))])
             other._fired = fired = dict(self._fired)
@@ -95,24 +97,39 @@ class World(Simulated):
         self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
     ) -> Audit | None:
         """Begin an episode, with what is given; see ``scm_world.world.World.reset``."""
-        if not len(self._standing):
+        plan = self._with(do)
+        if not len(self._standing) and not any(True for _ in plan.timed()):
+            self._course, self._fired = Course(()), {}
             return super().reset(seed=seed, episode=episode, do=do)
         super().reset(seed=seed, episode=episode)
-        acts = {**self._standing.at_start(), **Plan(do).at_start()}
         fired: dict[Key, int] = {}
-        self._course, self._fired = Course([(0, self._standing)]), fired
-        due = {**self._course.due(self, 0, fired), **acts}
+        self._course, self._fired = Course([(0, plan)]), fired
+        due = self._course.due(self, 0, fired)
         return self.do(due) if due else None
 
     def advance(self, command: Floats) -> None:
         """Advance one control step, with what is due at its beginning."""
-        if len(self._standing) and self.index:
+        if self._course.layers and self.index:
             fired = dict(self._fired)
             due = self._course.due(self, self.index, fired)
             self._fired = fired
             if due:
                 self.do(due)
         super().advance(command)
+
+    def snapshot(self) -> WorldSnapshot:
+        """Save everything, with the events that have happened."""
+        return replace(super().snapshot(), memory=(self._course, dict(self._fired)))
+
+    def restore(self, snapshot: WorldSnapshot) -> None:
+        """Go back to a snapshot, bit for bit."""
+        super().restore(snapshot)
+        if snapshot.memory is not None:
+            self._course, self._fired = snapshot.memory[0], dict(snapshot.memory[1])
+
+    def _with(self, do: Mapping[str, Any] | None) -> Plan:
+        """Add something to what is given; of two names of one quantity the later one counts."""
+        return Plan(merged(self.declaration, self._standing, Plan(do)))
 
     # --- asking -------------------------------------------------------------------------------
 
@@ -141,7 +158,7 @@ class World(Simulated):
             InterventionError: An intervention was refused.
             ActionError: The policy is none, or gave no action.
         """
-        plan = self._standing.do(do or {})
+        plan = self._with(do)
         return rollout(
             stage_of(self), policy, seed=seed, number=episode, do=plan, steps=steps, record=record
         )
@@ -184,7 +201,7 @@ class World(Simulated):
         return samples.sample(
             stage_of(self),
             self,
-            self._standing.do(do),
+            self._with(do),
             n,
             outcomes=outcomes,
             setting=Setting(**setting),
@@ -222,8 +239,8 @@ class World(Simulated):
             stage_of(self),
             self,
             outcome,
-            do=self._standing.do(do),
-            versus=self._standing.do(versus or {}),
+            do=self._with(do),
+            versus=self._with(versus),
             n=n,
             paired=paired,
             setting=Setting(**setting),
@@ -256,6 +273,7 @@ class World(Simulated):
             outcome,
             name=name,
             values=values,
+            given=self._standing,
             n=n,
             setting=Setting(**setting),
             progress=progress,
@@ -292,8 +310,8 @@ class World(Simulated):
             stage_of(self),
             self,
             outcome,
-            do=self._standing.do(do),
-            versus=self._standing.do(versus or {}),
+            do=self._with(do),
+            versus=self._with(versus),
             by=by,
             bins=bins,
             n=n,

@@ -49,8 +49,19 @@ def nature_graph(
         model: Of the world.
         nature: What varies by itself; a ``Mechanism`` adds its edges.
         outcomes: What the episode ends with.
+
+    Raises:
+        ModelError: Nature does something later than at the beginning.
     """
-    acts = Plan(nature).at_start()
+    plan = Plan(nature)
+    acts = plan.at_first()
+    late = sorted(
+        {name for name in plan if name not in acts} | {n for n in plan if len(plan[n]) > 1}
+    )
+    if late:
+        raise ModelError(
+            [f"what nature does to {name!r} has to happen at the beginning" for name in late]
+        )
     held = model.do(acts)
     states = [n for n in map(model.target, acts) if model.declared(n).role == "state"]
     graph = episode_outcome(held, outcomes, starts=states)
@@ -208,7 +219,7 @@ def check_backdoor(
     wanted = as_outcome(outcome)
     if not isinstance(wanted, Outcome):
         raise UnknownOption("outcome", outcome, ("the name of a variable", "Outcome(name, how)"))
-    graph = nature_graph(world.model, nature, [wanted.name])
+    graph = nature_graph(world.model, world.plan.do(nature), [wanted.name])
     found = identify(graph, treatment, wanted.name, observed=observed)
     if found.backdoor is None:
         raise ModelError(
@@ -246,6 +257,13 @@ def _standardised(
         Hernán and Robins, *Causal inference: what if*, 13; the interval is that of a linear
         combination of ordinary least squares coefficients.
     """
+    terms = (causes.shape[1] + 1) * (causes.shape[1] + 2) // 2
+    if len(effect) < 2 * terms:
+        raise ModelError(
+            [f"{len(effect)} episodes are too few for {terms} coefficients; watch {2 * terms}"]
+        )
+    if not causes[:, 0].std() > 0.0:
+        raise ModelError(["the treatment does not vary: let nature draw it, or give it a cause"])
     middle, scale = causes.mean(axis=0), causes.std(axis=0) + 1e-300
 
     def design(rows: Floats) -> Floats:
@@ -261,7 +279,9 @@ def _standardised(
     sides = [causes.copy(), causes.copy()]
     for side, value in zip(sides, values, strict=True):
         side[:, 0] = value
-    apart = (design(sides[1]) - design(sides[0])).mean(axis=0)
+    each = design(sides[1]) - design(sides[0])
+    apart = each.mean(axis=0)
     mean, variance = float(apart @ slopes), spread * float(apart @ inverse @ apart)
+    variance += float((each @ slopes).var(ddof=1)) / len(effect)  # units are a sample, too
     half = t_quantile(0.5 + 0.5 * CONFIDENCE, degrees) * float(np.sqrt(variance))
     return mean, mean - half, mean + half

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -23,7 +24,7 @@ class Record:
     """One experiment.
 
     Attributes:
-        kind: ``"see"``, ``"do"`` or ``"counterfactual"``.
+        kind: ``"see"``, ``"do"`` or ``"counterfactual"``, after ``"refused "`` where it failed.
         samples: What was done, to which units, and what came out.
         at: From which control step a counterfactual differs.
         row: Of a protocol, if it belongs to one.
@@ -47,13 +48,17 @@ class Journal:
     Args:
         path: Of the file; what is in it is read.
         terms: What has to be the same in the file.
+        trusted: Packages whose functions may be mechanisms of its plans.
 
     Raises:
         UnreadableFile: The file is no log, or one on other terms.
     """
 
-    def __init__(self, path: Path | str | None, terms: dict[str, Any]) -> None:
+    def __init__(
+        self, path: Path | str | None, terms: dict[str, Any], trusted: Sequence[str] = ()
+    ) -> None:
         self._path = None if path is None else Path(path)
+        self._trusted = tuple(trusted)
         self.records: list[Record] = []
         head = json.loads(json.dumps({"format": FORMAT, **terms}))
         if self._path is None:
@@ -66,7 +71,12 @@ class Journal:
     @property
     def next_unit(self) -> int:
         """Number of the first episode that was not lived yet."""
-        return sum(r.episodes for r in self.records if r.kind != "counterfactual")
+        return sum(r.episodes for r in self.records if not r.kind.endswith("counterfactual"))
+
+    @property
+    def is_written(self) -> bool:
+        """Whether there is a file."""
+        return self._path is not None
 
     def write(self, kind: str, samples: Samples, *, at: int = 0, row: int | None = None) -> None:
         """Add an experiment; it is on the disk when this returns."""
@@ -105,7 +115,7 @@ class Journal:
                 other = [key for key in head if first.get(key) != head[key]]
                 reason = f"it is the log of other experiments: {', '.join(other)} differ"
                 raise UnreadableFile(str(path), reason, "give the laboratory another log")
-            self.records = [_record(line) for line in lines]
+            self.records = [_record(line, self._trusted) for line in lines]
         except (ValueError, KeyError, TypeError, AttributeError, ModelError) as error:
             if isinstance(error, UnreadableFile):
                 raise
@@ -115,8 +125,8 @@ class Journal:
             path.write_text(whole, encoding="utf-8")
 
 
-def _record(line: dict[str, Any]) -> Record:
+def _record(line: dict[str, Any], trusted: Sequence[str]) -> Record:
     columns = {name: np.array(values, dtype=float) for name, values in line["values"].items()}
-    plan = Plan.from_dict(line["plan"])
+    plan = Plan.from_dict(line["plan"], trusted=trusted)
     samples = Samples(columns, tuple(line["units"]), line["seed"], plan)
     return Record(line["kind"], samples, line["at"], line["row"])

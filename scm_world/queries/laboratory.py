@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -16,6 +17,7 @@ from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, sample
 from scm_world.queries.stages import Stage, stage_of
+from scm_world.queries.timed import Contact, Reaches
 from scm_world.variables import Fixed
 from scm_world.world import World
 from scm_world.world.start import whole_number
@@ -38,7 +40,8 @@ class Laboratory:
         budget: How many episodes there are in all; without end if None.
         outcomes: What an experiment reports: names of visible variables (their final values) or
             ``Outcome``; the final values of all that is visible if None.
-        log: File to write to; a line of JSON for each experiment.
+        log: File to write to; a line of JSON for each experiment. One laboratory at a time.
+        trusted: Packages whose functions may be mechanisms of a log that is gone on with.
         setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
 
     Raises:
@@ -64,6 +67,7 @@ class Laboratory:
         budget: int | None = None,
         outcomes: Iterable[Any] | None = None,
         log: Path | str | None = None,
+        trusted: Sequence[str] = (),
         **setting: Any,
     ) -> None:
         self.allow = tuple(allow)
@@ -73,6 +77,7 @@ class Laboratory:
         self._world: World = world
         self._stage: Stage = stage_of(world)
         self._setting = Setting(**setting)
+        self._given: Plan = getattr(world, "plan", Plan())
         model = world.model
         everything = tuple(n for n in model if not isinstance(model.declared(n), Fixed))
         can_be_set = tuple(n for n in model if model.declared(model.target(n)).settable)
@@ -80,7 +85,8 @@ class Laboratory:
         self.settable = _matching("settable", settable, can_be_set)
         self.budget = None if budget is None else whole_number("budget", budget, least=0)
         self.outcomes = self._reported(outcomes)
-        self._journal = Journal(log, self._terms())
+        self._lock = threading.Lock()
+        self._journal = Journal(log, self._terms(), trusted)
 
     def _reported(self, outcomes: Iterable[Any] | None) -> tuple[Outcome, ...]:
         wanted = self.visible if outcomes is None else tuple(outcomes)
@@ -93,9 +99,12 @@ class Laboratory:
     def _terms(self) -> dict[str, Any]:
         """Say what has to be the same for a log to be gone on with."""
         setting = self._setting
+        given = self._world.task.given
         return {
             "task": self._world.task.name,
-            "engine": self._world.backend.name,
+            "arguments": {name: str(value) for name, value in sorted(given.items())},
+            "options": self._stage.options,
+            "given": repr(self._given),
             "seed": setting.seed,
             "steps": setting.steps,
             "policy": setting.policy if isinstance(setting.policy, str) else "given",
@@ -142,7 +151,9 @@ class Laboratory:
         Raises:
             Forbidden: This question is not allowed, or something may not be set.
             BudgetExhausted: There are fewer episodes left.
-            InterventionError: The intervention was refused; that costs nothing.
+            InterventionError: The intervention was refused. That costs nothing if it could be seen
+                beforehand, else all the episodes: how far they came may tell something.
+            ModelError: With a log: a mechanism has no name under which it can be found again.
         """
         return self._experiment("do", request, n, row=row)
 
@@ -163,17 +174,28 @@ class Laboratory:
             Forbidden: As in ``do``, or the unit was never seen.
             BudgetExhausted: No episode is left.
         """
+        with self._lock:
+            return self._imagine(unit, request, at)
+
+    def _imagine(self, unit: int, request: Mapping[str, Any], at: int) -> dict[str, Floats]:
         self._permit("counterfactual", request, 1)
-        plan = self._plan_of(unit)
+        plan = self._given.do(self._plan_of(unit))
         names = tuple(dict.fromkeys(outcome.name for outcome in self.outcomes))
         episode = self._setting.episode(self._stage, self._world, plan, unit, ())
-        other = episode.counterfactual(request, at=at, record=names)
+        try:
+            other = episode.counterfactual(request, at=at, record=names)
+        except Exception:
+            self._journal.write("refused counterfactual", self._nothing((unit,), request), at=at)
+            raise
         columns = {_key(outcome): outcome.of(other) for outcome in self.outcomes}
         held = Samples(
             {k: v[None] for k, v in columns.items()}, (unit,), self._setting.seed, Plan(request)
         )
         self._journal.write("counterfactual", held, at=at)
-        return columns
+        return {name: values.copy() for name, values in columns.items()}
+
+    def _nothing(self, units: Sequence[int], request: Mapping[str, Any]) -> Samples:
+        return Samples({}, tuple(units), self._setting.seed, Plan(request))
 
     def run(self, protocol: Path | str | Iterable[Mapping[str, Any]]) -> tuple[Samples, ...]:
         """Carry out a protocol: a table of settings in, a data set out.
@@ -191,9 +213,13 @@ class Laboratory:
         from scm_world.queries.tables import read_protocol
 
         rows = read_protocol(protocol, self._world.model)
-        done = {r.row: r for r in self._journal.records if r.row is not None}
-        for index, (request, _) in enumerate(rows):
-            if index in done and done[index].samples.plan != Plan(request):
+        done = {r.row: r for r in self._journal.records if r.row is not None and r.samples}
+        for index, (request, n) in enumerate(rows):
+            known = done.get(index)
+            same = known is None or (
+                known.samples.plan == Plan(request) and len(known.samples.numbers) == n
+            )
+            if not same:
                 raise UnknownOption(
                     "protocol", f"row {index}", ("the one that the log began with",)
                 )
@@ -203,32 +229,47 @@ class Laboratory:
         self._afford(sum(n for _, _, n in todo))
         for index, request, n in todo:
             self._experiment("do" if request else "see", request, n, row=index)
-        found = {r.row: r.samples for r in self._journal.records if r.row is not None}
+        found = {
+            r.row: r.samples.copy()
+            for r in self._journal.records
+            if r.row is not None and r.samples
+        }
         return tuple(found[index] for index in range(len(rows)))
 
     def _experiment(
         self, kind: str, request: Mapping[str, Any], n: int, *, row: int | None = None
     ) -> Samples:
         count = whole_number("n", n, least=1)
+        with self._lock:
+            return self._carry_out(kind, request, count, row)
+
+    def _carry_out(
+        self, kind: str, request: Mapping[str, Any], count: int, row: int | None
+    ) -> Samples:
         self._permit(kind, request, count)
         first = self._journal.next_unit
-        found = sample(
-            self._stage,
-            self._world,
-            request,
-            count,
-            outcomes=self.outcomes,
-            setting=self._setting,
-            first=first,
-        )
+        try:
+            found = sample(
+                self._stage,
+                self._world,
+                self._given.do(request),
+                count,
+                outcomes=self.outcomes,
+                setting=self._setting,
+                first=first,
+            )
+        except Exception:  # how far it came may tell something: it is paid
+            units = range(first, first + count)
+            self._journal.write(f"refused {kind}", self._nothing(units, request), row=row)
+            raise
         named = Samples(
             {_key(o): values for o, values in zip(self.outcomes, found.values(), strict=True)},
             found.numbers,
             found.seed,
-            found.plan,
+            Plan(request),
         )
         self._journal.write(kind, named, row=row)
-        return named
+        return named.copy()
 
     # --- permissions --------------------------------------------------------------------------
 
@@ -236,18 +277,31 @@ class Laboratory:
         if kind not in self.allow:
             raise Forbidden(kind, self.allow)
         plan = Plan(request)
+        if self._journal.is_written:
+            plan.as_dict()  # or it could not be written down afterwards
         for name in plan:
             if name not in self.settable:
                 raise Forbidden(f"set {name}", self.settable)
+        self._permit_looks(plan)
+        self._afford(n)
+
+    def _permit_looks(self, plan: Plan) -> None:
+        """Check what a plan looks at: events, and causes of mechanisms."""
         for name, part in plan.timed():
-            watched = getattr(getattr(part, "event", None), "name", None)
-            if watched is not None and watched not in self.visible:
-                raise Forbidden(f"wait with {name} for {watched}", self.visible)
+            event = getattr(part, "event", None)
+            if isinstance(event, Reaches) and event.name not in self.visible:
+                raise Forbidden(f"wait with {name} for {event.name}", self.visible)
+            if isinstance(event, Contact) and not all(map(self._sees, event.bodies)):
+                raise Forbidden(f"wait with {name} for contacts", self.visible)
         for name, act in plan.acts():
+            self._world.model.accept(name, act)
             for parent in getattr(act, "parents", ()):
                 if parent.name not in self.visible:
                     raise Forbidden(f"let {name} follow {parent.name}", self.visible)
-        self._afford(n)
+
+    def _sees(self, body: str) -> bool:
+        """Tell whether a body may be watched: the ground, or one with visible variables."""
+        return body in ("floor", "stage") or any(name.startswith(body) for name in self.visible)
 
     def _afford(self, n: int) -> None:
         left = self.remaining
@@ -256,7 +310,7 @@ class Laboratory:
 
     def _plan_of(self, unit: int) -> Plan:
         for record in self._journal.records:
-            if record.kind != "counterfactual" and unit in record.samples.numbers:
+            if record.kind in ("see", "do") and unit in record.samples.numbers:
                 return record.samples.plan
         raise Forbidden(f"imagine unit {unit}, which was never seen", self._units())
 

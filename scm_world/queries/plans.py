@@ -85,6 +85,16 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if isinstance(part, ACTS)
         }
 
+    def at_first(self) -> dict[str, Intervention]:
+        """Give what happens at the first instant, with or without a time, by variable."""
+        found = self.at_start()
+        for name, part in self.timed():
+            if (isinstance(part, At) and part.step == 0) or (
+                isinstance(part, Clamp) and part.start == 0
+            ):
+                found[name] = part.act
+        return found
+
     def timed(self) -> Iterator[tuple[str, Any]]:
         """List what happens later, or on an event."""
         for name, parts in self._parts.items():

@@ -12,8 +12,9 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats
+from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode, rollout
-from scm_world.queries.outcomes import as_outcome, label, read, watched
+from scm_world.queries.outcomes import Outcome, as_outcome, label, read, watched
 from scm_world.queries.plans import Plan
 from scm_world.queries.stages import Stage, threaded
 from scm_world.world import World
@@ -59,7 +60,11 @@ class Setting:
             number: Which unit.
             names: Variables to write down.
         """
-        plan = Plan(merged(world.declaration, Plan(self.nature), Plan(do)))
+        nature, acts = Plan(self.nature), Plan(do)
+        for name in acts:
+            if name in nature and name not in acts.at_first():
+                acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
+        plan = Plan(merged(world.declaration, nature, acts))
         return rollout(
             stage,
             self.policy,
@@ -97,6 +102,11 @@ class Samples(Mapping[str, Floats]):
     def __len__(self) -> int:
         return len(self.columns)
 
+    def copy(self) -> Samples:
+        """Copy the numbers."""
+        columns = {name: values.copy() for name, values in self.columns.items()}
+        return Samples(columns, self.numbers, self.seed, self.plan)
+
     @property
     def targets(self) -> tuple[str, ...]:
         """Which variables were intervened on: what learners from interventions ask for."""
@@ -124,8 +134,9 @@ class Samples(Mapping[str, Floats]):
                 (number, *map(repr, row))
                 for number, row in zip(self.numbers, table.tolist(), strict=True)
             )
+        beside = target.with_name(target.name.removesuffix(".csv") + ".json")
         about = {"seed": self.seed, "plan": self.plan.as_dict(), "targets": list(self.targets)}
-        target.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n")
+        beside.write_text(json.dumps(about, indent=1) + "\n")
 
 
 def sample(
@@ -152,7 +163,8 @@ def sample(
         progress: Told after each episode.
     """
     count = whole_number("n", n, least=1)
-    wanted = [as_outcome(outcome) for outcome in outcomes]
+    given = (outcomes,) if isinstance(outcomes, str | Outcome) else outcomes
+    wanted = [as_outcome(outcome) for outcome in given]
     names = tuple(dict.fromkeys(name for outcome in wanted for name in watched(outcome)))
     done = 0
 
@@ -167,12 +179,21 @@ def sample(
 
     numbers = range(first, first + count)
     rows = threaded(one, numbers, setting.workers)
-    columns = {
-        _column(outcome): np.array([row[i] for row in rows]) for i, outcome in enumerate(wanted)
-    }
+    try:
+        found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
+    except ValueError:
+        allowed = ("numbers of one shape in every episode",)
+        raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
+    columns: dict[str, Floats] = {}
+    for outcome, values in zip(wanted, found, strict=True):
+        columns[_column(outcome, columns)] = values
     return Samples(columns, tuple(numbers), setting.seed, Plan(do))
 
 
-def _column(outcome: Any) -> str:
-    text = label(outcome)
-    return text.removeprefix("final ")
+def _column(outcome: Any, taken: Iterable[str]) -> str:
+    """Name a column: by its outcome, with a number where that is taken."""
+    text, number = label(outcome).removeprefix("final "), 1
+    names = set(taken)
+    while (name := text if number == 1 else f"{text} ({number})") in names:
+        number += 1
+    return name

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar, final
+from typing import Any, TypeVar, final
 from weakref import WeakKeyDictionary
 
 from scm_world.world import World
@@ -32,6 +32,14 @@ class Stage:
         self._build, (self._kind, self.task, self.options, _), *_ = world.__reduce__()
         self._free: list[World] = []
         self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy and pickle without the twins."""
+        return {**self.__dict__, "_free": [], "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin without twins."""
+        self.__dict__.update(state, _lock=threading.Lock())
 
     @contextmanager
     def twin(self) -> Iterator[World]:

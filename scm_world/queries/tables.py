@@ -34,7 +34,7 @@ def read_protocol(protocol: Path | str | Iterable[Mapping[str, Any]], model: SCM
     """
     if isinstance(protocol, str | Path):
         try:
-            with Path(protocol).open(newline="", encoding="utf-8") as stream:
+            with Path(protocol).open(newline="", encoding="utf-8-sig") as stream:
                 rows: list[Mapping[str, Any]] = list(csv.DictReader(stream))
         except (OSError, csv.Error, UnicodeDecodeError) as error:
             advice = "give a CSV file whose first line names variables"

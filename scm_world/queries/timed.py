@@ -104,6 +104,11 @@ class Contact(Frozen):
     def __init__(self, first: str, second: str, **fields: Any) -> None:
         super().__init__(first=first, second=second, **fields)  # type: ignore[call-arg]
 
+    @property
+    def bodies(self) -> tuple[str, str]:
+        """Both names."""
+        return self.first, self.second
+
     def happens(self, world: World) -> bool:
         """Tell whether they touch now: in the last physics step, with a force."""
         return any(

@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from scm_world._types import Floats, Value
+from scm_world.errors import ActionError
 from scm_world.queries.courses import Course, Key
 from scm_world.queries.policies import Policy
 from scm_world.world import Audit, World, WorldSnapshot
@@ -56,7 +57,7 @@ class Trace:
             declarations=[pair for pair in self.declarations if pair[0] < step],
             actions=self.actions[:step],
             snapshots={at: kept for at, kept in self.snapshots.items() if at < step},
-            fired={key: at for key, at in self.fired.items() if at <= step},
+            fired={key: at for key, at in self.fired.items() if at < step},
             audits={at: audit for at, audit in self.audits.items() if at < step},
         )
 
@@ -87,9 +88,6 @@ def run(
         begun: Whether what is due at ``first`` has been done already.
     """
     wanted = tuple(names)
-    for name in wanted:
-        if name != ALL:
-            world.model.declared(name)  # or there is no such variable
     version = -1
     for step in range(first, steps + 1):
         if (step < steps or step == first) and not (begun and step == first):
@@ -103,9 +101,30 @@ def run(
         if step % EVERY == 0 and step < steps:
             trace.snapshots[step] = world.snapshot()
         if step < steps:
-            action = np.array(policy(world), dtype=np.float64)
+            action = _chosen(policy, world)
             world.step(action)
             trace.actions.append(action)
+
+
+def as_names(record: Iterable[str]) -> tuple[str, ...]:
+    """Read the names of variables; a text is one name."""
+    return (record,) if isinstance(record, str) else tuple(record)
+
+
+def _chosen(policy: Policy, world: World) -> Floats:
+    """Ask a policy for an action.
+
+    Raises:
+        ActionError: It did something else to the world, or gave no numbers.
+    """
+    before = world.version, world.index
+    given = policy(world)
+    if (world.version, world.index) != before:
+        raise ActionError("a policy acts through its action only; put the rest into a plan", given)
+    try:
+        return np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ActionError("an action is nine finite numbers", given) from None
 
 
 def begin(world: World, seed: int, number: int, course: Course, trace: Trace) -> None:
@@ -135,8 +154,9 @@ def _note_parameters(world: World, trace: Trace, step: int) -> None:
 def _write(world: World, trace: Trace, names: tuple[str, ...], contacts: bool) -> None:
     trace.vectors.append(world.current()[1].vector.copy())
     if names:
-        found = world.values() if names == (ALL,) else world.evaluate(names)
-        for name in found if names == (ALL,) else names:
+        there = names if names == (ALL,) else tuple(name for name in names if name in world.model)
+        found = world.values() if names == (ALL,) else world.evaluate(there)
+        for name in found if names == (ALL,) else there:
             trace.values.setdefault(name, []).append(np.array(found[name]))
     if contacts:
         pairs = (tuple(sorted(c.bodies)) for c in world.backend.contacts() if c.force > 0.0)

@@ -137,6 +137,11 @@ class Declaration:
         """What stands in the world, and what was taken out of it."""
         return put_together(self.task.plan, self.task.absent)
 
+    @cached_property
+    def entity_names(self) -> frozenset[str]:
+        """Names of what stands in the world."""
+        return frozenset(entity.name for entity in self.composition.entities)
+
     @property
     def n_blocks(self) -> int:
         """How many movable blocks there are."""

@@ -99,6 +99,8 @@ def accept(
     for name, value in flatten(request).items():
         if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
             continue
+        if isinstance(value, Natural) and name in instant.declaration.entity_names:
+            continue  # it is there
         try:
             act = _accept(instant, name, value)
             target = model.target(name)

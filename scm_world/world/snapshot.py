@@ -75,6 +75,7 @@ class WorldSnapshot:
         world: Task, options and names of all variables, to tell worlds apart.
         instant: What was done at this instant so far, and where it began.
         plan: What stands in the world.
+        memory: What a world of another kind remembers besides.
     """
 
     engine: EngineSnapshot
@@ -88,3 +89,4 @@ class WorldSnapshot:
     world: tuple[Any, ...] = ()
     instant: SavedInstant | None = None
     plan: Hashable = None
+    memory: Any = None
