@@ -59,6 +59,7 @@ class Journal:
     ) -> None:
         self._path = None if path is None else Path(path)
         self._trusted = tuple(trusted)
+        self._size = 0
         self.records: list[Record] = []
         head = json.loads(json.dumps({"format": FORMAT, **terms}))
         if self._path is None:
@@ -95,13 +96,28 @@ class Journal:
             )
         self.records.append(record)
 
+    def refuse_others(self) -> None:
+        """Refuse to go on if another laboratory has written to the file.
+
+        Raises:
+            UnreadableFile: The file is not as it was left.
+        """
+        if self._path is None:
+            return
+        size = self._path.stat().st_size if self._path.exists() else 0
+        if size != self._size:
+            reason = "another laboratory has written to it"
+            raise UnreadableFile(str(self._path), reason, "open it again to go on with all of it")
+
     def _append(self, line: dict[str, Any]) -> None:
         if self._path is None:
             return
+        self.refuse_others()
         with self._path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(line, allow_nan=False) + "\n")
             stream.flush()
             os.fsync(stream.fileno())
+        self._size = self._path.stat().st_size
 
     def _read(self, head: dict[str, Any]) -> None:
         path = self._path
@@ -123,6 +139,7 @@ class Journal:
             raise UnreadableFile(str(path), f"it is no log: {error}", advice) from None
         if whole != text:  # the process was killed while it wrote
             path.write_text(whole, encoding="utf-8")
+        self._size = path.stat().st_size
 
 
 def _record(line: dict[str, Any], trusted: Sequence[str]) -> Record:

@@ -277,6 +277,7 @@ class Laboratory:
         if kind not in self.allow:
             raise Forbidden(kind, self.allow)
         plan = Plan(request)
+        self._journal.refuse_others()
         if self._journal.is_written:
             plan.as_dict()  # or it could not be written down afterwards
         for name in plan:

@@ -44,7 +44,13 @@ class Outcome(Frozen):
         """Read it off an episode."""
         values = np.asarray(episode[self.name], dtype=np.float64)
         if self.component is not None:
-            values = values.reshape(len(values), -1)[:, self.component]
+            flat = values.reshape(len(values), -1)
+            if not 0 <= self.component < flat.shape[1]:
+                allowed = (f"0 to {flat.shape[1] - 1}",)
+                raise UnknownOption(f"component of {self.name}", self.component, allowed)
+            values = flat[:, self.component]
+        if not len(values):
+            raise UnknownOption("outcome", self.name, ("a variable that is there",))
         match self.how:
             case "final":
                 return np.asarray(values[-1])

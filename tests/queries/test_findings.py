@@ -18,6 +18,7 @@ from scm_world.errors import (
     Forbidden,
     InterventionError,
     ModelError,
+    UnknownOption,
     UnknownVariable,
     UnreadableFile,
 )
@@ -297,6 +298,19 @@ def test_logs_belong_to_one_world_and_hold_what_can_be_read(tmp_path: Path) -> N
     torques = World("pushing", backend="fake", action_mode="joint_torques")
     with pytest.raises(UnreadableFile, match="options"):
         Laboratory(torques, trusted=["numpy"], **options)
+
+
+def test_two_laboratories_do_not_share_a_log(tmp_path: Path) -> None:
+    """The one that comes later is told, before its experiment; opened again it has all."""
+    options: dict[str, Any] = {"outcomes": ["reward"], "steps": 2, "log": tmp_path / "log.jsonl"}
+    one, two = (Laboratory(World("pushing", backend="fake"), **options) for _ in range(2))
+    one.see(2)
+    with pytest.raises(UnreadableFile, match="another laboratory"):
+        two.see(1)
+    again = Laboratory(World("pushing", backend="fake"), **options)
+    assert again.see(1).numbers == (2,)
+    with pytest.raises(UnknownOption, match="component"):
+        World("pushing", backend="fake").see(1, outcomes=[Outcome("reward", "final", 7)], steps=1)
 
 
 def test_the_books_cannot_be_written_in(world: World) -> None:
