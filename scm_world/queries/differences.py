@@ -89,6 +89,9 @@ def compare(
     Raises:
         UnknownOption: They are not equally long.
     """
+    for given in (one, other):
+        if not isinstance(given, Episode):
+            raise UnknownOption("episode", given, ("what rollout or counterfactual gave",))
     if one.steps != other.steps:
         raise UnknownOption("episode", other, (f"one of {one.steps} steps",))
     both = [name for name in one.names if name in set(other.names)]

@@ -23,6 +23,7 @@ from scm_world.tasks import TASKS, make_task
 from scm_world.world import World
 
 FORMAT = "scm_world/episode/1"
+KEYS = {"task", "arguments", "options", "seed", "number", "steps", "layers", "versions"}
 
 
 def save_episode(episode: Episode, path: Path | str) -> Path:
@@ -120,16 +121,7 @@ def load_episode(
         SnapshotMismatch: It did not happen again bit for bit: another version, say.
     """
     file = Path(path)
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            about = json.loads(str(arrays["about"]))
-            actions, states = arrays["actions"], arrays["states"]
-            lengths = arrays["lengths"]
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        advice = "give a file that save_episode wrote"
-        raise UnreadableFile(str(file), str(error), advice) from None
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise UnreadableFile(str(file), "it is no episode", "give a file that save_episode wrote")
+    about, actions, states, lengths = _read(file)
     stage = stage_of(world) if world is not None else _stage(about)
     layers = [
         (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
@@ -149,6 +141,19 @@ def load_episode(
         steps=about["steps"],
         trace=trace,
     )
+
+
+def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
+    advice = "give a file that save_episode wrote"
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            about = json.loads(str(arrays["about"]))
+            found = arrays["actions"], arrays["states"], arrays["lengths"]
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise UnreadableFile(str(file), str(error), advice) from None
+    if not isinstance(about, dict) or about.get("format") != FORMAT or not about.keys() >= KEYS:
+        raise UnreadableFile(str(file), "it is no episode", advice)
+    return about, *found
 
 
 def _stage(about: dict[str, Any]) -> Stage:

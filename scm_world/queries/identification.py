@@ -90,7 +90,8 @@ def identify(
         frontdoor: Whether to look for front doors too, with pgmpy.
 
     Raises:
-        UnknownOption: There is no such node.
+        UnknownOption: There is no such node, or both are one.
+        ModelError: The graph has a cycle, or no directions.
         MissingExtra: pgmpy is not installed.
 
     Source:
@@ -104,10 +105,15 @@ def identify(
         >>> identify(graph, "x", "y", observed=["x", "y", "w"]).backdoor is None
         True
     """
-    for node in (treatment, outcome):
+    if not (graph.is_directed() and nx.is_directed_acyclic_graph(graph)):
+        raise ModelError(["the graph has to be directed and acyclic"])
+    seen = tuple(graph) if observed is None else tuple(observed)
+    for node in (treatment, outcome, *seen):
         if node not in graph:
             raise UnknownOption("node", node, tuple(map(str, graph)))
-    watched = set(graph if observed is None else observed) - {treatment, outcome}
+    if treatment == outcome:
+        raise UnknownOption("outcome", outcome, ("another node than the treatment",))
+    watched = set(seen) - {treatment, outcome}
     allowed = watched - nx.descendants(graph, treatment)
     behind = graph.copy()
     behind.remove_edges_from(list(graph.out_edges(treatment)))
@@ -217,6 +223,8 @@ def check_backdoor(
         UnknownOption: The outcome is no variable.
     """
     wanted = as_outcome(outcome)
+    if world.model.declared(treatment).shape or np.shape(values) != (2,):
+        raise UnknownOption("treatment", (treatment, values), ("one number, with two values",))
     if not isinstance(wanted, Outcome):
         raise UnknownOption("outcome", outcome, ("the name of a variable", "Outcome(name, how)"))
     graph = nature_graph(world.model, world.plan.do(nature), [wanted.name])

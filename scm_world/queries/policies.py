@@ -9,8 +9,9 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.errors import ActionError
+from scm_world.errors import ActionError, UnknownOption
 from scm_world.world import World
+from scm_world.world.start import whole_number
 
 Policy = Callable[[World], Any]
 """Looks at a world and gives an action, shape (9,) in the units of its action mode."""
@@ -30,6 +31,11 @@ class Random:
 
     share: float = 1.0
     every: int = 1
+
+    def __post_init__(self) -> None:
+        whole_number("every", self.every, least=1)
+        if not np.isfinite(self.share):
+            raise UnknownOption("share", self.share, ("a finite number",))
 
     def __call__(self, world: World) -> Floats:
         """Draw the action of the present step."""

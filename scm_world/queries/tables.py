@@ -40,7 +40,11 @@ def read_protocol(protocol: Path | str | Iterable[Mapping[str, Any]], model: SCM
             advice = "give a CSV file whose first line names variables"
             raise UnreadableFile(str(protocol), str(error), advice) from None
     else:
-        rows = list(protocol)
+        rows = list(protocol) if isinstance(protocol, Iterable) else [protocol]
+    for number, row in enumerate(rows):
+        if not isinstance(row, Mapping) or not all(isinstance(column, str) for column in row):
+            allowed = ("a dictionary of variables and numbers", "as many cells as columns")
+            raise UnknownOption(f"row {number}", row, allowed)
     return [_row(dict(row), model, number) for number, row in enumerate(rows)]
 
 
@@ -48,8 +52,8 @@ def _row(cells: dict[str, Any], model: SCM, number: int) -> Row:
     n = cells.pop("n", None)
     n = 1 if n in (None, "") else n
     try:
-        count = int(n)
-    except (TypeError, ValueError):
+        count = int(n) if float(n) == int(n) else 0
+    except (TypeError, ValueError, OverflowError):
         count = 0
     if count < 1:
         raise UnknownOption(f"n of row {number}", n, ("a whole number from 1 on",))

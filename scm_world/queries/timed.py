@@ -32,7 +32,7 @@ def as_act(value: Any) -> Any:
 
 def _step(option: str, value: Any, *, least: int = 0) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise UnknownOption(option, value, (f"any whole number of control steps from {least} on",))
+        raise UnknownOption(option, value, (f"any whole number from {least} on",))
     return int(value)
 
 
@@ -102,6 +102,9 @@ class Contact(Frozen):
     second: str
 
     def __init__(self, first: str, second: str, **fields: Any) -> None:
+        for body in (first, second):
+            if not isinstance(body, str):
+                raise UnknownOption("body", body, ("the name of a body, or its beginning",))
         super().__init__(first=first, second=second, **fields)  # type: ignore[call-arg]
 
     @property
@@ -138,13 +141,22 @@ class Reaches(Frozen):
     component: int = 0
 
     def __init__(self, name: str, **fields: Any) -> None:
+        given = [fields.get("above"), fields.get("below")]
+        number: Any = given[0] if given[1] is None else given[1]
         if (fields.get("above") is None) == (fields.get("below") is None):
             raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
+        if isinstance(number, str) or np.ndim(number) or not np.isfinite(number):
+            raise UnknownOption("threshold of Reaches", number, ("a finite number",))
+        _step("component of Reaches", fields.get("component", 0))
         super().__init__(name=name, **fields)  # type: ignore[call-arg]
 
     def happens(self, world: World) -> bool:
         """Tell whether it is there now."""
-        number = float(np.ravel(world[self.name])[self.component])
+        numbers = np.ravel(world[self.name])
+        if self.component >= len(numbers):
+            allowed = (f"0 to {len(numbers) - 1}",)
+            raise UnknownOption(f"component of {self.name}", self.component, allowed)
+        number = float(numbers[self.component])
         if self.above is not None:
             return number > self.above
         return self.below is not None and number < self.below
@@ -171,6 +183,10 @@ class On(Frozen):
     act: Intervention
 
     def __init__(self, event: Any, act: Any, **fields: Any) -> None:
+        if not isinstance(event, Contact | Reaches | dict):
+            raise UnknownOption(
+                "event", event, ("Contact(first, second)", "Reaches(name, above=…)")
+            )
         super().__init__(event=event, act=as_act(act), **fields)  # type: ignore[call-arg]
 
 

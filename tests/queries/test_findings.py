@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import networkx as nx
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from scm_world.errors import (
     Forbidden,
     InterventionError,
     ModelError,
+    ScmWorldError,
     UnknownOption,
     UnknownVariable,
     UnreadableFile,
@@ -29,11 +31,14 @@ from scm_world.queries import (
     Laboratory,
     On,
     Outcome,
+    Random,
     Reaches,
     World,
     but_for,
     check_backdoor,
+    compare,
     do,
+    identify,
     load_episode,
     nature_graph,
     save_episode,
@@ -327,3 +332,40 @@ def test_plans_may_be_made_of_anything_that_is_a_plan() -> None:
     """Names of spaces, tuples of timed parts, plans themselves."""
     plan = do({FLOOR: "A", "action": (At(1, [0.1] * 9), At(3, [0.2] * 9))})
     assert do(plan) == plan == do({}).do(plan)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda w: Random(every=0),
+        lambda w: Reaches("reward", above="a"),
+        lambda w: Reaches("reward", above=0.0, component=-1),
+        lambda w: Contact(1, 2),  # type: ignore[arg-type] # that is the point
+        lambda w: On("touch", 3.0),
+        lambda w: w.rollout(steps=2, do={FLOOR: On(Reaches("reward", above=0.0, component=9), 1)}),
+        lambda w: Laboratory(w, steps=1).run(["a"]),  # type: ignore[list-item] # that is the point
+        lambda w: Laboratory(w, steps=1).run([{FLOOR: 0.3, "n": 2.7}]),
+        lambda w: Laboratory(w, steps=1).run([{FLOOR: 0.3, "n": math.inf}]),
+        lambda w: Laboratory(w, steps=1).run([{None: 1.0}]),  # type: ignore[dict-item] # the point
+        lambda w: compare(1, 2),  # type: ignore[arg-type] # that is the point
+        lambda w: identify(nx.DiGraph([("a", "b"), ("b", "a")]), "a", "b"),
+        lambda w: identify(nx.Graph([("a", "b")]), "a", "b"),
+        lambda w: identify(nx.DiGraph([("a", "b")]), "a", "a"),
+        lambda w: identify(nx.DiGraph([("a", "b")]), "a", "b", observed=["c"]),
+        lambda w: check_backdoor(w, "gravity", "reward", values=(0.0, 1.0), nature={}),
+        lambda w: check_backdoor(w, FLOOR, "reward", values=(0.2,), nature={}),
+    ],
+)
+def test_what_is_no_question_is_answered_with_what_is(world: World, ask: Any) -> None:
+    """An error of this package, not of Python, numpy or pydantic."""
+    with pytest.raises(ScmWorldError):
+        ask(world)
+
+
+def test_other_files_are_no_episodes(tmp_path: Path) -> None:
+    """An array, an archive of something else, a description with holes."""
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    np.savez(tmp_path / "b.npz", about=np.array("{}"), actions=0, states=0, lengths=0)
+    for name in ("a.npy", "b.npz"):
+        with pytest.raises(UnreadableFile, match="save_episode"):
+            load_episode(tmp_path / name)
