@@ -12,8 +12,9 @@ from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.models import paired_effects
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.series import Progress, Series, checked_count
+from scm_world.queries.experiments.series import Series, checked_count
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.progress import Progress
 from scm_world.world import World
 
 

@@ -16,7 +16,7 @@ from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry.arrays import compact
 from scm_world.geometry.hull_kernels import Solid, hull_overlap_kernel
-from scm_world.geometry.rotations import canonical
+from scm_world.geometry.rotations import from_rotation_matrix
 
 Vector = tuple[float, float, float]
 
@@ -93,24 +93,8 @@ def hull_of(points: ArrayLike) -> Hull:
         tuple(map(tuple, np.column_stack([planes[:, :3] @ axes, offsets]).tolist())),
         volume,
         tuple((along.sum() - along).tolist()),
-        _quaternion(axes),
+        tuple(from_rotation_matrix(axes).tolist()),
     )
-
-
-def _quaternion(matrix: Floats) -> tuple[float, float, float, float]:
-    """Read the quaternion off a rotation matrix: its outer product is linear in the matrix."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    squares = np.array([1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i])
-    outer = np.array(
-        [
-            [squares[0], b + d, c + g, h - f],
-            [b + d, squares[1], f + h, c - g],
-            [c + g, f + h, squares[2], d - b],
-            [h - f, c - g, d - b, squares[3]],
-        ]
-    )
-    x, y, z, w = canonical(outer[np.argmax(squares)]).tolist()
-    return x, y, z, w
 
 
 def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:

@@ -23,7 +23,17 @@ from scm_world.tasks import TASKS, make_task
 from scm_world.world import World
 
 FORMAT = "scm_world/episode/1"
-KEYS = {"task", "arguments", "options", "seed", "number", "steps", "layers", "versions"}
+KEYS = {
+    "task",
+    "arguments",
+    "options",
+    "seed",
+    "number",
+    "steps",
+    "layers",
+    "versions",
+    "parameters",
+}
 
 
 def save_episode(episode: Episode, path: Path | str) -> Path:

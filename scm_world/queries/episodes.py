@@ -116,14 +116,14 @@ class Episode:
     def replay(self) -> Trace:
         """Go through the episode again, with every variable and every contact written down."""
         if self._all is None:
-            trace = Trace(fired={})
+            trace = Trace()
             with self.stage.twin() as world:
                 begin(world, self.seed, self.number, Course(self.layers), trace)
                 run(
                     world,
                     trace,
                     Course(self.layers),
-                    Given(self.trace.actions) if self.steps else as_policy(None),
+                    Given(self.trace.actions),
                     first=0,
                     steps=self.steps,
                     names=(ALL,),

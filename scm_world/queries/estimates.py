@@ -15,7 +15,8 @@ from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.outcomes import as_outcome, label
 from scm_world.queries.plans import Plan
-from scm_world.queries.samples import Progress, Samples, Setting, sample
+from scm_world.queries.progress import Progress, part
+from scm_world.queries.samples import Samples, Setting, sample
 from scm_world.queries.stages import Stage
 from scm_world.world import World
 from scm_world.world.start import whole_number
@@ -192,15 +193,15 @@ def _both(
 ) -> tuple[Samples, Samples]:
     count = whole_number("n", n, least=2)
 
-    def later(done: int, _: int) -> None:
-        if progress is not None:
-            progress(count + done, 2 * count)
-
-    def sooner(done: int, _: int) -> None:
-        if progress is not None:
-            progress(done, 2 * count)
-
-    treated = sample(stage, world, do, count, outcomes=outcomes, setting=setting, progress=sooner)
+    treated = sample(
+        stage,
+        world,
+        do,
+        count,
+        outcomes=outcomes,
+        setting=setting,
+        progress=part(progress, 0, 2 * count),
+    )
     control = sample(
         stage,
         world,
@@ -209,7 +210,7 @@ def _both(
         outcomes=outcomes,
         setting=setting,
         first=0 if paired else count,
-        progress=later,
+        progress=part(progress, count, 2 * count),
     )
     return treated, control
 
@@ -248,38 +249,23 @@ def effect_over(
     world: World,
     outcome: Any,
     *,
-    name: str,
-    values: Sequence[Any],
-    given: Plan,
+    plans: Sequence[Plan],
     n: int,
     setting: Setting,
     progress: Progress | None = None,
 ) -> tuple[Effect, ...]:
-    """Estimate the paired effects of each value of a variable against the first one."""
-    if len(values) < 2:
-        raise UnknownOption("values", values, ("two or more values of the variable",))
+    """Estimate the paired effects of each plan against the first one."""
     count, wanted = whole_number("n", n, least=2), as_outcome(outcome)
     columns = []
-    for index, value in enumerate(values):
-
-        def told(done: int, _: int, before: int = index * count) -> None:
-            if progress is not None:
-                progress(before + done, len(values) * count)
-
+    for index, plan in enumerate(plans):
+        told = part(progress, index * count, len(plans) * count)
         found = sample(
-            stage,
-            world,
-            given.do({name: value}),
-            count,
-            outcomes=(wanted,),
-            setting=setting,
-            progress=told,
+            stage, world, plan, count, outcomes=(wanted,), setting=setting, progress=told
         )
         columns.append(next(iter(found.values())))
-    base = {name: values[0]}
     return tuple(
-        _effect(world, wanted, column, columns[0], {name: value}, base, True, setting)
-        for value, column in zip(values[1:], columns[1:], strict=True)
+        _effect(world, wanted, values, columns[0], plan, plans[0], True, setting)
+        for plan, values in zip(plans[1:], columns[1:], strict=True)
     )
 
 
@@ -315,10 +301,10 @@ def effect_by(
         )
     order = np.argsort(place, kind="stable")
     found = []
-    for part in np.array_split(order, bins):
-        ends = float(place[part].min()), float(place[part].max())
+    for group in np.array_split(order, bins):
+        ends = float(place[group].min()), float(place[group].max())
         found.append(
-            (ends, _effect(world, wanted, one[part], other[part], do, versus, True, setting))
+            (ends, _effect(world, wanted, one[group], other[group], do, versus, True, setting))
         )
     return tuple(found)
 

@@ -9,12 +9,14 @@ from types import MappingProxyType
 from typing import Any, Self, final
 
 from scm_world._types import Floats
+from scm_world.errors import UnknownOption
 from scm_world.queries import estimates, samples
 from scm_world.queries.courses import Course, Key
 from scm_world.queries.episodes import Episode, rollout
 from scm_world.queries.estimates import Effect
 from scm_world.queries.plans import Plan
-from scm_world.queries.samples import Progress, Samples, Setting
+from scm_world.queries.progress import Progress
+from scm_world.queries.samples import Samples, Setting
 from scm_world.queries.stages import stage_of
 from scm_world.world import Audit, WorldSnapshot
 from scm_world.world import World as Simulated
@@ -267,13 +269,13 @@ class World(Simulated):
             progress: Told after each episode.
             setting: See ``sample``.
         """
+        if len(values) < 2:
+            raise UnknownOption("values", values, ("two or more values of the variable",))
         return estimates.effect_over(
             stage_of(self),
             self,
             outcome,
-            name=name,
-            values=values,
-            given=self._standing,
+            plans=[self._with({name: value}) for value in values],
             n=n,
             setting=Setting(**setting),
             progress=progress,

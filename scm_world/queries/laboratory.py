@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, final
@@ -13,13 +14,14 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import BudgetExhausted, Forbidden, UnknownOption
 from scm_world.queries.journal import Journal, Record
-from scm_world.queries.outcomes import Outcome
+from scm_world.queries.outcomes import Outcome, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, sample
 from scm_world.queries.stages import Stage, stage_of
 from scm_world.queries.timed import Contact, Reaches
 from scm_world.variables import Fixed
 from scm_world.world import World
+from scm_world.world.requests import merged
 from scm_world.world.start import whole_number
 
 QUESTIONS = ("see", "do", "counterfactual")
@@ -42,7 +44,8 @@ class Laboratory:
             ``Outcome``; the final values of all that is visible if None.
         log: File to write to; a line of JSON for each experiment. One laboratory at a time.
         trusted: Packages whose functions may be mechanisms of a log that is gone on with.
-        setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
+        setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``. A
+            policy that is a function has to be the same one for a log; that cannot be checked.
 
     Raises:
         UnknownOption: A pattern matches nothing, or a question does not exist.
@@ -90,7 +93,7 @@ class Laboratory:
 
     def _reported(self, outcomes: Iterable[Any] | None) -> tuple[Outcome, ...]:
         wanted = self.visible if outcomes is None else tuple(outcomes)
-        found = tuple(given if isinstance(given, Outcome) else Outcome(given) for given in wanted)
+        found = tuple(dict.fromkeys(o if isinstance(o, Outcome) else Outcome(o) for o in wanted))
         for outcome in found:
             if outcome.name not in self.visible:
                 raise Forbidden(f"see {outcome.name}", self.visible)
@@ -179,7 +182,7 @@ class Laboratory:
 
     def _imagine(self, unit: int, request: Mapping[str, Any], at: int) -> dict[str, Floats]:
         self._permit("counterfactual", request, 1)
-        plan = self._given.do(self._plan_of(unit))
+        plan = self._with(self._plan_of(unit))
         names = tuple(dict.fromkeys(outcome.name for outcome in self.outcomes))
         episode = self._setting.episode(self._stage, self._world, plan, unit, ())
         try:
@@ -187,12 +190,15 @@ class Laboratory:
         except Exception:
             self._journal.write("refused counterfactual", self._nothing((unit,), request), at=at)
             raise
-        columns = {_key(outcome): outcome.of(other) for outcome in self.outcomes}
+        columns = {column(outcome): outcome.of(other) for outcome in self.outcomes}
         held = Samples(
             {k: v[None] for k, v in columns.items()}, (unit,), self._setting.seed, Plan(request)
         )
         self._journal.write("counterfactual", held, at=at)
         return {name: values.copy() for name, values in columns.items()}
+
+    def _with(self, request: Mapping[str, Any]) -> Plan:
+        return Plan(merged(self._world.declaration, self._given, Plan(request)))
 
     def _nothing(self, units: Sequence[int], request: Mapping[str, Any]) -> Samples:
         return Samples({}, tuple(units), self._setting.seed, Plan(request))
@@ -252,7 +258,7 @@ class Laboratory:
             found = sample(
                 self._stage,
                 self._world,
-                self._given.do(request),
+                self._with(request),
                 count,
                 outcomes=self.outcomes,
                 setting=self._setting,
@@ -262,12 +268,7 @@ class Laboratory:
             units = range(first, first + count)
             self._journal.write(f"refused {kind}", self._nothing(units, request), row=row)
             raise
-        named = Samples(
-            {_key(o): values for o, values in zip(self.outcomes, found.values(), strict=True)},
-            found.numbers,
-            found.seed,
-            Plan(request),
-        )
+        named = replace(found, plan=Plan(request))
         self._journal.write(kind, named, row=row)
         return named.copy()
 
@@ -318,10 +319,6 @@ class Laboratory:
     def _units(self) -> Sequence[str]:
         last = self._journal.next_unit
         return (f"units 0 to {last - 1}",) if last else ("none yet: see or do something first",)
-
-
-def _key(outcome: Outcome) -> str:
-    return str(outcome).removeprefix("final ")
 
 
 def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:

@@ -103,6 +103,11 @@ def read(outcome: Any, episode: Episode) -> Floats:
     return number
 
 
+def column(outcome: Any) -> str:
+    """Name the column of an outcome: that of the variable for its final value."""
+    return label(outcome).removeprefix("final ")
+
+
 def label(outcome: Any) -> str:
     """Write an outcome down."""
     return str(outcome) if isinstance(outcome, Outcome) else getattr(outcome, "__name__", "outcome")

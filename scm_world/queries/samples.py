@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -14,8 +14,9 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode, rollout
-from scm_world.queries.outcomes import Outcome, as_outcome, label, read, watched
+from scm_world.queries.outcomes import Outcome, as_outcome, column, read, watched
 from scm_world.queries.plans import Plan
+from scm_world.queries.progress import Progress
 from scm_world.queries.stages import Stage, threaded
 from scm_world.world import World
 from scm_world.world.requests import merged
@@ -23,9 +24,6 @@ from scm_world.world.start import whole_number
 
 STEPS = 25
 """Control steps of an episode by default: one second at 25 steps a second."""
-
-Progress = Callable[[int, int], None]
-"""Told after each episode how many are done, and how many there will be."""
 
 
 @final
@@ -192,7 +190,7 @@ def sample(
 
 def _column(outcome: Any, taken: Iterable[str]) -> str:
     """Name a column: by its outcome, with a number where that is taken."""
-    text, number = label(outcome).removeprefix("final "), 1
+    text, number = column(outcome), 1
     names = set(taken)
     while (name := text if number == 1 else f"{text} ({number})") in names:
         number += 1

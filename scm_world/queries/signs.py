@@ -11,7 +11,8 @@ from scm_world.queries.agreement import Sign
 from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Response, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.series import Progress, Series
+from scm_world.queries.experiments.series import Series
+from scm_world.queries.progress import Progress, part
 from scm_world.tasks import Task
 from scm_world.variables import Measured
 from scm_world.world import World
@@ -46,20 +47,14 @@ def compare_signs(
     found: list[Responses] = []
     moves: frozenset[str] = frozenset()
     for number, backend in enumerate(backends):
+        told = part(progress, number * probes, len(backends) * probes)
         world = World(task, backend=backend, **options)
         try:
             moves = _moving(world)
-            found.append(_responses(world, probes, seed, _part(progress, number, probes)))
+            found.append(_responses(world, probes, seed, told))
         finally:
             world.close()
     return tuple(_signs(found[0], found[1], moves))
-
-
-def _part(progress: Progress | None, number: int, probes: int) -> Progress | None:
-    """Count the probe states of both engines as one series."""
-    if progress is None:
-        return None
-    return lambda done, _: progress(number * probes + done, 2 * probes)
 
 
 def _moving(world: World) -> frozenset[str]:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scm_world.errors import UnreadableFile
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.queries.local import RuleScore
 
 SHOWN = 10  # edges that are written out in a table
 Row = tuple[str, str, bool | None]
@@ -114,8 +115,7 @@ class LocalShare(Report):
     @property
     def f1(self) -> float:
         """Harmonic mean of precision and recall; 1 if there was nothing to predict."""
-        wrong = self.extra + self.missed
-        return 2 * self.right / (2 * self.right + wrong) if self.right + wrong else 1.0
+        return RuleScore(self.right, self.extra, self.missed).f1
 
     def __str__(self) -> str:
         return f"{self.f1:.3f} ({self.right + self.missed} edges in {self.steps} control steps)"

@@ -12,10 +12,11 @@ from scm_world.queries.agreement import Agreement, Sign
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.series import Progress, Series, checked_count
+from scm_world.queries.experiments.series import Series, checked_count
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import local_report
 from scm_world.queries.policies import Random
+from scm_world.queries.progress import Progress
 from scm_world.queries.signs import compare_signs
 from scm_world.queries.verification import Fired, LocalShare, Undeclared, Verification
 from scm_world.tasks import Task

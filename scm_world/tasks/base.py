@@ -95,10 +95,12 @@ class Task(ABC):
         """Say what stands in the world, given the variables of ``decided_by``."""
         return None
 
-    def at(self, plan: Hashable, conventions: Conventions) -> Self:
+    def at(
+        self, plan: Hashable, conventions: Conventions, absent: frozenset[str] = frozenset()
+    ) -> Self:
         """Give the same task with another structure, or under other conventions."""
         other = copy.copy(self)
-        other.plan, other.conventions = plan, conventions
+        other.plan, other.conventions, other.absent = plan, conventions, absent
         return other
 
     @abstractmethod

@@ -58,8 +58,7 @@ class Family:
         found = self._declarations.get(plan)
         if found is None:
             inner, absent = taken_apart(plan)
-            task = self.task.at(inner, self.options.conventions)
-            task.absent = absent
+            task = self.task.at(inner, self.options.conventions, absent)
             with _refused(task):
                 found = self._declarations[plan] = Declaration(task, self.options, self.steps)
             while len(self._declarations) > KEPT:

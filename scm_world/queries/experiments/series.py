@@ -9,9 +9,7 @@ from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import Probe
-
-Progress = Callable[[int, int], None]
-"""Called with (finished, planned) after each probe state."""
+from scm_world.queries.progress import Progress
 
 
 @final
