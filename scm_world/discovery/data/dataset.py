@@ -1,0 +1,374 @@
+"""Observations under several regimes, as one typed table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.errors import ModelError, UnknownVariable
+from scm_world.queries.plans import Plan
+
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+SEEN = Plan()
+"""The plan of a regime in which nothing is done."""
+
+
+@final
+@dataclass(frozen=True)
+class Column:
+    """One number of a row.
+
+    Attributes:
+        name: ``"tool_block.mass"``, or ``"gravity[2]"`` for a number of a vector; ``@-1`` at the end
+            means one control step before the row.
+        variable: Which variable it belongs to, without component and lag.
+        component: Which number of it; None for a scalar.
+        unit: Of the variable.
+        kind: Of the variable: ``"exogenous"``, ``"derived"``, ``"measured"``, ``"action"``.
+        role: Of the variable: ``"parameter"``, ``"state"``, ``"readout"``, ``"action"``.
+        dtype: ``"real"``, ``"integer"`` or ``"categorical"``.
+        lag: How many control steps before the row it was measured.
+        how: What was taken of an episode: ``"final"``, ``"mean"``, …; ``"value"`` of an instant.
+    """
+
+    name: str
+    variable: str
+    component: int | None = None
+    unit: str = "1"
+    kind: str = "exogenous"
+    role: str = "parameter"
+    dtype: str = "real"
+    lag: int = 0
+    how: str = "value"
+
+
+@final
+@dataclass(frozen=True)
+class Regime:
+    """What was done in some rows.
+
+    Attributes:
+        plan: The interventions; empty where nothing was done.
+        targets: Variables whose own mechanism was replaced, sorted.
+    """
+
+    plan: Plan = SEEN
+    targets: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Write it as plain data."""
+        return {"plan": self.plan.as_dict(), "targets": list(self.targets)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Regime:
+        """Read what ``as_dict`` wrote."""
+        plan = Plan.from_dict(data["plan"], trusted=trusted)
+        return cls(plan, tuple(map(str, data["targets"])))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Rows of numbers, each with the regime, the episode and the control step it comes from.
+
+    Attributes:
+        values: Shape (n, p).
+        columns: What stands in each column.
+        regimes: What was done; rows refer to them by number.
+        regime: Of each row, shape (n,).
+        episode: Of each row, shape (n,). Rows of one episode stand together, in time.
+        step: Control step of each row, shape (n,); 0 where a row is a whole episode.
+        about: Where the rows come from: system, seed, backend, versions and so on; plain data.
+
+    Raises:
+        ModelError: The shapes do not fit together, or a number is not finite.
+
+    Example:
+        >>> table = Dataset.of([[0.0, 1.0], [2.0, 5.0]], ["x", "y"], targets=[(), ("x",)])
+        >>> table.names, table.targeted.tolist(), len(table)
+        (('x', 'y'), [[False, False], [True, False]], 2)
+    """
+
+    values: Floats
+    columns: tuple[Column, ...]
+    regimes: tuple[Regime, ...]
+    regime: Ints
+    episode: Ints
+    step: Ints
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that everything fits together."""
+        n, p = self.values.shape if self.values.ndim == 2 else (-1, -1)
+        problems = []
+        if p != len(self.columns):
+            problems.append(
+                f"values have shape {self.values.shape}, of {len(self.columns)} columns"
+            )
+        for what in ("regime", "episode", "step"):
+            if getattr(self, what).shape != (n,):
+                problems.append(f"{what} has shape {getattr(self, what).shape}, not ({n},)")
+        if not np.isfinite(self.values).all():
+            row, column = np.argwhere(~np.isfinite(self.values))[0]
+            problems.append(f"row {row} of {self.columns[column].name!r} is not finite")
+        if len({column.name for column in self.columns}) != len(self.columns):
+            problems.append("two columns have one name")
+        if (
+            n > 0
+            and not problems
+            and not 0 <= self.regime.min() <= self.regime.max() < len(self.regimes)
+        ):
+            problems.append(f"a row refers to a regime that is not among {len(self.regimes)}")
+        if problems:
+            raise ModelError(problems)
+
+    @classmethod
+    def of(
+        cls,
+        values: Any,
+        names: Sequence[str],
+        *,
+        targets: Sequence[Iterable[str]] | None = None,
+        episode: Any = None,
+        step: Any = None,
+        **about: Any,
+    ) -> Dataset:
+        """Make a table of numbers from elsewhere.
+
+        Args:
+            values: Shape (n, p).
+            names: Of the p columns; scalars all.
+            targets: For each row the columns that were intervened on; nowhere if None.
+            episode: Of each row; each row is its own if None.
+            step: Of each row; 0 if None.
+            about: Where it comes from.
+        """
+        table = np.array(values, dtype=np.float64)
+        n = len(table)
+        rows = [tuple(sorted(set(t))) for t in targets] if targets is not None else [()] * n
+        unknown = sorted({name for row in rows for name in row} - set(names))
+        if unknown:
+            raise UnknownVariable(unknown[0], names)
+        kinds = tuple(dict.fromkeys([(), *rows]))
+        number = {kind: i for i, kind in enumerate(kinds)}
+        return cls(
+            values=table,
+            columns=tuple(Column(name, name) for name in names),
+            regimes=tuple(Regime(targets=kind) for kind in kinds),
+            regime=np.array([number[row] for row in rows], dtype=np.int64),
+            episode=np.arange(n) if episode is None else np.array(episode, dtype=np.int64),
+            step=np.zeros(n, np.int64) if step is None else np.array(step, dtype=np.int64),
+            about=dict(about),
+        )
+
+    # --- looking ------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, name: str) -> Floats:
+        """Give a column, shape (n,), or all columns of a vector, shape (n, k)."""
+        if name in self.names:
+            return self.values[:, self.names.index(name)]
+        where = [i for i, column in enumerate(self.columns) if column.variable == name]
+        if not where:
+            raise UnknownVariable(name, (*self.names, *self.variables))
+        return self.values[:, where]
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether two tables hold the same, bit for bit."""
+        return (
+            isinstance(other, Dataset)
+            and self.columns == other.columns
+            and self.about == other.about
+            and self.values.tobytes() == other.values.tobytes()
+            and all(
+                np.array_equal(getattr(self, what), getattr(other, what))
+                for what in ("episode", "step")
+            )
+            and [self.regimes[i] for i in self.regime] == [other.regimes[i] for i in other.regime]
+        )
+
+    __hash__ = None  # type: ignore[assignment] # compared by content
+
+    def __repr__(self) -> str:
+        done = len({self.regimes[i].targets for i in np.unique(self.regime)})
+        return f"Dataset({len(self)} rows, {len(self.columns)} columns, {done} regimes)"
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns."""
+        return tuple(column.name for column in self.columns)
+
+    @cached_property
+    def variables(self) -> tuple[str, ...]:
+        """That the columns belong to, in their order; with ``@-1`` for an earlier instant."""
+        return tuple(dict.fromkeys(map(block, self.columns)))
+
+    @cached_property
+    def blocks(self) -> dict[str, Ints]:
+        """Numbers of the columns of each variable."""
+        found: dict[str, list[int]] = {name: [] for name in self.variables}
+        for i, column in enumerate(self.columns):
+            found[block(column)].append(i)
+        return {name: np.array(where, dtype=np.int64) for name, where in found.items()}
+
+    @cached_property
+    def targeted(self) -> Bools:
+        """Which numbers were set from outside, shape (n, p)."""
+        kinds = np.array(
+            [[c.lag == 0 and c.variable in r.targets for c in self.columns] for r in self.regimes],
+            dtype=bool,
+        ).reshape(len(self.regimes), len(self.columns))
+        return kinds[self.regime]
+
+    @property
+    def is_temporal(self) -> bool:
+        """Whether an episode has several rows."""
+        return bool(len(self)) and len(np.unique(self.episode)) < len(self)
+
+    # --- other tables -------------------------------------------------------------------------
+
+    def rows(self, chosen: Any) -> Dataset:
+        """Take some rows: a mask, numbers or a slice."""
+        taken = np.arange(len(self))[chosen]
+        return replace(
+            self,
+            values=self.values[taken],
+            regime=self.regime[taken],
+            episode=self.episode[taken],
+            step=self.step[taken],
+        )
+
+    def select(self, names: Iterable[str]) -> Dataset:
+        """Take some columns or variables, in the order given."""
+        where: list[int] = []
+        for name in names:
+            if name in self.names:
+                where.append(self.names.index(name))
+            elif name in self.blocks:
+                where += self.blocks[name].tolist()
+            else:
+                raise UnknownVariable(name, (*self.names, *self.variables))
+        return replace(
+            self, values=self.values[:, where], columns=tuple(self.columns[i] for i in where)
+        )
+
+    @property
+    def seen(self) -> Dataset:
+        """The rows in which nothing was done."""
+        return self.rows(~self._acted[self.regime])
+
+    @cached_property
+    def _acted(self) -> Bools:
+        return np.array([bool(regime.targets) for regime in self.regimes], dtype=bool)
+
+    def first(self, episodes: int) -> Dataset:
+        """Take the rows of the first episodes, in their order."""
+        kept = np.unique(self.episode)[:episodes]
+        return self.rows(np.isin(self.episode, kept))
+
+    def standardised(self) -> Dataset:
+        """Give every column mean 0 and variance 1 over all rows; constant ones become 0."""
+        mean, spread = self.values.mean(axis=0), self.values.std(axis=0)
+        spread = np.where(spread > 1e-12 * (1.0 + np.abs(mean)), spread, np.inf)
+        return replace(self, values=(self.values - mean) / spread)
+
+    def lagged(self, lags: int = 1) -> Dataset:
+        """Put earlier control steps beside each row, as further columns ``name@-1``.
+
+        Rows without enough past are left out; nothing is carried from one episode to the next. A
+        row counts as intervened on where it was at its own instant.
+
+        Example:
+            >>> table = Dataset.of([[1.0], [2.0], [3.0]], ["x"], episode=[0, 0, 1], step=[0, 1, 0])
+            >>> table.lagged().names, table.lagged().values.tolist()
+            (('x', 'x@-1'), [[2.0, 1.0]])
+        """
+        rows = np.arange(len(self))
+        whole = rows[
+            (rows >= lags)
+            & (self.episode[rows - lags] == self.episode[rows])
+            & (self.step[rows] - self.step[rows - lags] == lags)
+        ]
+        earlier = [
+            replace(column, name=f"{column.name}@-{lag}", lag=lag)
+            for lag in range(1, lags + 1)
+            for column in self.columns
+        ]
+        parts = [self.values[whole - lag] for lag in range(lags + 1)]
+        wide = replace(
+            self.rows(whole),
+            values=np.concatenate(parts, axis=1),
+            columns=(*self.columns, *earlier),
+        )
+        wide.about["lags"] = lags
+        return wide
+
+    @classmethod
+    def joined(cls, parts: Sequence[Dataset]) -> Dataset:
+        """Put tables of one kind below one another.
+
+        Raises:
+            ModelError: They differ in columns or in where they come from, or there is none.
+        """
+        if not parts:
+            raise ModelError(["there is no table to join"])
+        first = parts[0]
+        for part in parts[1:]:
+            if part.columns != first.columns or part.about != first.about:
+                raise ModelError(["tables with other columns or from elsewhere cannot be joined"])
+        regimes: list[Regime] = []
+        numbers: list[Ints] = []
+        for part in parts:
+            at = [_place(regimes, regime) for regime in part.regimes]
+            numbers.append(np.array(at, dtype=np.int64)[part.regime])
+        return replace(
+            first,
+            values=np.concatenate([part.values for part in parts]),
+            regimes=tuple(regimes),
+            regime=np.concatenate(numbers),
+            episode=np.concatenate([part.episode for part in parts]),
+            step=np.concatenate([part.step for part in parts]),
+        )
+
+
+def _place(regimes: list[Regime], regime: Regime) -> int:
+    if regime not in regimes:
+        regimes.append(regime)
+    return regimes.index(regime)
+
+
+def block(column: Column) -> str:
+    """Name the variable of a column, with ``@-1`` for an earlier instant."""
+    return f"{column.variable}@-{column.lag}" if column.lag else column.variable
+
+
+def columns_of(variable: Any, how: str = "value") -> tuple[Column, ...]:
+    """List the columns that the numbers of a ``Variable`` fill."""
+    size = int(np.prod(variable.shape))
+    scalar = variable.shape == ()
+    return tuple(
+        Column(
+            variable.name if scalar else f"{variable.name}[{i}]",
+            variable.name,
+            None if scalar else i,
+            variable.unit,
+            variable.kind,
+            str(variable.role),
+            variable.dtype,
+            how=how,
+        )
+        for i in range(size)
+    )
+
+
+Level = Literal["variable", "component"]

@@ -1,0 +1,194 @@
+"""What a learner found: a graph with a measure of how sure each edge is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.errors import ModelError
+from scm_world.queries.experiments.effects import EdgeKey
+
+FORMAT = "scm_world/found/1"
+Bools = NDArray[np.bool_]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A graph over variables, possibly with earlier instants and with undirected edges.
+
+    Attributes:
+        names: Of the p variables.
+        edges: Shape (lags + 1, p, p): ``edges[lag, i, j]`` says that i acts on j that many control
+            steps later. Both ``edges[0, i, j]`` and ``edges[0, j, i]``: the edge has no direction.
+        sureness: Same shape: the larger, the surer the learner is of the edge; only the order of
+            the numbers means something. 0 or 1 where it does not say.
+        learner: Name of the learner.
+        settings: Of the learner.
+        experiments: How many episodes or control steps it used.
+        bound: Fewest experiments that can do in theory, if one is known; see ``design``.
+        seconds: How long it took.
+        versions: Of the libraries that it is made of.
+        notes: What one should know about the result.
+    """
+
+    names: tuple[str, ...]
+    edges: Bools
+    sureness: Floats
+    learner: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+    experiments: int = 0
+    bound: int | None = None
+    seconds: float = 0.0
+    versions: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the shapes."""
+        p = len(self.names)
+        if self.edges.shape != self.sureness.shape or self.edges.shape[1:] != (p, p):
+            shapes = f"{self.edges.shape} and {self.sureness.shape}"
+            raise ModelError([f"edges and sureness have shapes {shapes}, of {p} variables"])
+
+    @classmethod
+    def of(
+        cls,
+        names: Sequence[str],
+        matrix: Any,
+        *,
+        sureness: Any = None,
+        lags: Iterable[int] | None = None,
+        **others: Any,
+    ) -> Found:
+        """Make one from matrices.
+
+        Args:
+            names: Of the p variables.
+            matrix: Shape (p, p) for lag 0, or (lags + 1, p, p); not zero at [i, j] where i acts on
+                j. An edge in both directions within an instant has none.
+            sureness: Same shape; that of the matrix if None.
+            lags: Which lags a matrix of shape (k, p, p) speaks of; 0 to k - 1 if None.
+            others: Further attributes.
+
+        Raises:
+            ModelError: The shapes do not fit together.
+
+        Example:
+            >>> found = Found.of(["x", "y", "z"], [[0, 1, 0], [0, 0, 1], [0, 1, 0]])
+            >>> found.directed, found.undirected
+            ((('x', 'y', 0),), (('y', 'z'),))
+        """
+        given = np.array(matrix)
+        given = given[None] if given.ndim == 2 else given
+        if given.ndim != 3 or given.shape[1:] != (len(names), len(names)):
+            what = f"a graph of {len(names)} variables has shape {given.shape}"
+            raise ModelError([what + f", not ({len(names)}, {len(names)})"])
+        weight = given if sureness is None else np.array(sureness).reshape(given.shape)
+        if lags is not None:
+            at = list(lags)
+            wide = np.zeros((max(at) + 1, *given.shape[1:]))
+            heavy = wide.copy()
+            wide[at], heavy[at] = given, weight
+            given, weight = wide, heavy
+        edges = given != 0
+        np.fill_diagonal(edges[0], False)
+        return cls(tuple(names), edges, np.abs(weight.astype(np.float64)), **others)
+
+    @classmethod
+    def of_edges(cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: Any) -> Found:
+        """Make one from a list of directed edges."""
+        keys = list(edges)
+        at = {name: i for i, name in enumerate(names)}
+        matrix = np.zeros((1 + max((lag for *_, lag in keys), default=0), len(at), len(at)))
+        for cause, effect, lag in keys:
+            matrix[lag, at[cause], at[effect]] = 1.0
+        return cls.of(names, matrix, **others)
+
+    @property
+    def directed(self) -> tuple[EdgeKey, ...]:
+        """Edges that have a direction: cause, effect, lag."""
+        one_way = self.edges.copy()
+        one_way[0] &= ~self.edges[0].T
+        return tuple(
+            (self.names[i], self.names[j], lag) for lag, i, j in np.argwhere(one_way).tolist()
+        )
+
+    @property
+    def undirected(self) -> tuple[tuple[str, str], ...]:
+        """Edges within the instant that have none."""
+        both = np.triu(self.edges[0] & self.edges[0].T)
+        return tuple((self.names[i], self.names[j]) for i, j in np.argwhere(both).tolist())
+
+    def told(self, **others: Any) -> Found:
+        """Say more about it."""
+        return replace(self, **others)
+
+    def restricted(self, names: Sequence[str]) -> Found:
+        """Take the part on some variables, in their order; variables it lacks have no edges."""
+        at = {name: i for i, name in enumerate(self.names)}
+        kept = [name for name in names if name in at]
+        new = [names.index(name) for name in kept]
+        old = [at[name] for name in kept]
+        shape = (len(self.edges), len(names), len(names))
+        edges, sureness = np.zeros(shape, bool), np.zeros(shape)
+        for lag in range(shape[0]):
+            edges[lag][np.ix_(new, new)] = self.edges[lag][np.ix_(old, old)]
+            sureness[lag][np.ix_(new, new)] = self.sureness[lag][np.ix_(old, old)]
+        return replace(self, names=tuple(names), edges=edges, sureness=sureness)
+
+    # --- files --------------------------------------------------------------------------------
+
+    def as_dict(self) -> dict[str, Any]:
+        """Write it as plain data."""
+        sure = np.argwhere(self.sureness > 0.0).tolist()
+        return {
+            "format": FORMAT,
+            "names": list(self.names),
+            "lags": len(self.edges) - 1,
+            "edges": np.argwhere(self.edges).tolist(),
+            "sureness": [[lag, i, j, float(self.sureness[lag, i, j])] for lag, i, j in sure],
+            "learner": self.learner,
+            "settings": self.settings,
+            "experiments": self.experiments,
+            "bound": self.bound,
+            "seconds": self.seconds,
+            "versions": self.versions,
+            "notes": list(self.notes),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Found:
+        """Read what ``as_dict`` wrote.
+
+        Raises:
+            ModelError: It is no such graph.
+        """
+        try:
+            if data["format"] != FORMAT:
+                raise ValueError(f"expected the format {FORMAT!r}, got {data['format']!r}")
+            names = tuple(map(str, data["names"]))
+            edges = np.zeros((int(data["lags"]) + 1, len(names), len(names)), bool)
+            sureness = np.zeros(edges.shape)
+            for lag, i, j in data["edges"]:
+                edges[lag, i, j] = True
+            for lag, i, j, size in data["sureness"]:
+                sureness[lag, i, j] = size
+            return cls(
+                names,
+                edges,
+                sureness,
+                learner=str(data["learner"]),
+                settings=dict(data["settings"]),
+                experiments=int(data["experiments"]),
+                bound=data["bound"],
+                seconds=float(data["seconds"]),
+                versions=dict(data["versions"]),
+                notes=tuple(data["notes"]),
+            )
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise ModelError([f"not a graph that a learner found: {error!r}"]) from None
