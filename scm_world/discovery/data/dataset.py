@@ -27,8 +27,8 @@ class Column:
     """One number of a row.
 
     Attributes:
-        name: ``"tool_block.mass"``, or ``"gravity[2]"`` for a number of a vector; ``@-1`` at the end
-            means one control step before the row.
+        name: ``"tool_block.mass"``, or ``"gravity[2]"`` for a number of a vector; ``@-1`` at the
+            end means one control step before the row.
         variable: Which variable it belongs to, without component and lag.
         component: Which number of it; None for a scalar.
         unit: Of the variable.
@@ -113,9 +113,10 @@ class Dataset:
             problems.append(
                 f"values have shape {self.values.shape}, of {len(self.columns)} columns"
             )
-        for what in ("regime", "episode", "step"):
-            if getattr(self, what).shape != (n,):
-                problems.append(f"{what} has shape {getattr(self, what).shape}, not ({n},)")
+        rows = {what: getattr(self, what).shape for what in ("regime", "episode", "step")}
+        problems += [
+            f"{what} has shape {shape}, not ({n},)" for what, shape in rows.items() if shape != (n,)
+        ]
         if not np.isfinite(self.values).all():
             row, column = np.argwhere(~np.isfinite(self.values))[0]
             problems.append(f"row {row} of {self.columns[column].name!r} is not finite")

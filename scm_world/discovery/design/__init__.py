@@ -1,0 +1,1 @@
+"""Which experiments to do, and how few can do."""

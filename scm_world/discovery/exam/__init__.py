@@ -1,0 +1,1 @@
+"""Learners examined: subjects, runs, tables, pictures."""

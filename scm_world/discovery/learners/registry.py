@@ -28,9 +28,9 @@ class Learner:
 
     Attributes:
         name: To call it by.
-        learn: ``learn(data, seed=0, **settings)`` gives a ``Found``, or a matrix of shape (p, p) over
-            the columns of the data: not zero at [i, j] where i acts on j; both ways for an edge
-            without direction. ``data`` is a ``Dataset``, or an ``Apparatus`` for ``"paired"``.
+        learn: ``learn(data, seed=0, **settings)`` gives a ``Found``, or a matrix of shape (p, p)
+            over the columns of the data: not zero at [i, j] where i acts on j; both ways for an
+            edge without direction. ``data`` is a ``Dataset``, or an ``Apparatus`` for ``"paired"``.
         takes: The kinds of data it can use: ``"see"`` (nothing is done), ``"do"`` (known targets),
             ``"paired"`` (it does its own experiments, with the same noise).
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
@@ -92,8 +92,8 @@ def learner(name: str) -> Learner:
     """Find a learner.
 
     Args:
-        name: One that is known, or ``"module:attribute"``: a ``Learner``, or a function that is taken
-            for one that uses ``"see"`` and ``"do"``.
+        name: One that is known, or ``"module:attribute"``: a ``Learner``, or a function that is
+            taken for one that uses ``"see"`` and ``"do"``.
 
     Raises:
         UnknownOption: There is none.
@@ -126,9 +126,9 @@ def learn(
 
     Args:
         given: A learner, or its name.
-        data: A ``Dataset``, or an ``Apparatus`` for a learner that does its own experiments. Earlier
-            control steps are put beside each row of a dataset with several rows per episode, if
-            the learner does not use time by itself.
+        data: A ``Dataset``, or an ``Apparatus`` for a learner that does its own experiments.
+            Earlier control steps are put beside each row of a dataset with several rows per
+            episode, if the learner does not use time by itself.
         seed: Of what the learner draws.
         level: ``"variable"`` for one node per variable, its components taken together;
             ``"component"`` for one per column.
