@@ -22,11 +22,21 @@ from scm_world.graph.structure import Edge
 RIGHT, LEFT, NONE = "-->", "<--", ""
 
 
-def _load(module: str, library: str) -> Any:
+def load(module: str, library: str, extra: str = "") -> Any:
+    """Import a module of an optional library.
+
+    Args:
+        module: Its full name.
+        library: As it is called on the package index.
+        extra: The optional dependency of this package that brings it; named like it if empty.
+
+    Raises:
+        MissingExtra: It is not installed.
+    """
     try:
         return import_module(module)
     except ImportError as error:
-        raise MissingExtra(library, library) from error
+        raise MissingExtra(library, extra or library) from error
 
 
 def _acyclic(source: CausalGraph | SCM, view: View, library: str) -> CausalGraph:
@@ -124,8 +134,8 @@ def to_causal_learn(source: CausalGraph | SCM, *, view: View = "two_slice") -> A
         UnknownOption: There is no such view.
     """
     graph = _acyclic(source, view, "causal-learn")
-    general = _load("causallearn.graph.GeneralGraph", "causal-learn").GeneralGraph
-    node = _load("causallearn.graph.GraphNode", "causal-learn").GraphNode
+    general = load("causallearn.graph.GeneralGraph", "causal-learn").GeneralGraph
+    node = load("causallearn.graph.GraphNode", "causal-learn").GraphNode
     nodes = {name: node(name) for name in graph.names}
     made = general(list(nodes.values()))
     for edge in graph.edges:
@@ -167,7 +177,7 @@ def to_pgmpy(source: CausalGraph | SCM, *, view: View = "two_slice") -> Any:
         UnknownOption: There is no such view.
     """
     graph = _acyclic(source, view, "pgmpy")
-    made = _load("pgmpy.base", "pgmpy").DAG()
+    made = load("pgmpy.base", "pgmpy").DAG()
     made.add_nodes_from(graph.names)
     made.add_edges_from((edge.cause, edge.effect) for edge in graph.edges)
     return made
