@@ -1,0 +1,189 @@
+"""``do_order``: a causal graph from unpaired interventions with known targets.
+
+First the order (see ``causal_order``), then the edges: each variable is regressed on those before
+it, over the rows in which it was not intervened on itself. A cause is kept if it explains more
+than chance would; over all tests the share of false edges is bounded.
+
+Only what was intervened on somewhere can be found to be a cause: what was merely watched is an
+effect, never a cause. Earlier control steps are causes without that, because time has an order.
+
+It assumes that effects add up (``features`` gives them curves) and that no unobserved variable acts
+on two of those that were intervened on. Scales do not matter: standardised data give the same.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.discovery.data.dataset import Bools, Dataset
+from scm_world.discovery.learners.causal_order import EXACT, RIDGE, Ints, Rows, before_each
+from scm_world.discovery.learners.found import Found
+from scm_world.discovery.learners.statistics import (
+    SMALLEST,
+    discoveries,
+    normal_scores,
+    regression_tail,
+)
+from scm_world.errors import ModelError, UnknownOption
+
+POWERS = (1, 2, 3, 4)
+
+
+def do_order(
+    data: Dataset,
+    *,
+    seed: int = 0,
+    q: float = 0.01,
+    features: int = 1,
+    ranks: bool = False,
+    spread: bool = False,
+    blocks: bool = True,
+) -> Found:
+    """Find a graph from rows with known intervention targets.
+
+    Args:
+        data: Rows in which nothing is done, or some variables are set at random.
+        seed: Not used: nothing is drawn.
+        q: Expected share of false edges among those found, at most.
+        features: Highest power in which a cause may act: 1 for straight lines.
+        ranks: Whether effects are replaced by the normal scores of their ranks, so that outliers do
+            not count; for edges, not for the order.
+        spread: Whether a cause of the spread of a variable is looked for, too.
+        blocks: Whether the numbers of a vector are tested together, as one cause.
+
+    Returns:
+        A graph over the columns; ``sureness`` is -log10 of the probability under no edge.
+
+    Raises:
+        ModelError: Nothing was intervened on, and there are no earlier control steps.
+        UnknownOption: A setting is not allowed.
+    """
+    del seed
+    if not 0.0 < q < 1.0:
+        raise UnknownOption("q", q, ("a share between 0 and 1",))
+    if features not in POWERS:
+        raise UnknownOption("features", features, map(str, POWERS))
+    rows = _rows(data, blocks)
+    causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
+    if not causes.any():
+        raise ModelError(
+            [
+                "do_order needs interventions: no variable that varies is a target, and there are "
+                "no earlier control steps"
+            ]
+        )
+    summed = rows.summed()
+    before = before_each(summed, causes)
+    straight = features == 1 and not ranks and not spread
+    p_values = _tested(summed if straight else rows, before, features, ranks, spread)
+    tested = p_values <= 1.0
+    chosen = np.zeros(p_values.shape, bool)
+    chosen[tested] = discoveries(p_values[tested], q)
+    weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
+    matrix, sure = _columns(rows, chosen), _columns(rows, weight)
+    notes = _notes(data, rows, causes)
+    settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}
+    return Found.of(data.names, matrix, sureness=sure, settings=settings, notes=notes)
+
+
+def _rows(data: Dataset, blocks: bool) -> Rows:
+    n = len(data)
+    if n < 3:
+        raise ModelError([f"do_order needs some rows, got {n}"])
+    together = tuple(data.blocks.values()) if blocks else tuple(np.arange(len(data.names))[:, None])
+    past = np.array([column.lag > 0 for column in data.columns])
+    return Rows(data.standardised().values, np.ones(n), data.targeted, together, past)
+
+
+# --- edges --------------------------------------------------------------------------------------
+
+
+def _tested(rows: Rows, before: Bools, features: int, ranks: bool, spread: bool) -> Floats:
+    """Test every block of causes on every column; 2 where there is no test, shape (blocks, p)."""
+    terms, owner = _features(rows, features)
+    found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
+    for column in np.flatnonzero(before.any(axis=0) & rows.alive).tolist():
+        used = before[:, column]
+        wanted = np.flatnonzero(used[owner])
+        free = ~rows.targeted[:, column]
+        answers = _answers(rows.x[free, column], ranks, spread)
+        design = np.concatenate([terms[free][:, wanted], rows.one[free, None]], axis=1)
+        blocks = {
+            b: np.flatnonzero(np.isin(owner[wanted], where)) for b, where in enumerate(rows.blocks)
+        }
+        for b, p in _tails(design, answers, blocks).items():
+            found[b, column] = p
+    return found
+
+
+def _features(rows: Rows, highest: int) -> tuple[Floats, Ints]:
+    """Write powers of the columns, as orthogonal polynomials, and which column each is of."""
+    size = np.maximum(np.abs(rows.x).max(axis=0), 1e-12)
+    scaled = rows.x / size
+    powers = [
+        np.polynomial.legendre.legval(scaled, [0.0] * d + [1.0]) for d in range(2, highest + 1)
+    ]
+    p = rows.x.shape[1]
+    terms = np.concatenate([rows.x, *(part - part.mean(axis=0) for part in powers)], axis=1)
+    return terms, np.tile(np.arange(p), highest)
+
+
+def _answers(y: Floats, ranks: bool, spread: bool) -> list[Floats]:
+    """Write what is to be explained: the column, and how far off its middle it is."""
+    scores = normal_scores(y) if ranks else y
+    if not spread:
+        return [scores]
+    # A function of the column alone: residuals would carry the causes that are tested.
+    far = (normal_scores(y) if not ranks else scores) ** 2
+    return [scores, far - far.mean()]
+
+
+def _tails(design: Floats, answers: list[Floats], blocks: dict[int, Ints]) -> dict[int, float]:
+    """Compute how probable each block's share of the explanation is by chance."""
+    sums = design.T @ design
+    sums[np.diag_indices_from(sums)] *= 1.0 + RIDGE
+    sums[np.diag_indices_from(sums)] += SMALLEST
+    inverse = np.linalg.pinv(sums, hermitian=True) if _is_poor(sums) else np.linalg.inv(sums)
+    count = float(design[:, -1] @ design[:, -1])
+    free = count - design.shape[1]
+    found = {b: 1.0 for b, where in blocks.items() if len(where)}
+    for y in answers:
+        weights = inverse @ (design.T @ y)
+        left = max(float(np.sum((y - design @ weights) ** 2)), EXACT * count)
+        for b in found:
+            where = blocks[b]
+            part = weights[where]
+            explained = float(part @ np.linalg.pinv(inverse[np.ix_(where, where)]) @ part)
+            p = regression_tail(explained, left, len(where), free)
+            found[b] = min(found[b], len(answers) * p)
+    return found
+
+
+def _is_poor(sums: Floats) -> bool:
+    """Tell whether a matrix is too near to a singular one to be inverted."""
+    scale = np.sqrt(np.diag(sums))
+    return bool((scale < 1e-9 * math.sqrt(len(sums))).any())
+
+
+def _columns(rows: Rows, by_block: Any) -> Any:
+    """Give every column of a block what was found for the block."""
+    p = rows.x.shape[1]
+    made = np.zeros((p, p), by_block.dtype)
+    for b, where in enumerate(rows.blocks):
+        made[where] = by_block[b]
+    return made
+
+
+def _notes(data: Dataset, rows: Rows, causes: Bools) -> tuple[str, ...]:
+    found = []
+    still = [name for name, lives in zip(data.names, rows.alive, strict=True) if not lives]
+    if still:
+        found.append(f"never varied, no edges: {', '.join(still)}")
+    watched = int((rows.alive & ~causes & ~rows.past).sum())
+    if watched:
+        found.append(f"{watched} columns were never intervened on: they can be effects only")
+    return tuple(found)
