@@ -1,5 +1,41 @@
 """Data from interventions: tables with regimes, and how to collect them."""
 
+from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
+from scm_world.discovery.data.designs import DESIGNS, Design
+from scm_world.discovery.data.files import load, save
+from scm_world.discovery.data.folders import UnwritableFolder
+from scm_world.discovery.data.recorded import default_causes, default_outcomes
+from scm_world.discovery.data.sources import Part, Source
+from scm_world.discovery.data.views import (
+    CausalLearn,
+    as_causal_learn,
+    as_frame,
+    as_gies,
+    as_tigramite,
+    from_frame,
+    from_tigramite,
+)
 
-__all__ = ["Column", "Dataset", "Regime"]
+__all__ = [
+    "DESIGNS",
+    "CausalLearn",
+    "Column",
+    "Dataset",
+    "Design",
+    "Part",
+    "Regime",
+    "Source",
+    "UnwritableFolder",
+    "as_causal_learn",
+    "as_frame",
+    "as_gies",
+    "as_tigramite",
+    "collect",
+    "default_causes",
+    "default_outcomes",
+    "from_frame",
+    "from_tigramite",
+    "load",
+    "save",
+]

@@ -327,10 +327,10 @@ class Dataset:
         for part in parts[1:]:
             if part.columns != first.columns or part.about != first.about:
                 raise ModelError(["tables with other columns or from elsewhere cannot be joined"])
-        regimes: list[Regime] = []
+        regimes: dict[Regime, int] = {}
         numbers: list[Ints] = []
         for part in parts:
-            at = [_place(regimes, regime) for regime in part.regimes]
+            at = [regimes.setdefault(regime, len(regimes)) for regime in part.regimes]
             numbers.append(np.array(at, dtype=np.int64)[part.regime])
         return replace(
             first,
@@ -340,12 +340,6 @@ class Dataset:
             episode=np.concatenate([part.episode for part in parts]),
             step=np.concatenate([part.step for part in parts]),
         )
-
-
-def _place(regimes: list[Regime], regime: Regime) -> int:
-    if regime not in regimes:
-        regimes.append(regime)
-    return regimes.index(regime)
 
 
 def block(column: Column) -> str:

@@ -1,0 +1,277 @@
+"""A folder that holds a dataset: a sidecar, and files that are complete or absent."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, final
+
+from scm_world.discovery.data.dataset import Column
+from scm_world.discovery.data.shards import Place, check_kind, check_names, decoded, encoded
+from scm_world.discovery.data.sources import FORMAT, Part
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.graph.structure import Edge
+from scm_world.world.start import whole_number
+
+SIDECAR = "dataset.json"
+SHARD = 100
+"""Episodes in a file by default."""
+
+_PARTIAL = ".part"
+
+
+class UnwritableFolder(ScmWorldError, OSError):
+    """A folder (``path``) that cannot be written to, or not any more (``reason``)."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        self.path, self.reason = path, reason
+        super().__init__(
+            f"{path!r} cannot be written to: {reason}; what is in it already is complete, and the "
+            "same call goes on there once there is room, or the permission"
+        )
+
+
+@final
+@dataclass(frozen=True)
+class Head:
+    """What is known of a dataset before its first row.
+
+    Attributes:
+        about: Everything that decides the rows, as plain data.
+        columns: What stands in a row.
+        n: How many episodes there will be.
+        shard: How many of them are in a file.
+        kind: Of the files: ``"parquet"`` or ``"csv"``.
+        edges: The declared graph, if it may be known.
+    """
+
+    about: dict[str, Any]
+    columns: tuple[Column, ...]
+    n: int
+    shard: int = SHARD
+    kind: str = "parquet"
+    edges: tuple[Edge, ...] | None = None
+
+    @property
+    def terms(self) -> dict[str, Any]:
+        """List what has to be the same for rows to belong together; how many is not among it."""
+        found = {
+            "about": self.about,
+            "columns": [asdict(column) for column in self.columns],
+            "shard": self.shard,
+            "files": self.kind,
+        }
+        plain: dict[str, Any] = json.loads(json.dumps(found))
+        return plain
+
+    @property
+    def plan(self) -> str:
+        """Sum up the terms."""
+        return hashlib.sha256(json.dumps(self.terms, sort_keys=True).encode()).hexdigest()
+
+    def ranges(self) -> list[range]:
+        """Give the numbers of the episodes of each file."""
+        return [
+            range(first, min(first + self.shard, self.n)) for first in range(0, self.n, self.shard)
+        ]
+
+
+@final
+class Folder:
+    """A folder that holds a dataset, or is about to.
+
+    Args:
+        path: Of the folder.
+        head: Of the dataset.
+        trusted: Packages whose functions may be mechanisms of its plans.
+    """
+
+    def __init__(self, path: Path | str, head: Head, trusted: Sequence[str] = ()) -> None:
+        self.path, self.head, self._trusted = Path(path), head, tuple(trusted)
+        self._plan = head.plan
+
+    def shard(self, index: int) -> Path:
+        """Name a file."""
+        return self.path / f"shard-{index:05d}.{self.head.kind}"
+
+    def read(self, index: int, numbers: range) -> Part | None:
+        """Read a file; None where it is not there, or ends before it should.
+
+        Raises:
+            UnreadableFile: It is damaged, or belongs to something else.
+        """
+        path = self.shard(index)
+        head = self.head
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise UnreadableFile(str(path), str(error), "make it readable") from None
+        try:
+            place, part = decoded(
+                data, head.kind, self._plan, head.columns, head.about, self._trusted
+            )
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+            if isinstance(error, ModelError) and "trusted" in str(error):
+                raise
+            advice = "delete it, and collect again with the same settings: only it is made anew"
+            raise UnreadableFile(str(path), str(error), advice) from None
+        if place.first != numbers.start or place.stop > numbers.start + head.shard:
+            reason = f"it holds the episodes from {place.first} to {place.stop - 1}"
+            raise UnreadableFile(str(path), reason, "put it back under its own name")
+        return part if place.stop >= numbers.stop else None
+
+    def write(self, index: int, numbers: range, part: Part) -> None:
+        """Write a file; it is there as a whole, or not at all.
+
+        Raises:
+            UnwritableFolder: There is no room, or no permission.
+        """
+        place = Place(self._plan, numbers.start, numbers.stop)
+        _put(self.shard(index), encoded(part, place, self.head.kind))
+
+    # --- the sidecar --------------------------------------------------------------------------
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Hold the folder for writing: new, or one in which this dataset was begun.
+
+        Raises:
+            UnreadableFile: Something else is in it, or another process is writing to it.
+            UnknownOption: It has more episodes already.
+            UnwritableFolder: There is no permission.
+        """
+        check_kind(self.head.kind)
+        check_names(self.head.columns)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            handle = os.open(self.path, os.O_RDONLY)
+        except OSError as error:
+            raise UnwritableFolder(str(self.path), error.strerror or str(error)) from None
+        try:
+            self._hold(handle)
+            self._begin()
+            yield
+        finally:
+            os.close(handle)
+
+    def _hold(self, handle: int) -> None:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process
+        except OSError:
+            reason = "another process is writing to it"
+            raise UnreadableFile(str(self.path), reason, "wait, or give another folder") from None
+
+    def _begin(self) -> None:
+        for stale in self.path.glob(f".*.*{_PARTIAL}"):  # of a process that was killed
+            if stale.name.startswith((".shard-", f".{SIDECAR}")):
+                stale.unlink(missing_ok=True)
+        if (self.path / SIDECAR).exists():
+            self._check_same(read_sidecar(self.path))
+        elif any(not path.name.startswith(".") for path in self.path.iterdir()):
+            reason = f"it holds other files, and no {SIDECAR}"
+            raise UnreadableFile(str(self.path), reason, "give a new or an empty folder")
+        else:
+            self.note({})
+
+    def _check_same(self, there: Mapping[str, Any]) -> None:
+        mine = self.head.terms
+        other = [f"{key}" for key in mine if key != "about" and there.get(key) != mine[key]]
+        abouts = there.get("about", {}), mine["about"]
+        keys = dict.fromkeys((*abouts[0], *abouts[1]))
+        other += [key for key in keys if abouts[0].get(key) != abouts[1].get(key)]
+        if other:
+            reason = f"it holds another dataset: {', '.join(other)} differ"
+            raise UnreadableFile(str(self.path), reason, "give another folder")
+        if there["n"] > self.head.n:
+            allowed = (f"{there['n']} or more: {self.path} has so many already",)
+            raise UnknownOption("n", self.head.n, allowed)
+        if there["n"] < self.head.n:
+            self.note({})
+
+    def note(self, refused: Mapping[str, str], *, complete: bool = False) -> None:
+        """Write the sidecar.
+
+        Args:
+            refused: Why episodes could not be, by their number.
+            complete: Whether all files are there.
+        """
+        graph = None if self.head.edges is None else [list(e.key) for e in self.head.edges]
+        lines = {
+            "format": FORMAT,
+            "n": self.head.n,
+            "complete": complete,
+            "refused": dict(refused),
+            "plan": self._plan,
+            **self.head.terms,
+            "graph": graph,
+        }
+        rows = ",\n".join(f' "{key}": {json.dumps(value)}' for key, value in lines.items())
+        data = f"{{\n{rows}\n}}\n".encode()
+        path = self.path / SIDECAR
+        if not path.exists() or path.read_bytes() != data:
+            _put(path, data)
+
+
+def _put(path: Path, data: bytes) -> None:
+    draft = path.with_name(f".{path.name}{_PARTIAL}")
+    try:
+        with draft.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        draft.replace(path)
+        _sync(path.parent)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UnwritableFolder(str(path.parent), f"{path.name}: {reason}") from None
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+
+
+def _sync(folder: Path) -> None:
+    """Make a new name in a folder outlast a loss of power."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def read_sidecar(folder: Path) -> dict[str, Any]:
+    """Read what a folder says of itself.
+
+    Raises:
+        UnreadableFile: There is no sidecar, or it is damaged.
+    """
+    path, advice = folder / SIDECAR, "give a folder that collect or save wrote"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        head = head_of(found)
+        is_right = found["format"] == FORMAT and found["plan"] == head.plan
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UnreadableFile(str(path), f"it describes no dataset ({error})", advice) from None
+    if not is_right:
+        raise UnreadableFile(str(path), "it was changed, or has another format", advice)
+    checked: dict[str, Any] = found
+    return checked
+
+
+def head_of(found: Mapping[str, Any]) -> Head:
+    """Turn what a sidecar says into what it said it from."""
+    columns = tuple(Column(**column) for column in found["columns"])
+    n, shard = (
+        whole_number("n", found["n"], least=0),
+        whole_number("shard", found["shard"], least=1),
+    )
+    graph = found["graph"]
+    edges = None if graph is None else tuple(Edge(*key) for key in graph)
+    return Head(found["about"], columns, n, shard, found["files"], edges)

@@ -1,0 +1,258 @@
+"""Some episodes as the bytes of one file, Parquet or CSV, and back without loss."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
+from scm_world.discovery.data.sources import Part
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.graph.exchange.libraries import load as load_library
+from scm_world.queries.plans import FORMAT as PLAN
+from scm_world.queries.plans import Plan
+
+NUMBERS = ("episode", "step", "regime")
+TARGETS = "intervention_targets"
+RESERVED = (*NUMBERS, TARGETS)
+"""Columns of every file beside those of the data."""
+
+KEY = b"scm_world"
+FORMAT = "scm_world/shard/1"
+
+
+@final
+@dataclass(frozen=True)
+class Place:
+    """To which part of which dataset a file belongs.
+
+    Attributes:
+        plan: Sums up everything that decides the rows.
+        first: Number of its first episode.
+        stop: Number after its last one.
+    """
+
+    plan: str
+    first: int
+    stop: int
+
+
+@final
+@dataclass(frozen=True)
+class Raw:
+    """What a file holds, before it is believed."""
+
+    header: dict[str, Any]
+    numbers: dict[str, Ints]
+    targets: list[str]
+    values: Floats
+
+
+Encode = Callable[[Raw, Sequence[str]], bytes]
+Decode = Callable[[bytes, Sequence[str]], Raw]
+
+
+def encoded(part: Part, place: Place, kind: str) -> bytes:
+    """Write episodes as the bytes of a file; the same ones every time.
+
+    Raises:
+        ModelError: A plan has a function without a name, or a column has a name of ours.
+    """
+    header = {
+        "format": FORMAT,
+        "plan": place.plan,
+        "first": place.first,
+        "stop": place.stop,
+        "refused": [list(pair) for pair in part.refused],
+        **_regimes(part.table.regimes),
+    }
+    table = part.table
+    numbers = {name: getattr(table, name) for name in NUMBERS}
+    raw = Raw(header, numbers, target_texts(table), table.values)
+    header["checksum"] = _checksum(raw)
+    return CODECS[kind][0](raw, table.names)
+
+
+def decoded(
+    data: bytes,
+    kind: str,
+    plan: str,
+    columns: tuple[Column, ...],
+    about: dict[str, Any],
+    trusted: Sequence[str],
+) -> tuple[Place, Part]:
+    """Read what ``encoded`` wrote.
+
+    Raises:
+        ValueError: It is damaged, or belongs to another dataset; with the reason.
+        ModelError: A plan names a function outside of the trusted packages.
+    """
+    raw = CODECS[kind][1](data, [column.name for column in columns])
+    header = raw.header
+    if header.get("format") != FORMAT:
+        raise ValueError("it is no part of a dataset")
+    given = header.pop("checksum", None)
+    if given != _checksum(raw):
+        raise ValueError("its content is not what was written")
+    if header["plan"] != plan:
+        raise ValueError("it belongs to another dataset")
+    table = Dataset(
+        values=raw.values,
+        columns=columns,
+        regimes=_read_regimes(header, trusted),
+        about=about,
+        **raw.numbers,
+    )
+    refused = tuple((int(number), str(why)) for number, why in header["refused"])
+    return Place(header["plan"], header["first"], header["stop"]), Part(table, refused)
+
+
+def _checksum(raw: Raw) -> str:
+    found = hashlib.sha256(json.dumps([raw.header, raw.targets], sort_keys=True).encode())
+    for name in NUMBERS:
+        found.update(np.ascontiguousarray(raw.numbers[name], dtype="<i8").tobytes())
+    found.update(np.ascontiguousarray(raw.values, dtype="<f8").tobytes())
+    return found.hexdigest()
+
+
+def check_names(columns: Sequence[Column]) -> None:
+    """Refuse columns that are named like those of every file.
+
+    Raises:
+        ModelError: One is.
+    """
+    taken = [column.name for column in columns if column.name in RESERVED]
+    if taken:
+        raise ModelError([f"a column cannot be named {name!r} in a file" for name in taken])
+
+
+# --- regimes ----------------------------------------------------------------------------------
+
+
+def _regimes(regimes: Sequence[Regime]) -> dict[str, Any]:
+    """Write regimes; what many of them do is written once."""
+    acts: dict[str, int] = {}
+    written = []
+    for regime in regimes:
+        done = regime.plan.as_dict()["do"]
+        texts = [json.dumps([name, parts]) for name, parts in done.items()]
+        numbers = [acts.setdefault(text, len(acts)) for text in texts]
+        written.append([numbers, list(regime.targets)])
+    return {"acts": [json.loads(text) for text in acts], "regimes": written}
+
+
+def _read_regimes(header: Mapping[str, Any], trusted: Sequence[str]) -> tuple[Regime, ...]:
+    acts = [
+        (name, Plan.from_dict({"format": PLAN, "do": {name: parts}}, trusted=trusted)[name])
+        for name, parts in header["acts"]
+    ]
+    return tuple(
+        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
+        for numbers, targets in header["regimes"]
+    )
+
+
+def target_texts(table: Dataset) -> list[str]:
+    """Name for each row the columns that were intervened on, with semicolons between them."""
+    texts = [
+        ";".join(c.name for c in table.columns if not c.lag and c.variable in regime.targets)
+        for regime in table.regimes
+    ]
+    return [texts[number] for number in table.regime]
+
+
+# --- Parquet ----------------------------------------------------------------------------------
+
+
+def _to_parquet(raw: Raw, names: Sequence[str]) -> bytes:
+    arrow = load_library("pyarrow", "pyarrow", "data")
+    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
+    columns = {
+        **raw.numbers,
+        TARGETS: arrow.array(raw.targets, arrow.string()),
+        **dict(zip(names, raw.values.T.copy(), strict=True)),
+    }
+    header = json.dumps(raw.header, sort_keys=True)
+    made = arrow.table(columns).replace_schema_metadata({KEY: header})
+    sink = arrow.BufferOutputStream()
+    # Only words repeat; numbers keep every bit without a dictionary, and are faster.
+    parquet.write_table(made, sink, compression="zstd", use_dictionary=[TARGETS])
+    return bytes(sink.getvalue())
+
+
+def _from_parquet(data: bytes, names: Sequence[str]) -> Raw:
+    arrow = load_library("pyarrow", "pyarrow", "data")
+    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
+    try:
+        table = parquet.read_table(arrow.BufferReader(data))
+    except (arrow.ArrowException, OSError) as error:
+        raise ValueError(f"it is no whole Parquet file ({error})") from None
+    if table.column_names != [*RESERVED, *names]:
+        raise ValueError("it has other columns")
+    rows = [table[name].to_numpy() for name in names]
+    return Raw(
+        json.loads((table.schema.metadata or {})[KEY]),
+        {name: table[name].to_numpy().astype(np.int64) for name in NUMBERS},
+        table[TARGETS].to_pylist(),
+        np.stack(rows, axis=1) if rows else np.empty((table.num_rows, 0)),
+    )
+
+
+# --- CSV --------------------------------------------------------------------------------------
+
+
+def _to_csv(raw: Raw, names: Sequence[str]) -> bytes:
+    stream = io.StringIO(newline="")
+    stream.write(f"# {json.dumps(raw.header, sort_keys=True)}\n")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow((*RESERVED, *names))
+    whole = np.stack([raw.numbers[name] for name in NUMBERS], axis=1).tolist()
+    rows = zip(whole, raw.targets, raw.values.tolist(), strict=True)
+    writer.writerows((*ints, text, *map(repr, floats)) for ints, text, floats in rows)
+    return stream.getvalue().encode()
+
+
+def _from_csv(data: bytes, names: Sequence[str]) -> Raw:
+    first, _, rest = data.decode().partition("\n")
+    rows = list(csv.reader(io.StringIO(rest, newline="")))
+    if not rows or rows[0] != [*RESERVED, *names]:
+        raise ValueError("it has other columns")
+    k = len(NUMBERS)
+    numbers = np.array([row[:k] for row in rows[1:]], dtype=np.int64).reshape(-1, k)
+    values = np.array([row[k + 1 :] for row in rows[1:]], dtype=np.float64)
+    raw = Raw(
+        json.loads(first.removeprefix("# ")),
+        dict(zip(NUMBERS, numbers.T.copy(), strict=True)),
+        [row[k] for row in rows[1:]],
+        values.reshape(len(rows) - 1, len(names)),
+    )
+    if _to_csv(raw, names) != data:  # the same numbers, in other words
+        raise ValueError("it was written by another program")
+    return raw
+
+
+CODECS: dict[str, tuple[Encode, Decode]] = {
+    "parquet": (_to_parquet, _from_parquet),
+    "csv": (_to_csv, _from_csv),
+}
+
+
+def check_kind(kind: str) -> None:
+    """Check that files of a kind can be written, before time is spent on filling them.
+
+    Raises:
+        UnknownOption: There is no such kind.
+        MissingExtra: What it needs is not installed.
+    """
+    if kind not in CODECS:
+        raise UnknownOption("format", kind, tuple(CODECS))
+    if kind == "parquet":
+        load_library("pyarrow.parquet", "pyarrow", "data")

@@ -1,0 +1,193 @@
+"""Datasets as other libraries take them, and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
+from scm_world.discovery.data.shards import NUMBERS, TARGETS, check_names
+from scm_world.errors import ModelError
+from scm_world.graph.exchange.libraries import load
+
+KEY = "scm_world"
+
+
+def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
+    """Give a dataset the way ``gies.fit_bic(data, I)`` takes it.
+
+    Returns:
+        For each set of targets its rows, shape (n_k, p), and the numbers of the columns that were
+        intervened on, in the order in which they first occur. Of a vector all columns are.
+
+    Example:
+        >>> table = Dataset.of([[0.0], [1.0], [2.0]], ["x"], targets=[(), ("x",), ()])
+        >>> data, targets = as_gies(table)
+        >>> [rows.tolist() for rows in data], targets
+        ([[[0.0], [2.0]], [[1.0]]], [[], [0]])
+    """
+    kinds, first, where = np.unique(
+        dataset.targeted, axis=0, return_index=True, return_inverse=True
+    )
+    order = np.argsort(first)
+    where = where.reshape(-1)
+    data = [dataset.values[where == kind] for kind in order]
+    return data, [np.flatnonzero(kinds[kind]).tolist() for kind in order]
+
+
+# --- pandas -----------------------------------------------------------------------------------
+
+
+def as_frame(dataset: Dataset) -> Any:
+    """Give a dataset as a ``pandas.DataFrame``.
+
+    Returns:
+        The columns ``episode``, ``step``, ``regime`` and ``intervention_targets``, then those of
+        the dataset. The targets of a row are a tuple of names of columns, None where nothing was
+        done, as proposed in https://github.com/pgmpy/pgmpy/issues/2117. All the rest is in
+        ``frame.attrs``, so that ``from_frame`` gives the same dataset.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        ModelError: A column has the name of one of the four, or something is no plain data.
+    """
+    pandas = load("pandas", "pandas", "data")
+    check_names(dataset.columns)
+    numbers = {name: getattr(dataset, name).copy() for name in NUMBERS}
+    data = pandas.DataFrame(dataset.values.copy(), columns=list(dataset.names))
+    names = np.array(dataset.names, dtype=object)
+    targets = [tuple(names[row]) or None for row in dataset.targeted]
+    column = pandas.Series(targets, dtype=object, name=TARGETS)
+    frame = pandas.concat([pandas.DataFrame(numbers), column, data], axis=1)
+    about = {
+        "columns": [asdict(column) for column in dataset.columns],
+        "regimes": [regime.as_dict() for regime in dataset.regimes],
+        "about": dataset.about,
+    }
+    try:
+        frame.attrs[KEY] = json.dumps(about)  # one text: pandas copies it at every step
+    except TypeError as error:
+        raise ModelError(
+            [f"what the dataset says about itself is no plain data: {error}"]
+        ) from None
+    return frame
+
+
+def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
+    """Read a frame that ``as_frame`` wrote, or any with a column ``intervention_targets``.
+
+    Args:
+        frame: Rows and columns may have been taken away or reordered.
+        trusted: Packages whose functions may be mechanisms of its plans.
+
+    Raises:
+        ModelError: It has no column ``intervention_targets``, or other columns than numbers.
+    """
+    if TARGETS not in frame:
+        raise ModelError([f"the frame has no column {TARGETS!r}: None, or a tuple of names, each"])
+    names = [name for name in frame.columns if name not in (*NUMBERS, TARGETS)]
+    values = frame[names].to_numpy(dtype=np.float64)
+    if KEY not in frame.attrs:
+        given = [_names_in(cell) for cell in frame[TARGETS]]
+        rows = {n: frame[n].to_numpy() for n in ("episode", "step") if n in frame}
+        return Dataset.of(values, names, targets=given, **rows)
+    about = json.loads(frame.attrs[KEY])
+    columns = {column["name"]: Column(**column) for column in about["columns"]}
+    numbers = {name: frame[name].to_numpy(dtype=np.int64) for name in NUMBERS}
+    return Dataset(
+        values=values,
+        columns=tuple(columns.get(name, Column(name, name)) for name in names),
+        regimes=tuple(Regime.from_dict(regime, trusted=trusted) for regime in about["regimes"]),
+        about=about["about"],
+        **numbers,
+    )
+
+
+def _names_in(cell: Any) -> tuple[str, ...]:
+    """Read a cell: a name, several with semicolons or in a sequence, or none."""
+    if cell is None or (isinstance(cell, float) and np.isnan(cell)):
+        return ()
+    if isinstance(cell, str):
+        return tuple(name.strip() for name in cell.split(";") if name.strip())
+    return tuple(cell)
+
+
+# --- tigramite --------------------------------------------------------------------------------
+
+
+def as_tigramite(dataset: Dataset) -> Any:
+    """Give time series as a ``tigramite.data_processing.DataFrame``.
+
+    Each episode is a data set of its own (``analysis_mode="multiple"``), so that nothing is carried
+    from one to the next. Categories and whole numbers are marked as discrete.
+
+    Raises:
+        MissingExtra: tigramite is not installed.
+        ModelError: An episode has one row only, or misses a control step.
+    """
+    if not dataset.is_temporal:
+        raise ModelError(
+            ["every episode is one row, which is no time series: collect with every_step=True"]
+        )
+    processing = load("tigramite.data_processing", "tigramite")
+    starts = np.flatnonzero(np.diff(dataset.episode, prepend=dataset.episode[0] - 1))
+    pieces = np.split(np.arange(len(dataset)), starts[1:])
+    gaps = [p[0] for p in pieces if np.any(np.diff(dataset.step[p]) != 1)]
+    if gaps:
+        raise ModelError([f"episode {dataset.episode[gaps[0]]} misses a control step"])
+    discrete = np.array([column.dtype != "real" for column in dataset.columns])
+    kinds = {i: np.tile(discrete, (len(p), 1)).astype(int) for i, p in enumerate(pieces)}
+    return processing.DataFrame(
+        {i: dataset.values[p] for i, p in enumerate(pieces)},
+        data_type=kinds,
+        var_names=list(dataset.names),
+        analysis_mode="multiple",
+    )
+
+
+def from_tigramite(frame: Any, like: Dataset) -> Dataset:
+    """Read time series back, with the regimes of the dataset they were made of.
+
+    Raises:
+        ModelError: They have other names, or other lengths.
+    """
+    if tuple(frame.var_names) != like.names or sum(map(len, frame.values.values())) != len(like):
+        raise ModelError(["these are other time series"])
+    values = np.concatenate([frame.values[number] for number in sorted(frame.values)])
+    return replace(like, values=values)
+
+
+# --- causal-learn -----------------------------------------------------------------------------
+
+
+class CausalLearn(NamedTuple):
+    """What functions of causal-learn take.
+
+    Attributes:
+        data: Shape (n, p).
+        node_names: Of the p columns.
+        c_indx: For ``cdnod``: number of the set of targets of each row, shape (n, 1).
+    """
+
+    data: Floats
+    node_names: list[str]
+    c_indx: Ints
+
+
+def as_causal_learn(dataset: Dataset) -> CausalLearn:
+    """Give a dataset the way causal-learn takes it: ``pc(data)``, ``cdnod(data, c_indx)``.
+
+    Example:
+        >>> table = Dataset.of([[0.0], [1.0], [2.0]], ["x"], targets=[(), ("x",), ()])
+        >>> as_causal_learn(table).c_indx.ravel().tolist()
+        [0, 1, 0]
+    """
+    _, first, where = np.unique(dataset.targeted, axis=0, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))
+    return CausalLearn(
+        dataset.values.copy(), list(dataset.names), rank[where.reshape(-1)].reshape(-1, 1)
+    )

@@ -1,0 +1,357 @@
+"""Which acyclic graphs data cannot tell apart.
+
+A graph is a boolean matrix of shape (p, p): ``graph[i, j]`` says that i acts on j. Where both
+``graph[i, j]`` and ``graph[j, i]`` hold, the edge has no direction. Nothing is on the diagonal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.errors import ModelError
+
+Bools = NDArray[np.bool_]
+
+
+# --- acyclic graphs ---------------------------------------------------------------------------
+
+
+def as_graph(matrix: NDArray[np.generic]) -> Bools:
+    """Take a matrix for a graph: an edge wherever it is not zero. Always a new array.
+
+    Raises:
+        ModelError: It is not square, or something acts on itself.
+    """
+    graph: Bools = np.asarray(matrix) != 0
+    if graph.ndim != 2 or graph.shape[0] != graph.shape[1]:
+        raise ModelError([f"a graph is a square matrix; this one has shape {graph.shape}"])
+    loops = np.flatnonzero(graph.diagonal())
+    if len(loops):
+        raise ModelError([f"node {loops[0]} acts on itself; clear the diagonal"])
+    return graph
+
+
+def random_dag(n: int, density: float, rng: np.random.Generator) -> Bools:
+    """Draw an acyclic graph, its nodes in random order.
+
+    Args:
+        n: Number of nodes.
+        density: Probability of each edge; ``2 * k / (n - 1)`` for k edges per node.
+        rng: Draws edges, then the order.
+
+    Source:
+        Erdős and Rényi, *On random graphs I*, Publicationes Mathematicae 1959, for the skeleton.
+
+    Example:
+        >>> int(random_dag(3, 1.0, np.random.default_rng(0)).sum())
+        3
+    """
+    upper = np.triu(rng.random((n, n)) < density, 1)
+    order = rng.permutation(n)
+    dag: Bools = upper[np.ix_(order, order)]
+    return dag
+
+
+def is_acyclic(graph: Bools) -> bool:
+    """Tell whether no node acts on itself, even through others; no edge without direction either.
+
+    Example:
+        >>> is_acyclic(np.array([[0, 1], [0, 0]], bool))
+        True
+        >>> is_acyclic(np.array([[0, 1], [1, 0]], bool))
+        False
+    """
+    return len(_order(graph)) == len(graph)
+
+
+def topological_order(dag: Bools) -> tuple[int, ...]:
+    """List all nodes, causes before their effects.
+
+    Raises:
+        ModelError: The graph has a cycle.
+
+    Example:
+        >>> topological_order(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]], bool))
+        (2, 1, 0)
+    """
+    order = _order(dag)
+    if len(order) < len(dag):
+        rest = sorted(set(range(len(dag))) - set(order))
+        raise ModelError([f"nodes {rest} cannot be put in order: there is a cycle among them"])
+    return order
+
+
+def _order(graph: Bools) -> tuple[int, ...]:
+    waits = graph.sum(axis=0)
+    order: list[int] = []
+    ready = np.flatnonzero(waits == 0)
+    while len(ready):
+        order += ready.tolist()
+        waits = waits - graph[ready].sum(axis=0)
+        waits[order] = -1
+        ready = np.flatnonzero(waits == 0)
+    return tuple(order)
+
+
+def skeleton(graph: Bools) -> Bools:
+    """Forget the directions."""
+    return graph | graph.T
+
+
+def reaches(graph: Bools) -> Bools:
+    """Tell from where one can come where: [i, j] if i is j or one of its ancestors.
+
+    Example:
+        >>> reaches(np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)).astype(int).tolist()
+        [[1, 1, 1], [0, 1, 1], [0, 0, 1]]
+    """
+    closure: Bools = graph | np.eye(len(graph), dtype=bool)
+    for _ in range(max(len(graph) - 1, 1).bit_length()):
+        closure = meets(closure, closure)
+    return closure
+
+
+def meets(left: Bools, right: Bools) -> Bools:
+    """Multiply boolean matrices: [i, j] if left[i, k] and right[k, j] for some k."""
+    result: Bools = (left.astype(np.float32) @ right.astype(np.float32)) > 0
+    return result
+
+
+def v_structures(graph: Bools) -> frozenset[tuple[int, int, int]]:
+    """List all ``(i, k, j)`` with i -> k <- j, i < j, and no edge between i and j.
+
+    Example:
+        >>> v_structures(np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]], bool))
+        frozenset({(0, 2, 1)})
+    """
+    directed, apart = graph & ~graph.T, _apart(graph)
+    found = []
+    for k in range(len(graph)):
+        parents = np.flatnonzero(directed[:, k])
+        pairs = np.argwhere(np.triu(apart[np.ix_(parents, parents)]))
+        found += [(int(parents[a]), k, int(parents[b])) for a, b in pairs]
+    return frozenset(found)
+
+
+def covered_edges(dag: Bools) -> Bools:
+    """Find the edges i -> j for which the other parents of j are the parents of i.
+
+    Turning one of them around gives an equivalent graph.
+
+    Source:
+        Chickering, *A transformational characterization of equivalent Bayesian network
+        structures*, UAI 1995, definition 2.
+
+    Example:
+        >>> covered_edges(np.array([[0, 1, 1], [0, 0, 1], [0, 0, 0]], bool)).astype(int).tolist()
+        [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
+    """
+    dag = as_graph(dag)
+    i, j = np.nonzero(dag)
+    differ = dag[:, i] != dag[:, j]  # (p, edges); the cause itself is such a difference
+    covered = np.zeros_like(dag)
+    covered[i, j] = differ.sum(axis=0) == 1
+    return covered
+
+
+# --- essential graphs -------------------------------------------------------------------------
+
+
+def cpdag(dag: Bools) -> Bools:
+    """Give the essential graph: an edge keeps its direction if all equivalent graphs agree on it.
+
+    Raises:
+        ModelError: The graph has a cycle.
+
+    Example:
+        >>> cpdag(np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)).astype(int).tolist()
+        [[0, 1, 0], [1, 0, 1], [0, 1, 0]]
+    """
+    return essential_graph(dag, ())
+
+
+def essential_graph(dag: Bools, targets: Iterable[Iterable[int]]) -> Bools:
+    """Give what is known of a graph once some interventions were done, besides looking.
+
+    Args:
+        dag: The true graph, shape (p, p).
+        targets: For each intervention the nodes that it sets, one or several.
+
+    Raises:
+        ModelError: The graph has a cycle.
+
+    Source:
+        Hauser and Bühlmann, *Characterization and greedy learning of interventional Markov
+        equivalence classes of directed acyclic graphs*, JMLR 2012: an edge with exactly one end
+        in a target shows its direction; the rest follows by the rules of Meek.
+
+    Example:
+        >>> chain = np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)
+        >>> essential_graph(chain, [(1,)]).astype(int).tolist()
+        [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
+    """
+    dag = as_graph(dag)
+    topological_order(dag)
+    inside = np.zeros((0, len(dag)), dtype=bool)
+    for target in targets:
+        row = np.zeros(len(dag), dtype=bool)
+        row[list(target)] = True
+        inside = np.vstack([inside, row])
+    cut = meets(inside.T, ~inside)
+    known = dag & (cut | cut.T | meets(_apart(dag), dag))  # the last: part of a v-structure
+    return meek(skeleton(dag) & ~known.T)
+
+
+def meek(graph: Bools) -> Bools:
+    """Direct every edge that can have one direction only.
+
+    Args:
+        graph: Edges with and without direction; its v-structures are all there are.
+
+    Raises:
+        ModelError: No acyclic graph has these directions and v-structures.
+
+    Source:
+        Meek, *Causal inference and causal explanation with background knowledge*, UAI 1995,
+        rules 1 to 4.
+
+    Example:
+        >>> meek(np.array([[0, 1, 0], [0, 0, 1], [0, 1, 0]], bool)).astype(int).tolist()
+        [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
+    """
+    graph = as_graph(graph)
+    while True:
+        forced = _by_two_edges(graph)
+        if not forced.any():
+            forced = _by_three_edges(graph)
+        if not forced.any():
+            return graph
+        both = np.argwhere(forced & forced.T)
+        if len(both):
+            i, j = both[0]
+            raise ModelError([f"the edge between {i} and {j} would need both directions"])
+        graph &= ~forced.T
+
+
+def _by_two_edges(graph: Bools) -> Bools:
+    """Rule 1: a -> b - c gives b -> c. Rule 2: a -> b -> c and a - c give a -> c."""
+    directed, free = graph & ~graph.T, graph & graph.T
+    return free & (meets(directed.T, _apart(graph)) | meets(directed, directed))
+
+
+def _by_three_edges(graph: Bools) -> Bools:
+    """Rule 3: a - c -> b, a - d -> b. Rule 4: a - d -> c -> b. Both give a -> b."""
+    directed, free, apart = graph & ~graph.T, graph & graph.T, _apart(graph)
+    forced = np.zeros_like(graph)
+    a, b = np.nonzero(free)
+    if not len(a):
+        return forced
+    between = free[a] & directed.T[b]  # (edges, p): all c with a - c -> b
+    third = (meets(between, apart) & between).any(axis=1)
+    last = directed.T[b] & skeleton(graph)[a]  # all c with c -> b, and an edge to a
+    fourth = (meets(free[a] & apart[b], directed) & last).any(axis=1)
+    forced[a, b] = third | fourth
+    return forced
+
+
+def _apart(graph: Bools) -> Bools:
+    return ~(graph | graph.T | np.eye(len(graph), dtype=bool))
+
+
+# --- members of a class -----------------------------------------------------------------------
+
+
+def extension(graph: Bools, rng: np.random.Generator | None = None) -> Bools | None:
+    """Direct all edges, without a cycle or another v-structure.
+
+    Args:
+        graph: Edges with and without direction.
+        rng: Chooses among the possible sinks; the first is taken if None. Every member of the
+            class can come, but not all with the same probability.
+
+    Returns:
+        An acyclic graph; None if there is none.
+
+    Source:
+        Dor and Tarsi, *A simple algorithm to construct a consistent extension of a partially
+        oriented graph*, UCLA technical report R-185, 1992.
+
+    Example:
+        >>> extension(np.array([[0, 1], [1, 0]], bool)).astype(int).tolist()
+        [[0, 0], [1, 0]]
+    """
+    dag, left = as_graph(graph), as_graph(graph)
+    here = np.ones(len(graph), dtype=bool)
+    while here.any():
+        free = left & left.T
+        # A sink: nothing leads out, and what has no direction at it is next to all its neighbors.
+        strangers = (meets(free, _apart(left)) & skeleton(left)).any(axis=1)
+        sinks = np.flatnonzero(here & ~(left & ~left.T).any(axis=1) & ~strangers)
+        if not len(sinks):
+            return None
+        sink = sinks[0] if rng is None else rng.choice(sinks)
+        dag[sink, free[sink]] = False
+        left[sink], left[:, sink], here[sink] = False, False, False
+    return dag
+
+
+def extensions(graph: Bools) -> Iterator[Bools]:
+    """List all acyclic graphs with these directions and v-structures; there can be p! of them.
+
+    Example:
+        >>> triangle = ~np.eye(3, dtype=bool)
+        >>> len(list(extensions(triangle)))
+        6
+    """
+    if extension(graph) is not None:
+        yield from _members(meek(graph))
+
+
+def _members(graph: Bools) -> Iterator[Bools]:
+    open_edges = np.argwhere(np.triu(graph & graph.T))
+    if not len(open_edges):
+        yield graph
+        return
+    i, j = open_edges[0]
+    for cause, effect in ((i, j), (j, i)):
+        directed = graph.copy()
+        directed[effect, cause] = False
+        yield from _members(meek(directed))
+
+
+def chain_components(graph: Bools) -> tuple[tuple[int, ...], ...]:
+    """Take together what edges without direction connect.
+
+    Example:
+        >>> chain_components(np.array([[0, 1, 1], [1, 0, 1], [0, 0, 0]], bool))
+        ((0, 1), (2,))
+    """
+    together = reaches(graph & graph.T)
+    return tuple(
+        tuple(np.flatnonzero(row).tolist())
+        for node, row in enumerate(together)
+        if row.argmax() == node  # its lowest number stands for the component
+    )
+
+
+__all__ = [
+    "Bools",
+    "as_graph",
+    "chain_components",
+    "covered_edges",
+    "cpdag",
+    "essential_graph",
+    "extension",
+    "extensions",
+    "is_acyclic",
+    "meek",
+    "meets",
+    "random_dag",
+    "reaches",
+    "skeleton",
+    "topological_order",
+    "v_structures",
+]

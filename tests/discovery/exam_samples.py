@@ -1,0 +1,90 @@
+"""A small exam with every kind of mistake, for the tests of what is written about it."""
+
+from itertools import product
+
+import numpy as np
+
+from scm_world.discovery.exam.results import (
+    Cell,
+    Exam,
+    Truth,
+)
+from scm_world.discovery.learners import Found
+from scm_world.discovery.scores import score
+
+CHAIN = Truth(
+    name="chain",
+    names=("a", "b", "c", "d"),
+    edges=(("a", "b", 0), ("b", "c", 0), ("c", "d", 0), ("d", "d", 1), ("a", "d", 1)),
+    left_out=(("b", "d"),),
+    about={"kind": "synthetic"},
+)
+PUSHING = Truth(
+    name="pushing",
+    names=("tool_block.mass", "tool_block.position", "goal_block.position", "reward", "floor"),
+    edges=(
+        ("tool_block.mass", "tool_block.position", 1),
+        ("tool_block.position", "tool_block.position", 1),
+        ("tool_block.position", "reward", 0),
+        ("goal_block.position", "reward", 0),
+        ("floor", "tool_block.position", 0),
+        ("floor", "tool_block.position", 1),
+    ),
+    left_out=(("floor", "tool_block.position"),),
+)
+INERT = Truth(
+    name="<script>alert(1)</script>",
+    names=("<script>", 'x"&', "z"),
+    edges=(("<script>", 'x"&', 0),),
+)
+TRUTHS = (CHAIN, PUSHING, INERT)
+WAYS = (("ours", "paired"), ("gies", "do"), ("pc", "see"), ("mine:learner", "do"))
+
+
+def found_of(truth: Truth, learner: str, budget: int) -> Found:
+    """Make a graph with each kind of mistake; more of the truth for a larger budget."""
+    edges = list(truth.edges)
+    if learner == "ours":
+        return Found.of_edges(truth.names, edges)
+    if learner == "pc":
+        cause, effect, _ = next(edge for edge in edges if edge[2] == 0)
+        return Found.of_edges(truth.names, [(cause, effect, 0), (effect, cause, 0), *edges[3:]])
+    cause, effect, lag = edges[0]
+    turned = [(effect, cause, lag)] if budget < 1000 else [(cause, effect, lag)]
+    extra = (truth.names[0], truth.names[-1], 0)
+    return Found.of_edges(truth.names, [*turned, extra, *edges[2:]])
+
+
+def cell(truth: Truth, learner: str, data: str, budget: int, seed: int) -> Cell:
+    """Make a run; the scores get better with the budget, and differ by seed."""
+    about = {"subject": truth.name, "learner": learner, "data": data, "budget": budget}
+    if learner == "gies" and seed == 2 and budget == 1000:
+        return Cell(**about, seed=seed, status="timeout", message="more than 60 s", seconds=60.0)
+    found = found_of(truth, learner, budget)
+    known = score(found.directed, truth.edges)
+    numbers = {
+        "shd": known.shd + seed,
+        "f1": known.f1,
+        "precision": known.precision,
+        "recall": known.recall,
+        "sid": None if learner == "pc" else np.int64(3),
+        "fdp": 1.0 - known.precision,
+    }
+    return Cell(
+        **about,
+        seed=seed,
+        found=found,
+        scores=numbers,
+        seconds=0.5 * budget,
+        experiments=budget,
+        bound=12 if data == "paired" else None,
+    )
+
+
+def sample_exam() -> Exam:
+    """Three subjects, four learners, three budgets, three seeds; one learner runs out of time."""
+    cells = tuple(
+        cell(truth, learner, data, budget, seed)
+        for truth, (learner, data), budget, seed in product(TRUTHS, WAYS, (10, 100, 1000), range(3))
+    )
+    return Exam({truth.name: truth for truth in TRUTHS}, cells, {"versions": {"gies": "0.0.3"}})

@@ -1,0 +1,386 @@
+"""Collecting: the same rows whatever the order, with the right regimes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world import SCM, Box, Derived, Exogenous, Linear
+from scm_world.discovery.data import (
+    Dataset,
+    Design,
+    Part,
+    collect,
+    default_causes,
+    default_outcomes,
+)
+from scm_world.env.observer import Observing, observer
+from scm_world.errors import (
+    BudgetExhausted,
+    Forbidden,
+    InterventionError,
+    ModelError,
+    UnknownOption,
+    UnknownVariable,
+)
+from scm_world.queries import Laboratory, Outcome, World
+from scm_world.variables import Affine, Draw, Normal, Parent, Shift
+
+MASS, FRICTION = "tool_block.mass", "floor_friction"
+
+
+def model() -> SCM:
+    """Three variables in a row; the space of the last one follows the first."""
+    row: Any = Linear(weights=(1.5,))
+    space = Box(Affine(parent="x", offset=10.0), 20.0)
+    return SCM(
+        [
+            Exogenous(name="x", distribution=Normal(), a=Box(4.0, 5.0)),
+            Derived(name="y", parents=("x",), mechanism=row, noise=Normal(), a=Box(7.0, 8.0)),
+            Derived(name="z", parents=("y",), mechanism=row, noise=Normal(), a=space),
+        ]
+    )
+
+
+@pytest.fixture
+def world() -> World:
+    """A world without physics."""
+    return World("pushing", backend="fake")
+
+
+# --- designs ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["single", "all", "half"])
+@pytest.mark.parametrize("seen", [0.0, 0.3, 0.5, 1.0])
+def test_every_prefix_has_its_share(name: str, seen: float) -> None:
+    """The first N episodes have the share of watched ones, to one episode."""
+    chosen = Design(name, tuple("abc"), seen=seen).chosen(0, 0, 200)
+    watched = np.cumsum(~chosen.any(axis=1))
+    assert np.all(np.abs(watched - seen * np.arange(1, 201)) <= 1.0)
+
+
+def test_single_targets_take_turns() -> None:
+    """Watched episodes do not make a target lose its turn."""
+    chosen = Design("single", tuple("abc"), seen=0.25).chosen(0, 0, 40)
+    turns = chosen[chosen.any(axis=1)].argmax(axis=1)
+    np.testing.assert_array_equal(turns, np.arange(30) % 3)
+
+
+def test_half_is_drawn_by_lot() -> None:
+    """Half of the targets, rounded up; each one about as often; another seed, other lots."""
+    design = Design("half", tuple("abcde"), seen=0.0)
+    chosen = design.chosen(1, 0, 1000)
+    assert set(chosen.sum(axis=1)) == {3}
+    assert np.all(np.abs(chosen.mean(axis=0) - 0.6) < 0.06)  # four standard errors
+    assert not np.array_equal(chosen, design.chosen(2, 0, 1000))
+
+
+@pytest.mark.parametrize("name", ["see", "single", "all", "half"])
+def test_an_episode_does_not_know_how_many_there_are(name: str) -> None:
+    """Episode i is the same in a part as in the whole."""
+    design = Design(name, () if name == "see" else tuple("abcd"), seen=0.3)
+    np.testing.assert_array_equal(design.chosen(5, 0, 90)[37:61], design.chosen(5, 37, 24))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("sigle", ("a",)), "did you mean 'single'"),
+        (("single", ()), "targets cannot be"),
+        (("see", ("a",)), "none with 'see'"),
+        (("all", ("a", "a")), "each of them once"),
+        (("all", ("a",), "C"), "it can be: A, B"),
+        (("all", ("a", "b"), {"a": "A"}), "a source for 'b'"),
+        (("all", ("a",), "A", 1.5), "a share from 0 to 1"),
+    ],
+)
+def test_designs_that_mean_nothing_are_refused(arguments: Any, message: str) -> None:
+    """The error says what there is."""
+    with pytest.raises(UnknownOption, match=message):
+        Design(*arguments)
+
+
+# --- models -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["single", "half"])
+def test_a_row_is_that_of_the_mutilated_model(name: str) -> None:
+    """Row i is what ``do`` and ``sample`` give for episode i, bit for bit."""
+    values = {"x": Normal(9.0, 1.0), "y": Shift(100.0), "z": "A"}
+    found = collect(model(), Design(name, ("x", "y", "z"), values), 30, seed=4)
+    for row in range(30):
+        plan = found.regimes[found.regime[row]].plan.at_start()
+        alone = model().do(plan).sample(1, seed=4, first=row)
+        assert [alone[n][0] for n in ("x", "y", "z")] == found.values[row].tolist()
+
+
+def test_a_lagged_model_is_solved_step_by_step() -> None:
+    """Its rows are those of ``sample``, one for each control step."""
+    drift = SCM(
+        [
+            Derived(
+                name="x",
+                parents=(Parent("x", 1),),
+                mechanism=Linear(weights=(0.9,)),
+                noise=Normal(),
+            ),
+            Derived(
+                name="y",
+                parents=(Parent("x", 1),),
+                mechanism=Linear(weights=(1.0,)),
+                noise=Normal(),
+            ),
+        ]
+    )
+    found = collect(drift, Design("all", ("x",), 3.0, seen=0.5), 4, seed=1, steps=6)
+    assert found.step.tolist() == [0, 1, 2, 3, 4, 5] * 4
+    seen, done = drift.sample(4, seed=1, steps=6), drift.do({"x": 3.0}).sample(4, seed=1, steps=6)
+    for episode in range(4):
+        rows = (seen, done)[episode % 2]
+        np.testing.assert_array_equal(found["y"].reshape(4, 6)[episode], rows["y"][episode])
+    with pytest.raises(ModelError, match="lagged edges"):
+        collect(drift, Design(), 4)
+
+
+def test_interventions_that_close_a_cycle_together_are_refused() -> None:
+    """Each of them is possible, but there is no order in which both can be computed."""
+    follows = {n: Box(Affine(parent=m), 99.0) for n, m in (("x", "y"), ("y", "x"))}
+    pair = SCM([Exogenous(name=n, distribution=Box(0.0, 1.0)) for n in ("x", "y")])
+    with pytest.raises(ModelError, match="close a cycle"):
+        collect(pair, Design("single", ("x", "y"), follows), 4)
+
+
+def test_a_model_takes_no_policy() -> None:
+    """What belongs to worlds is refused, not ignored."""
+    with pytest.raises(UnknownOption, match="circumstance of a model"):
+        collect(model(), Design(), 2, policy="random")
+    with pytest.raises(UnknownOption, match="a Laboratory"):
+        collect("pushing", Design(), 2)  # type: ignore[arg-type]
+
+
+# --- worlds -----------------------------------------------------------------------------------
+
+
+def test_a_row_of_a_world_is_its_episode(world: World) -> None:
+    """Causes as they were set, outcomes as they ended."""
+    design = Design("all", (MASS,), "B", seen=0.5)
+    outcomes = ["fractional_success", Outcome("tool_block.cartesian_position", "change", 1)]
+    found = collect(world, design, 4, seed=2, steps=3, causes=[FRICTION], outcomes=outcomes)
+    assert found.names == (
+        FRICTION,
+        MASS,
+        "fractional_success",
+        "change tool_block.cartesian_position[1]",
+    )
+    for row in range(4):
+        do = {MASS: Draw("B")} if row % 2 else {}
+        episode = world.rollout("random", seed=2, episode=row, steps=3, do=do)
+        want = [episode.final(FRICTION), episode.final(MASS), episode.final("fractional_success")]
+        assert found.values[row, :3].tolist() == [float(value) for value in want]
+    assert found.targeted[:, 1].tolist() == [False, True] * 2
+    assert found.columns[1].unit == "kg"
+
+
+def test_order_shards_and_threads_do_not_matter(world: World) -> None:
+    """The same rows come out of one shard and one thread as of many."""
+    design = Design("half", (MASS, FRICTION, "gravity"))
+    how: Any = {"steps": 2, "nature": {"sensor_noise": 0.01, "tool_block.friction": "A"}}
+    whole = collect(world, design, 12, seed=1, **how)
+    assert collect(world, design, 12, seed=1, shard=5, workers=3, **how) == whole
+    assert collect(world, design, 7, seed=1, **how) == whole.first(7)
+    assert collect(world, design, 12, seed=2, **how) != whole
+
+
+def test_instants_have_the_action_of_their_step(world: World) -> None:
+    """Row t has the world as it is when action t is chosen, and action t."""
+    names = ["joint_positions", "fractional_success"]
+    found = collect(
+        world, Design(), 2, seed=3, steps=4, every_step=True, causes=[MASS], outcomes=names
+    )
+    assert found.is_temporal
+    assert found.variables == (MASS, *names, "action")
+    for number in range(2):
+        episode = world.rollout("random", seed=3, episode=number, steps=4)
+        rows = found.rows(found.episode == number)
+        np.testing.assert_array_equal(rows["action"], episode.actions)
+        np.testing.assert_array_equal(rows["joint_positions"], episode["joint_positions"][:-1])
+        assert rows.step.tolist() == [0, 1, 2, 3]
+    with pytest.raises(UnknownOption, match="every_step"):
+        collect(world, Design(), 2, every_step=True, outcomes=[Outcome("reward", "sum")])
+
+
+def test_a_state_is_a_target_at_its_instant_only(world: World) -> None:
+    """A parameter stays set; where a block was put counts for the first row."""
+    place = "tool_block.cylindrical_position"
+    values = {MASS: 0.05, place: [0.05, 0.1, 0.0325]}
+    design = Design("all", (MASS, place), values, seen=0.0)
+    found = collect(
+        world, design, 1, steps=3, every_step=True, outcomes=["tool_block.cartesian_position"]
+    )
+    assert found.targeted[:, found.names.index(MASS)].all()
+    for name in (place, "tool_block.cartesian_position"):
+        first = found.targeted[:, found.names.index(f"{name}[0]")]
+        assert first.tolist() == [True, False, False]
+
+
+def test_an_action_that_is_set_is_the_one_in_the_row(world: World) -> None:
+    """What the robot was told counts, not what its policy wished."""
+    told = [0.1, 0.9, -1.7] * 3
+    found = collect(world, Design("all", ("action",), told, 0.0), 2, steps=2, every_step=True)
+    np.testing.assert_array_equal(found["action"], np.tile(told, (4, 1)))
+
+
+def test_default_causes_are_physical(world: World) -> None:
+    """No looks, no noise, no structure; the color of the block serves as negative control."""
+    names = default_causes(world)
+    assert {MASS, FRICTION, "gravity", "block.size", "tool_block.color"} <= set(names)
+    assert not {"floor_color", "sensor_noise", "timestep_preset", "light_ambient"} & set(names)
+    assert not any(name.startswith("camera") for name in names)
+    walls = World("stacked_blocks", backend="fake")
+    assert "max_level_width" in walls.model
+    assert not {"max_level_width", "wall_noise"} & set(default_causes(walls))
+    assert Outcome("fractional_success") in default_outcomes(world)
+
+
+@pytest.mark.parametrize("pattern", ["tool_blok.*", "fractional_success"])
+def test_patterns_that_name_nothing_are_refused(world: World, pattern: str) -> None:
+    """A cause has to be something that can be set."""
+    with pytest.raises(UnknownVariable, match="no variable is named"):
+        collect(world, Design(), 2, causes=[pattern])
+
+
+def test_outcomes_are_plain_data(world: World) -> None:
+    """A function could not be written down."""
+    with pytest.raises(UnknownOption, match="outcome of a dataset"):
+        collect(world, Design(), 2, outcomes=[len])
+
+
+# --- sensors ----------------------------------------------------------------------------------
+
+
+def test_noise_reaches_what_is_measured_and_nothing_else(world: World) -> None:
+    """Parameters and actions are exact; the rest is off by the declared fraction of its range."""
+    names = ["joint_positions", "control_index"]
+    how: Any = {"steps": 4, "causes": [MASS], "outcomes": names, "every_step": True}
+    clean = collect(world, Design(), 60, **how)
+    noisy = collect(world, Design(), 60, nature={"sensor_noise": 0.01}, **how)
+    for name in (MASS, "action", "control_index"):
+        np.testing.assert_array_equal(noisy[name], clean[name])
+    off = (noisy["joint_positions"] - clean["joint_positions"]) / (0.01 * 3.3)  # [rad], half range
+    assert abs(off.mean()) < 0.1  # five standard errors of 2,160 numbers
+    assert abs(off.std() - 1.0) < 0.1
+    assert len(np.unique(off)) == off.size
+
+
+def test_the_range_is_that_of_the_observations(world: World) -> None:
+    """A sensor has the same strength here as in the environment."""
+    from scm_world.discovery.data.sensors import half_range
+
+    vector = observer(world, world.declaration, Observing(normalize=False), None)  # type: ignore[arg-type]
+    for name, place in vector.layouts["observation"].items():
+        if world.model.declared(name).role in ("state", "readout"):
+            np.testing.assert_array_equal(
+                half_range(world, name),
+                vector._spread[place],  # type: ignore[attr-defined]
+            )
+
+
+def test_a_mean_is_that_of_what_was_measured(world: World) -> None:
+    """Noise is added at every instant, then summed up; both see the same noise."""
+    how: Any = {"nature": {"sensor_noise": 0.01}, "causes": [MASS], "steps": 4}
+    name = "joint_positions"
+    outcomes = [Outcome(name, "first"), Outcome(name, "change"), name, Outcome(name, "mean")]
+    ends = collect(world, Design(), 2, outcomes=outcomes, **how)
+    every = collect(world, Design(), 2, outcomes=[name], every_step=True, **how)
+    np.testing.assert_array_equal(ends[f"first {name}"], every[name][::4])
+    np.testing.assert_allclose(ends[f"change {name}"], ends[name] - every[name][::4], atol=1e-15)
+    inner = every[name].reshape(2, 4, 9)[:, 1:].sum(axis=1)
+    np.testing.assert_allclose(ends[f"mean {name}"], (inner + ends[name]) / 4, atol=1e-15)
+
+
+# --- refusals ---------------------------------------------------------------------------------
+
+
+class Stubborn:
+    """A source in which some episodes cannot be."""
+
+    def __init__(self, every: int) -> None:
+        self.every, self.at_once, self.edges = every, False, None
+        self.columns = Dataset.of([[0.0]], ["x"]).columns
+        self.about: dict[str, Any] = {}
+
+    def part(self, numbers: range, tell: Any) -> Part:
+        """Refuse every so many episodes."""
+        tell(len(numbers))
+        lived = [number for number in numbers if number % self.every]
+        table = Dataset.of(np.array(lived, float)[:, None], ["x"], episode=lived)
+        refused = ((number, "no") for number in numbers if number % self.every == 0)
+        return Part(table, tuple(refused))
+
+
+def test_refused_episodes_are_left_out_and_listed() -> None:
+    """They keep their numbers, and the reason is told."""
+    found = collect(Stubborn(4), Design(), 10, shard=3)
+    assert found.episode.tolist() == [1, 2, 3, 5, 6, 7, 9]
+    assert found.about["refused"] == {"0": "no", "4": "no", "8": "no"}
+
+
+def test_refusals_of_a_world_do_not_end_it(world: World) -> None:
+    """What is drawn from beyond the arena is left out, with the reason, and the rest stays."""
+    place = "tool_block.cartesian_position"
+    values = Box((0.0, 0.1, 0.0325), (0.3, 0.1, 0.0325))  # [m]; the arena ends at 0.24
+    how: Any = {"steps": 1, "causes": [place]}
+    found = collect(world, Design("all", (place,), values, 0.0), 16, **how)
+    assert 0 < len(found) < 16
+    refused = found.about["refused"]
+    assert sorted([*map(int, refused), *found.episode.tolist()]) == list(range(16))
+    assert all("is outside" in why for why in refused.values())
+
+
+def test_a_hopeless_collection_ends_with_the_reason(world: World) -> None:
+    """If most episodes are refused it says why."""
+    place = "tool_block.cartesian_position"
+    sunk = Design("all", (place,), [0.0, 0.0, 0.0], 0.0)
+    with pytest.raises(InterventionError, match=r"20 of 20 episodes were refused; .*not feasible"):
+        collect(world, sunk, 40, shard=20, steps=1)
+
+
+def test_what_can_never_be_is_refused_at_once(world: World) -> None:
+    """Names and shapes are checked before the first episode."""
+    for request in ({"tool_block.speed": 1.0}, {MASS: [1.0, 2.0]}):
+        with pytest.raises(InterventionError):
+            collect(world, Design("all", tuple(request), request), 2)
+        with pytest.raises(InterventionError):
+            collect(world, Design(), 2, nature=request)
+
+
+# --- laboratories -----------------------------------------------------------------------------
+
+
+def test_a_laboratory_pays_for_every_row(world: World) -> None:
+    """Each episode is an experiment, with what the laboratory reports."""
+    lab = Laboratory(world, settable=["*.mass"], visible=["tool_block.*"], budget=10, steps=2)
+    found = collect(lab, Design("all", (MASS,), "B", seen=0.5), 4)
+    assert lab.remaining == 6
+    assert [record.kind for record in lab.records] == ["see", "do", "see", "do"]
+    assert found.targeted[:, found.names.index(MASS)].tolist() == [False, True] * 2
+    assert found.columns[found.names.index(MASS)].unit == "kg"
+    alone = world.rollout("random", seed=0, episode=1, steps=2, do={MASS: Draw("B")})
+    assert float(found[MASS][1]) == float(alone.final(MASS))
+
+
+def test_a_laboratory_keeps_its_rules(world: World) -> None:
+    """What it forbids or cannot pay raises its own errors."""
+    lab = Laboratory(world, settable=["*.mass"], budget=3, steps=2)
+    with pytest.raises(Forbidden):
+        collect(lab, Design("all", (FRICTION,)), 2)
+    with pytest.raises(BudgetExhausted):
+        collect(lab, Design("all", (MASS,)), 4)
+    assert lab.remaining == 2  # what was watched before the one that is forbidden
+    with pytest.raises(UnknownOption, match="circumstance of a laboratory"):
+        collect(lab, Design(), 1, steps=3)
+    with pytest.raises(UnknownOption, match="a log"):
+        collect(lab, Design(), 1, out="nowhere")

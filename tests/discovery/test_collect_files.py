@@ -1,0 +1,394 @@
+"""Datasets in folders: nothing is lost, nothing is half there, and all of it is checked."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from scm_world import SCM, Box, Exogenous
+from scm_world.cli.app import app
+from scm_world.discovery.data import Dataset, Design, UnwritableFolder, collect, folders, load, save
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.queries import World
+from scm_world.variables import Mechanism
+
+pytest.importorskip("pyarrow")
+
+DESIGN = Design("half", ("tool_block.mass", "floor_friction", "gravity"), seen=0.3)
+HOW: dict[str, Any] = {"steps": 2, "seed": 5, "shard": 4, "nature": {"sensor_noise": 0.01}}
+KINDS = ("parquet", "csv")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Read every file of a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    """A world without physics."""
+    return World("pushing", backend="fake")
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def written(
+    request: pytest.FixtureRequest, world: World, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Dataset, str]:
+    """A folder, what is in it, and the kind of its files."""
+    folder = tmp_path_factory.mktemp("data") / "whole"
+    found = collect(world, DESIGN, 10, out=folder, format=request.param, **HOW)
+    return folder, found, request.param
+
+
+@pytest.fixture
+def copied(written: tuple[Path, Dataset, str], tmp_path: Path) -> Path:
+    """A copy of the folder, to be spoiled."""
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for name, data in contents(written[0]).items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+# --- whole ------------------------------------------------------------------------------------
+
+
+def test_a_folder_holds_what_was_collected(
+    written: tuple[Path, Dataset, str], world: World
+) -> None:
+    """Loaded, it is bit for bit what came out, and what comes out without a folder."""
+    folder, found, kind = written
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["dataset.json", *(f"shard-0000{i}.{kind}" for i in range(3))]
+    assert load(folder) == found
+    assert collect(world, DESIGN, 10, **HOW) == found
+
+
+def test_saving_is_without_loss(written: tuple[Path, Dataset, str], tmp_path: Path) -> None:
+    """Any table comes back: extreme numbers, several rows per episode, unused regimes."""
+    _, found, kind = written
+    values = [[-0.0, 1e-310], [np.nextafter(1.0, 2.0), -1.7976931348623157e308], [0.1, 1 / 3]]
+    table = Dataset.of(
+        values, ["a", 'b;"c'], targets=[(), ("a",), ()], episode=[7, 7, 9], step=[0, 1, 0], x=[1]
+    )
+    for number, data in enumerate((found, table, table.rows([0]), table.rows([]))):
+        back = load(save(data, tmp_path / str(number), shard=1, format=kind))
+        assert back == data
+        assert back.values.tobytes() == data.values.tobytes()
+
+
+def test_files_are_tables_for_others(written: tuple[Path, Dataset, str]) -> None:
+    """Other libraries read them without this package, targets included."""
+    pandas = pytest.importorskip("pandas")
+    folder, found, kind = written
+    path = folder / f"shard-00000.{kind}"
+    read = pandas.read_parquet if kind == "parquet" else pandas.read_csv
+    frame = read(path, **({"comment": "#"} if kind == "csv" else {}))
+    rows = frame["tool_block.mass"].to_numpy()
+    np.testing.assert_array_equal(rows, found["tool_block.mass"][:4])
+    told = frame["intervention_targets"].fillna("")[1]
+    assert told == ";".join(np.array(found.names)[found.targeted[1]])
+
+
+def test_a_model_goes_into_a_folder(tmp_path: Path) -> None:
+    """If it can be written; a model with nameless functions could not be told from another."""
+    named = SCM([Exogenous(name="x", distribution=Box(0.0, 1.0))])
+    found = collect(named, Design(), 7, out=tmp_path / "a", shard=3)
+    assert load(tmp_path / "a") == found == collect(named, Design(), 7)
+    nameless = named.do({"x": Mechanism(lambda: 1.0)})
+    assert len(collect(nameless, Design(), 2)) == 2
+    with pytest.raises(ModelError, match="has no name"):
+        collect(nameless, Design(), 2, out=tmp_path / "b")
+
+
+def test_mechanisms_are_read_back_where_they_are_trusted(tmp_path: Path) -> None:
+    """Who collects trusts the functions of the design; who loads says so."""
+    model = SCM([Exogenous(name="x"), Exogenous(name="y")])
+    design = Design("all", ("y",), Mechanism(np.negative, ["x"]), 0.0)
+    found = collect(model, design, 3, out=tmp_path, shard=2)
+    assert collect(model, design, 3, out=tmp_path, shard=2) == found
+    with pytest.raises(ModelError, match="trusted"):
+        load(tmp_path)
+    assert load(tmp_path, trusted=["numpy"]) == found
+
+
+# --- interrupted ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("after", [1, 4, 7, 9])
+def test_ctrl_c_keeps_what_is_complete(
+    written: tuple[Path, Dataset, str], world: World, tmp_path: Path, after: int
+) -> None:
+    """The same call goes on, and every file is as if nothing had happened."""
+    folder, found, kind = written
+
+    def interrupt(done: int, planned: int) -> None:
+        if done == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect(world, DESIGN, 10, out=tmp_path, format=kind, progress=interrupt, **HOW)
+    assert len(list(tmp_path.glob("shard-*"))) == (after - 1) // 4
+    with pytest.raises(UnreadableFile, match="it is not there yet"):
+        load(tmp_path)
+    assert load(tmp_path, partial=True) == found.first((after - 1) // 4 * 4)
+    told: list[int] = []
+    again = collect(
+        world, DESIGN, 10, out=tmp_path, format=kind, progress=lambda d, _: told.append(d), **HOW
+    )
+    assert again == found
+    assert contents(tmp_path) == contents(folder)
+    assert told[-1] == 10
+    assert len(told) == len(set(told))
+
+
+PROGRAM = """
+import sys
+from scm_world.discovery.data import Design, collect
+from scm_world.queries import World
+design = Design("half", ("tool_block.mass", "floor_friction", "gravity"), seen=0.3)
+print("begin", flush=True)
+collect(World("pushing", backend="fake"), design, 400, out=sys.argv[1], shard=3, steps=2)
+"""
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.3])
+def test_a_killed_process_leaves_nothing_broken(world: World, tmp_path: Path, delay: float) -> None:
+    """After SIGKILL the same call makes the files of an uninterrupted run, byte for byte."""
+    folder, whole = tmp_path / "killed", tmp_path / "whole"
+    with subprocess.Popen(  # noqa: S603 # our own text
+        [sys.executable, "-c", PROGRAM, str(folder)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begin\n"
+        while process.poll() is None and not list(folder.glob("shard-*")):
+            time.sleep(0.001)
+        time.sleep(delay)
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    there = len(list(folder.glob("shard-*")))
+    assert 0 < there < 134
+    for out in (folder, whole):
+        collect(world, DESIGN, 400, out=out, shard=3, steps=2)
+    assert contents(folder) == contents(whole)
+
+
+def test_drafts_of_the_dead_are_swept_away(copied: Path, world: World) -> None:
+    """Half a file under another name is no part of anything; other hidden files are left alone."""
+    kind = next(copied.glob("shard-*")).suffix.removeprefix(".")
+    (copied / f".shard-00001.{kind}.part").write_bytes(b"half a")
+    (copied / ".mine").write_text("to be kept")
+    collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+    assert sorted(path.name for path in copied.glob(".*")) == [".mine"]
+
+
+def test_more_episodes_go_on_from_there(
+    written: tuple[Path, Dataset, str], copied: Path, world: World, tmp_path: Path
+) -> None:
+    """Complete files stay as they are; the folder becomes that of the larger collection."""
+    kind = written[2]
+    before = (copied / f"shard-00000.{kind}").stat().st_mtime_ns
+    more = collect(world, DESIGN, 15, out=copied, format=kind, **HOW)
+    assert more.first(10) == written[1]
+    assert (copied / f"shard-00000.{kind}").stat().st_mtime_ns == before
+    collect(world, DESIGN, 15, out=tmp_path / "new", format=kind, **HOW)
+    assert contents(copied) == contents(tmp_path / "new")
+    with pytest.raises(UnknownOption, match="15 or more"):
+        collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+
+
+# --- spoiled ----------------------------------------------------------------------------------
+
+
+def test_every_kind_of_damage_is_seen(copied: Path, world: World) -> None:
+    """A file that was cut, changed or exchanged is named, and what to do with it."""
+    paths = sorted(copied.glob("shard-*"))
+    data, kind = paths[1].read_bytes(), paths[1].suffix.removeprefix(".")
+    generator = np.random.default_rng(0)
+    spoiled = [b"", data[:-1], data[: len(data) // 2], paths[0].read_bytes()]
+    places = generator.integers(len(data), size=40)
+    spoiled += [data[:i] + bytes([data[i] ^ 16]) + data[i + 1 :] for i in places]
+    whole = load(copied)
+    for number, text in enumerate(spoiled):
+        paths[1].write_bytes(text)
+        try:
+            assert load(copied) == whole  # a bit that carries nothing
+            assert number > 3
+        except UnreadableFile as error:
+            assert error.path == str(paths[1])  # noqa: PT017 # both outcomes are allowed
+            with pytest.raises(UnreadableFile, match=r"delete it|under its own name"):
+                collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+    paths[1].unlink()
+    assert collect(world, DESIGN, 10, out=copied, format=kind, **HOW) == whole
+    assert paths[1].read_bytes() == data
+
+
+def test_changed_numbers_are_seen(copied: Path) -> None:
+    """A value that someone corrected in a CSV file is not what was written."""
+    path = copied / "shard-00001.csv"
+    if not path.exists():
+        pytest.skip("Parquet is not corrected by hand")
+    lines = path.read_text().splitlines()
+    cells = lines[2].split(",")
+    cells[-1] = repr(float(cells[-1]) + 1.0)
+    lines[2] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(UnreadableFile, match=r"shard-00001\.csv.*not what was written"):
+        load(copied)
+
+
+def test_files_of_another_dataset_are_foreign(
+    written: tuple[Path, Dataset, str], copied: Path, world: World, tmp_path: Path
+) -> None:
+    """A shard of the same shape from another seed is refused, and so is one too many."""
+    kind, name = written[2], f"shard-00001.{written[2]}"
+    collect(world, DESIGN, 10, out=tmp_path / "other", format=kind, **{**HOW, "seed": 6})
+    mine = (copied / name).read_bytes()
+    (copied / name).write_bytes((tmp_path / "other" / name).read_bytes())
+    with pytest.raises(UnreadableFile, match="belongs to another dataset"):
+        load(copied)
+    (copied / name).write_bytes(mine)
+    (copied / f"shard-00007.{kind}").write_bytes(mine)
+    with pytest.raises(UnreadableFile, match=rf"shard-00007.{kind}.*remove it"):
+        load(copied)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [({"seed": 6}, "seed"), ({"steps": 3}, "steps"), ({"nature": None}, "nature")],
+)
+def test_another_collection_is_not_mixed_in(
+    written: tuple[Path, Dataset, str], world: World, change: dict[str, Any], named: str
+) -> None:
+    """The folder of another one is refused, and the error says what differs."""
+    folder, _, kind = written
+    before = contents(folder)
+    with pytest.raises(UnreadableFile, match=f"another dataset: {named} differ"):
+        collect(world, DESIGN, 10, out=folder, format=kind, **{**HOW, **change})
+    with pytest.raises(UnreadableFile, match="design differ"):
+        collect(world, Design(), 10, out=folder, format=kind, **HOW)
+    assert contents(folder) == before
+
+
+def test_a_sidecar_is_checked(copied: Path, tmp_path: Path) -> None:
+    """Missing, cut or changed, it is named."""
+    path = copied / "dataset.json"
+    text = path.read_text()
+    for spoiled in (text[:-10], text.replace('"seed": 5', '"seed": 6'), "[]", "{}"):
+        path.write_text(spoiled)
+        with pytest.raises(UnreadableFile, match=r"dataset\.json"):
+            load(copied)
+    with pytest.raises(UnreadableFile, match=r"dataset\.json"):
+        load(tmp_path / "nowhere")
+
+
+def test_a_folder_with_other_things_is_left_alone(world: World, tmp_path: Path) -> None:
+    """Nothing is written between the files of somebody else."""
+    (tmp_path / "thesis.txt").write_text("final")
+    with pytest.raises(UnreadableFile, match="other files"):
+        collect(world, DESIGN, 10, out=tmp_path, **HOW)
+    assert contents(tmp_path) == {"thesis.txt": b"final"}
+
+
+def test_two_processes_do_not_write_to_one_folder(copied: Path, world: World) -> None:
+    """The second one is told."""
+    kind = next(copied.glob("shard-*")).suffix.removeprefix(".")
+    handle = os.open(copied, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(UnreadableFile, match="another process"):
+            collect(world, DESIGN, 10, out=copied, format=kind, **HOW)
+    finally:
+        os.close(handle)
+
+
+def test_a_full_disk_loses_nothing(
+    written: tuple[Path, Dataset, str], world: World, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """The error says so; with room again the same call goes on."""
+    folder, _, kind = written
+    calls = iter(range(100))
+
+    def full(handle: int) -> None:
+        if next(calls) == 4:  # the sidecar, and its folder; the first file, and its folder
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(folders.os, "fsync", full)
+        with pytest.raises(UnwritableFolder, match=r"shard-00001.*No space left"):
+            collect(world, DESIGN, 10, out=tmp_path, format=kind, **HOW)
+    assert sorted(contents(tmp_path)) == ["dataset.json", f"shard-00000.{kind}"]
+    collect(world, DESIGN, 10, out=tmp_path, format=kind, **HOW)
+    assert contents(tmp_path) == contents(folder)
+
+
+def test_a_place_that_cannot_be_is_told(world: World, tmp_path: Path) -> None:
+    """A file where the folder should be, and a format that there is not."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UnwritableFolder, match="cannot be written to"):
+        collect(world, DESIGN, 10, out=tmp_path / "file", **HOW)
+    with pytest.raises(UnknownOption, match="did you mean 'parquet'"):
+        collect(world, DESIGN, 10, out=tmp_path / "new", format="parket", **HOW)
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """It collects, goes on, and prints what each library would get."""
+    path = Path(__file__).parents[2] / "examples" / "collect.py"
+    runpy.run_path(str(path))["main"](episodes=20)
+    assert "rows with do(nothing)" in capsys.readouterr().out
+
+
+# --- the command ------------------------------------------------------------------------------
+
+
+COMMAND = ["collect", "pushing", "--backend", "fake", "--steps", "2", "--shard", "5"]
+
+
+def test_the_command_collects(tmp_path: Path) -> None:
+    """It says how often each target was one, and where the files are."""
+    arguments = ["--n", "12", "--target", "tool_block.*ss", "--outcome", "max:reward"]
+    more = ["--cause", "gravity", "--nature", "sensor_noise=0.01", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, [*COMMAND, *arguments, *more])
+    assert done.exit_code == 0, done.output
+    assert "do(tool_block.mass)" in done.output
+    found = load(tmp_path)
+    assert found.variables == ("gravity", "tool_block.mass", "max reward")
+    assert len(found) == 12
+    assert CliRunner().invoke(app, [*COMMAND, *arguments, *more]).exit_code == 0
+
+
+def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
+    """A typo gives exit code 2 and no folder."""
+    for wrong in (["--values", "C"], ["--design", "sigle"], ["--target", "tool_blok.*"]):
+        done = CliRunner().invoke(app, [*COMMAND, *wrong, "--out", str(tmp_path / "new")])
+        assert done.exit_code == 2, done.output
+    assert not (tmp_path / "new").exists()
+
+
+def test_ctrl_c_on_the_command_line(tmp_path: Path) -> None:
+    """It exits 130, says how many files are safe, and the same command goes on."""
+    command = [sys.executable, "-m", "scm_world", *COMMAND, "--n", "3000", "--out"]
+    with subprocess.Popen(  # noqa: S603 # our own text
+        [*command, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        while process.poll() is None and len(list(tmp_path.glob("shard-*"))) < 2:
+            time.sleep(0.001)
+        process.send_signal(signal.SIGINT)
+        text = process.communicate()[0]
+    assert process.returncode == 130
+    there = len(list(tmp_path.glob("shard-*")))
+    assert f"interrupted: {there} of 600 files are safe" in text
+    assert len(load(tmp_path, partial=True)) == 5 * there

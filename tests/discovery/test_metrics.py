@@ -1,0 +1,335 @@
+"""Scores of graphs agree with their definitions, with other programs and with brute force."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scm_world.discovery.data import Dataset, Regime
+from scm_world.discovery.learners.found import Found
+from scm_world.discovery.metrics import (
+    Scores,
+    aid,
+    auprc,
+    auroc,
+    distances,
+    effect_rmse,
+    evaluate,
+    hold_out,
+    shd,
+    shd_of_classes,
+    sid,
+    sid_bounds,
+)
+from scm_world.errors import MissingExtra, ModelError, UnknownVariable
+from scm_world.graph.equivalence import (
+    cpdag,
+    extension,
+    extensions,
+    meek,
+    random_dag,
+    topological_order,
+)
+from scm_world.queries.plans import Plan
+
+NAMES = ("x1", "x2", "y1", "y2", "y3")
+PAPER = [("x1", "x2", 0), *[(x, y, 0) for x in NAMES[:2] for y in NAMES[2:]]]
+
+KINDS: tuple[distances.Adjustment, ...] = ("parent", "ancestor", "oset")
+ROWS = "from row to column"
+
+
+# --- distances --------------------------------------------------------------------------------
+
+
+def test_the_example_of_the_paper() -> None:
+    """One edge too many harms no effect; one edge turned around spoils eight.
+
+    Source:
+        Peters and Bühlmann 2015, figure 1.
+    """
+    more = evaluate(Found.of_edges(NAMES, [*PAPER, ("y1", "y2", 0)]), PAPER)
+    turned = evaluate(Found.of_edges(NAMES, [("x2", "x1", 0), *PAPER[1:]]), PAPER)
+    assert (more.shd, more.sid) == (1, 0)
+    assert (turned.shd, turned.sid) == (1, 8)
+
+
+def test_distances_agree_with_gadjid() -> None:
+    """SHD and SID are those of gadjid on 1,000 random pairs of acyclic graphs."""
+    gadjid = pytest.importorskip("gadjid")
+    rng = np.random.default_rng(0)
+    for _ in range(1_000):
+        n = int(rng.integers(3, 16))
+        true, found = (random_dag(n, rng.uniform(0.05, 0.9), rng) for _ in range(2))
+        as_int = true.astype(np.int8), found.astype(np.int8)
+        _, expected = gadjid.sid(*as_int, edge_direction=ROWS)
+        assert sid(found, true) == expected
+        assert shd(found, true) == gadjid.shd(*as_int)[1]
+
+
+def test_sid_forgives_what_is_adjusted_for_in_vain() -> None:
+    """A complete graph in the right order gets every effect right, and not the other way round."""
+    true = random_dag(8, 0.2, np.random.default_rng(1))
+    place = np.argsort(topological_order(true))
+    complete = place[:, None] < place[None, :]
+    assert sid(complete, true) == 0
+    assert sid(true, complete) > 0
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_bounds_of_sid_are_those_of_all_members(seed: int) -> None:
+    """The bounds are the least and the greatest SID of all members, with known directions too."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 8))
+    true, other = (random_dag(n, rng.uniform(0.1, 0.7), rng) for _ in range(2))
+    found = cpdag(other)
+    if seed % 2:  # some background knowledge, which need not leave a chain graph
+        i, j = rng.choice(np.argwhere(other)) if other.any() else (0, 0)
+        found[j, i] = False
+        found = meek(found)
+    values = [sid(member, true) for member in extensions(found)]
+    assert sid_bounds(found, true) == (min(values), max(values))
+
+
+def test_what_has_too_many_members_or_none_has_no_sid() -> None:
+    """A clique of seven has 5,040 members, a ring of four none."""
+    true = np.triu(np.ones((7, 7), bool), 1)
+    assert sid_bounds(~np.eye(7, dtype=bool), true) is None
+    ring = np.roll(np.eye(4, dtype=bool), 1, axis=1)
+    assert sid_bounds(ring | ring.T, np.zeros((4, 4), bool)) is None
+    assert shd_of_classes(ring | ring.T, np.zeros((4, 4), bool)) is None
+    with pytest.raises(ModelError, match="cycle"):
+        sid(ring, np.zeros((4, 4), bool))
+
+
+def test_classes_are_compared_as_classes() -> None:
+    """A member, another member and their essential graph are at distance 0 from one another."""
+    true = random_dag(12, 0.2, np.random.default_rng(4))
+    essential = cpdag(true)
+    member = extension(essential, np.random.default_rng(5))
+    assert member is not None
+    assert (member != true).any()
+    assert [shd_of_classes(graph, true) for graph in (true, member, essential)] == [0, 0, 0]
+
+
+def test_adjustment_distances_are_those_of_gadjid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows are causes for gadjid too, and edges without direction are told; so is its absence."""
+    gadjid = pytest.importorskip("gadjid")
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        true, other = (random_dag(8, 0.3, rng) for _ in range(2))
+        found = cpdag(other)
+        coded = np.where(found & found.T, 2, found).astype(np.int8)
+        for kind in KINDS:
+            distance = getattr(gadjid, f"{kind}_aid")
+            as_int = true.astype(np.int8), coded
+            assert aid(found, true, kind) == distance(*as_int, edge_direction=ROWS)[1]
+    two = np.array([[0, 1], [0, 0]], bool)
+    assert [aid(two, two, "ancestor"), aid(two.T, two, "ancestor")] == [0, 2]
+    ring = np.roll(np.eye(3, dtype=bool), 1, axis=1)
+    assert aid(ring, np.zeros((3, 3), bool), "parent") is None
+
+    monkeypatch.setattr(distances, "has_gadjid", lambda: False)
+    with pytest.raises(MissingExtra, match=r"scm-world\[discovery\]"):
+        aid(two, two, "parent")
+
+
+# --- rankings ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_rankings_follow_their_definitions(seed: int) -> None:
+    """With ties, AUROC counts pairs and AUPRC sums precision over the distinct thresholds."""
+    rng = np.random.default_rng(seed)
+    sureness = rng.integers(0, 6, 40).astype(float)
+    present = rng.random(40) < 0.3
+    pairs = sureness[present][:, None] - sureness[~present][None, :]
+    assert auroc(sureness, present) == pytest.approx(((pairs > 0) + 0.5 * (pairs == 0)).mean())
+    area, before = 0.0, 0.0
+    for level in sorted(set(sureness), reverse=True):
+        taken = sureness >= level
+        recall = present[taken].sum() / present.sum()
+        area, before = area + (recall - before) * present[taken].mean(), recall
+    assert auprc(sureness, present) == pytest.approx(area)
+
+
+def test_rankings_need_both_kinds() -> None:
+    """Without anything absent, or anything present, there is no ranking."""
+    for present in (np.ones(3, bool), np.zeros(3, bool)):
+        assert auroc(np.arange(3.0), present) is None
+        assert auprc(np.arange(3.0), present) is None
+    assert auroc(np.zeros(4), np.array([True, False, False, False])) == 0.5
+
+
+# --- all together -----------------------------------------------------------------------------
+
+
+def test_a_perfect_graph_has_perfect_scores() -> None:
+    """The declared graph itself scores best everywhere."""
+    scores = evaluate(Found.of_edges(NAMES, PAPER), PAPER)
+    best = [scores.precision, scores.recall, scores.f1, scores.skeleton_f1, scores.auroc]
+    assert [*best, scores.auprc] == [1.0] * 6
+    assert [scores.shd, scores.shd_classes, scores.sid, scores.false_discoveries] == [0, 0, 0, 0]
+    assert (scores.edges, scores.declared, scores.pairs) == (7, 7, 20)
+
+
+def test_edges_without_direction() -> None:
+    """They count 1 each for SHD, are missed for recall, right for the skeleton; SID is a range."""
+    found = Found.of(("x", "y", "z"), [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    scores = evaluate(found, [("x", "y", 0)])
+    assert (scores.shd, scores.precision, scores.recall) == (1, 1.0, 0.0)
+    assert (scores.skeleton_f1, scores.edges) == (1.0, 1)
+    assert (scores.sid_lower, scores.sid_upper, scores.sid) == (0, 2, None)
+    assert scores.shd_classes == 0
+    assert evaluate(found, []).shd == 1
+
+
+def test_graphs_through_time() -> None:
+    """Edges are compared lag by lag, a node may act on itself later, and SID does not apply."""
+    found = Found.of_edges(("x", "y"), [("x", "x", 1), ("x", "y", 1), ("y", "x", 0)])
+    scores = evaluate(found, [("x", "x", 1), ("x", "y", 0), ("x", "y", 2)])
+    assert (scores.shd, scores.shd_by_lag) == (3, (1, 1, 1))
+    assert (scores.sid, scores.shd_classes, scores.parent_aid) == (None, None, None)
+    assert scores.notes == ("no intervention distances: there are edges through time",)
+    assert scores.pairs == 2 + 4 + 4
+    assert scores.precision == scores.recall == pytest.approx(1 / 3)
+    assert scores.skeleton_precision == pytest.approx(2 / 3)
+
+
+def test_pairs_that_do_not_count() -> None:
+    """What is left out neither helps nor harms; a pair within an instant is left out as a whole."""
+    found = Found.of_edges(("x", "y", "z"), [("x", "y", 0), ("y", "z", 0)])
+    counts = np.ones((3, 3), bool)
+    counts[1, 0] = False
+    scores = evaluate(found, [("y", "z", 0)], pairs=counts)
+    assert (scores.shd, scores.precision, scores.auroc, scores.pairs) == (0, 1.0, 1.0, 4)
+    assert scores.sid is None
+    assert "some pairs" in scores.notes[0]
+    with pytest.raises(ModelError, match="pairs has shape"):
+        evaluate(found, [], pairs=np.ones((2, 2)))
+
+
+def test_cycles_have_no_intervention_distance() -> None:
+    """A found or declared cycle leaves the counts, and says why the rest is missing."""
+    ring = [("x", "y", 0), ("y", "z", 0), ("z", "x", 0)]
+    scores = evaluate(Found.of_edges(("x", "y", "z"), ring), ring[:2])
+    assert (scores.shd, scores.sid, scores.shd_classes) == (1, None, None)
+    assert "found graph has a cycle" in scores.notes[0]
+    scores = evaluate(Found.of_edges(("x", "y", "z"), ring[:2]), ring)
+    assert "declared graph has a cycle" in scores.notes[0]
+
+
+def test_names_are_checked_and_can_be_given() -> None:
+    """A variable that was not found has no edges; one that is not compared on is refused."""
+    found = Found.of_edges(("x", "y"), [("x", "y", 0)])
+    assert evaluate(found, [("x", "y", 0), ("y", "z", 0)], names=["x", "y", "z"]).recall == 0.5
+    with pytest.raises(UnknownVariable, match="'zz'"):
+        evaluate(found, [("zz", "y", 0)])
+
+
+def test_scores_survive_a_file() -> None:
+    """Scores come back from JSON as they were; anything else is refused."""
+    scores = evaluate(Found.of_edges(NAMES, PAPER[:3]), PAPER)
+    assert Scores.from_dict(json.loads(json.dumps(scores.as_dict()))) == scores
+    with pytest.raises(ModelError, match="not scores"):
+        Scores.from_dict({"format": "else"})
+
+
+def test_without_gadjid_there_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where gadjid is not installed, its distances are None and the rest is there."""
+    monkeypatch.setattr("scm_world.discovery.metrics.comparison.has_gadjid", lambda: False)
+    scores = evaluate(Found.of_edges(NAMES, PAPER), PAPER)
+    assert (scores.sid, scores.parent_aid) == (0, None)
+    assert "pip install" in scores.notes[0]
+
+
+# --- prediction -------------------------------------------------------------------------------
+
+
+def chain_data(seed: int = 0, n: int = 2_000) -> Dataset:
+    """Sample x → y → z with noise, seen and under do(x = 3), do(y = 3), do(y = -2), do(z = 3)."""
+    rng = np.random.default_rng(seed)
+    tables = []
+    for plan in ({}, {"x": 3.0}, {"y": 3.0}, {"y": -2.0}, {"z": 3.0}):
+        x = np.full(n, plan["x"]) if "x" in plan else rng.normal(size=n)
+        y = np.full(n, plan["y"]) if "y" in plan else 2.0 * x + 1.0 + rng.normal(size=n)
+        z = np.full(n, plan["z"]) if "z" in plan else -y + rng.normal(size=n)
+        table = Dataset.of(np.stack([x, y, z], axis=1), ["x", "y", "z"])
+        tables.append(replace(table, regimes=(Regime(Plan(plan), tuple(plan)),)))
+    return Dataset.joined(tables)
+
+
+def rmse(edges: list[tuple[str, str, int]], data: Dataset, *held_out: tuple[str, ...]) -> float:
+    """Predict held-out interventions with these edges."""
+    train, test = hold_out(data, held_out)
+    found = effect_rmse(Found.of_edges(("x", "y", "z"), edges), train, test)
+    assert found.rmse is not None
+    return found.rmse
+
+
+def test_the_true_graph_predicts_interventions() -> None:
+    """The true graph predicts the means; a turned edge or a missing one does not."""
+    data, true = chain_data(), [("x", "y", 0), ("y", "z", 0)]
+    for held_out in [("x",), ("y",), ("z",)]:
+        assert rmse(true, data, held_out) < 0.05
+    assert rmse([("y", "x", 0), ("y", "z", 0)], data, ("y",)) > 0.3
+    assert rmse([("x", "y", 0), ("z", "y", 0)], data, ("y",)) > 0.3
+    train, test = hold_out(data, [("x",)])
+    nothing = effect_rmse(Found.of_edges(("x", "y", "z"), []), train.seen, test)
+    assert nothing.rmse == pytest.approx(nothing.unmoved)
+    assert nothing.by_regime == {("x",): nothing.rmse}
+
+
+def test_prediction_does_not_depend_on_scale() -> None:
+    """Standardised data give the same numbers."""
+    data, edges = chain_data(), [("x", "y", 0), ("z", "y", 0)]
+    assert rmse(edges, data, ("y",)) == pytest.approx(rmse(edges, data.standardised(), ("y",)))
+
+
+def test_prediction_says_when_it_does_not_apply() -> None:
+    """Cycles and lags give None with a reason; missing rows and unknown names are errors."""
+    data = chain_data()
+    train, test = hold_out(data, [("x",)])
+    ring = Found.of_edges(("x", "y", "z"), [("x", "y", 0), ("y", "z", 0), ("z", "x", 0)])
+    late = Found.of_edges(("x", "y", "z"), [("x", "y", 1)])
+    assert effect_rmse(ring, train, test).note == "the graph has a cycle, or no extension"
+    assert effect_rmse(late, train, test).note == "the graph has edges through time"
+    with pytest.raises(ModelError, match="something was done"):
+        effect_rmse(ring, train, data.seen)
+    with pytest.raises(ModelError, match="nothing was done"):
+        effect_rmse(ring, test, test)
+    with pytest.raises(UnknownVariable, match="'w'"):
+        effect_rmse(Found.of_edges(("w", "x"), []), train, test)
+    with pytest.raises(ModelError, match="no row has the targets: w"):
+        hold_out(data, [("w",)])
+
+
+def test_prediction_over_vectors_constants_and_undirected_edges() -> None:
+    """Vectors are joined by components, constants are left out, an extension directs the rest."""
+    rng = np.random.default_rng(0)
+    n = 500
+    a = rng.normal(size=(2 * n, 2))
+    a[n:, 0] = 4.0
+    b = a @ [1.0, -1.0] + 0.1 * rng.normal(size=2 * n)
+    table = Dataset.of(
+        np.column_stack([a, b, np.ones(2 * n)]),
+        ["a[0]", "a[1]", "b", "c"],
+        targets=[()] * n + [("a[0]",)] * n,
+    )
+    columns = [replace(c, variable="a", component=i) for i, c in enumerate(table.columns[:2])]
+    data = replace(table, columns=(*columns, *table.columns[2:]))
+    regimes = tuple(Regime(r.plan, ("a",) if r.targets else ()) for r in data.regimes)
+    train, test = hold_out(replace(data, regimes=regimes), [("a",)])
+    found = effect_rmse(Found.of_edges(("a", "b", "c"), [("a", "b", 0)]), train, test)
+    assert found.rmse is not None
+    assert found.unmoved is not None
+    assert found.rmse < 0.1 < 2.0 < found.unmoved
+    assert json.loads(json.dumps(found.as_dict()))["by_regime"][0]["targets"] == ["a"]
+    both = Found.of(("a", "b", "c"), [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    way = effect_rmse(Found.of(("a", "b", "c"), extension(both.edges[0])), train, test)
+    assert effect_rmse(both, train, test).rmse == way.rmse
+    alone = effect_rmse(Found.of_edges(("c",), []), train, test)
+    assert alone.note == "no column varies that was not set"
