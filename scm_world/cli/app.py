@@ -87,7 +87,9 @@ Acts = Annotated[
     ),
 ]
 Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
-Policy = Annotated[str, typer.Option(help="random, or still: the robot stays where it begins.")]
+Policy = Annotated[
+    str, typer.Option(help="random, sweep: the fingertips go to the middle, or still.")
+]
 
 
 def _version(wanted: bool) -> None:

@@ -25,8 +25,9 @@ from scm_world.queries import (
     compare,
     save_episode,
 )
+from scm_world.queries.policies import NAMED
 
-POLICIES = ("random", "still")
+POLICIES = (*NAMED, "still")
 FORMAT = "scm_world/counterfactual/1"
 
 
@@ -41,7 +42,7 @@ class Circumstances:
         preset: Numerical settings.
         seed: Of the noise.
         steps: Control steps of an episode.
-        policy: ``"random"`` or ``"still"``.
+        policy: ``"random"``, ``"sweep"`` or ``"still"``.
         arguments: Of the task, each as ``name=value``.
     """
 

@@ -108,10 +108,11 @@ def episode_outcome(
         for edge in model.edges
         if edge.cause in graph and edge.effect in graph and edge.when != "set"
     )
-    moving = follow.subgraph([name for name in follow if name not in graph])
+    still = set(parameters)
+    moving = follow.subgraph([name for name in follow if name not in still])
     for outcome in outcomes:
         causes = {model.declared(outcome).name, *nx.ancestors(moving, outcome)}
-        direct = {p for name in causes for p in follow.predecessors(name) if p in graph}
+        direct = {p for name in causes for p in follow.predecessors(name) if p in still}
         graph.add_edges_from((parameter, outcome) for parameter in sorted(direct))
         graph.add_edges_from((f"{name}@0", outcome) for name in starts if name in causes)
     return graph

@@ -13,10 +13,11 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
+from scm_world.graph.evaluate import Act, source_of
 from scm_world.queries.estimates import CONFIDENCE, Effect, t_quantile
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.plans import Plan
-from scm_world.variables import Mechanism
+from scm_world.variables import Draw, Mechanism
 
 
 @final
@@ -47,7 +48,8 @@ def nature_graph(
 
     Args:
         model: Of the world.
-        nature: What varies by itself; a ``Mechanism`` adds its edges.
+        nature: What varies by itself; a ``Mechanism`` adds its edges, and so does a ``Draw`` from
+            a space that follows other variables.
         outcomes: What the episode ends with.
 
     Raises:
@@ -62,14 +64,23 @@ def nature_graph(
         raise ModelError(
             [f"what nature does to {name!r} has to happen at the beginning" for name in late]
         )
-    held = model.do(acts)
     states = [n for n in map(model.target, acts) if model.declared(n).role == "state"]
+    held = model.do({n: act for n, act in acts.items() if model.target(n) not in states})
     graph = episode_outcome(held, outcomes, starts=states)
     for name, act in acts.items():
-        if isinstance(act, Mechanism) and model.target(name) in states:
-            causes = (p.name if p.name in graph else f"{p.name}@0" for p in act.parents)
+        if model.target(name) in states:
+            causes = (n if n in graph else f"{n}@0" for n in sorted(_followed(model, name, act)))
             graph.add_edges_from((cause, f"{model.target(name)}@0") for cause in causes)
     return graph
+
+
+def _followed(model: SCM, name: str, act: Any) -> frozenset[str]:
+    """Name what a state follows at the beginning: parents of a mechanism or of a space."""
+    if isinstance(act, Mechanism):
+        return frozenset(parent.name for parent in act.parents)
+    if isinstance(act, Draw):
+        return source_of(Act(act, model.declared(name))).parents()
+    return frozenset()
 
 
 def identify(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
+from scm_world.scene import trifinger
+from scm_world.scene.kinematics import forward, inverse
 from scm_world.world import World
 from scm_world.world.start import whole_number
 
@@ -75,6 +78,50 @@ class Sequence:
         return action
 
 
+INWARD = ((0.33, 0.12, 0.0), (1.0, 0.02, 0.0))
+ACROSS = ((0.25, 0.12, 0.0), (1.0, -0.11, 0.0))
+"""Where a sweep is after shares of its way: distance from the middle, and above its level [m]."""
+
+
+@final
+class Sweep:
+    """The fingertips sweep over the floor to its middle, and stay there.
+
+    What lies in their way is pushed. It depends on nothing but the control step, so that it adds
+    no cause and no noise to what happens.
+
+    Args:
+        across: Whether one of them goes through the middle to the other side, so that what it
+            pushes comes to the wall, while the others stay where they are.
+        steps: How many control steps the way takes.
+        level: Height of the fingertips as they sweep [m].
+    """
+
+    def __init__(self, *, across: bool = False, steps: int = 14, level: float = 0.035) -> None:
+        self.steps = whole_number("steps", steps, least=1)
+        rest, height = np.array(trifinger.REST), trifinger.NOMINAL_HEIGHT
+        tips = forward(rest, height).reshape(3, 3)
+        far, high = float(np.hypot(*tips[0, :2])), float(tips[0, 2])
+        stations = ACROSS if across else INWARD
+        when, radius, lift = np.array([(0.0, far, high - level), *stations]).T
+        share = np.arange(1, steps + 1) / steps
+        way = np.empty((steps, 3, 3))
+        way[..., :2] = np.interp(share, when, radius)[:, None, None] * tips[:, :2] / far
+        way[..., 2] = level + np.interp(share, when, lift)[:, None]
+        if across:
+            way[:, 1:] = tips[1:]
+        self._way = way.reshape(steps, 9)
+        self._joints = np.array([inverse(t, height, rest).joint_positions for t in self._way])
+
+    def __call__(self, world: World) -> Floats:
+        """Give the action of the present step."""
+        if world.action_mode == "joint_torques":
+            raise ActionError("a sweep needs positions as actions, not", world.action_mode)
+        way = self._way if "effector" in world.action_mode else self._joints
+        action: Floats = way[min(world.index, self.steps - 1)]
+        return action
+
+
 def still(world: World) -> Floats:
     """Keep the robot where it is told to be: joints, fingertips, or no torque."""
     if world.action_mode == "joint_torques":
@@ -84,11 +131,20 @@ def still(world: World) -> Floats:
     return found
 
 
+NAMED: Mapping[str, Callable[[], Policy]] = {
+    "random": Random,
+    "sweep": cache(Sweep),
+    "across": cache(partial(Sweep, across=True)),
+}
+"""Policies that have a name."""
+
+
 def as_policy(given: Any) -> Policy:
     """Turn what a user gives into a policy for one rollout.
 
     Args:
-        given: A policy, actions, ``"random"``, or None: where the robot begins it stays.
+        given: A policy, actions, ``"random"``, ``"sweep"`` (to the middle), ``"across"``
+            (one finger), or None: where the robot begins it stays.
 
     Raises:
         ActionError: It is none of these.
@@ -96,9 +152,9 @@ def as_policy(given: Any) -> Policy:
     if given is None:
         return _Hold()
     if isinstance(given, str):
-        if given == "random":
-            return Random()
-        raise ActionError('a policy is a function of the world, actions, "random" or None', given)
+        if given in NAMED:
+            return NAMED[given]()
+        raise ActionError(f"a policy is a function, actions, None, or one of {[*NAMED]}", given)
     return given if callable(given) else Sequence(given)
 
 

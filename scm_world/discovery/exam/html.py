@@ -140,7 +140,7 @@ def _words(value: object) -> str:
 
 def _subject(exam: Exam, name: str, number: int) -> str:
     truth, cells = exam.subjects[name], exam.cells_of(name)
-    links = {c.key: compare(truth, c.found) for c in cells if c.found is not None}
+    links = {c.key: compare(exam.truth_of(c), c.found) for c in cells if c.found is not None}
     board = Board(truth, f"s{number}", max(map(len, links.values()), default=0))
     drawn = len(exam.cells) <= PICTURES
     groups: dict[tuple[str, str, bool], list[Cell]] = {}
@@ -162,9 +162,11 @@ Links = dict[tuple[str, str, str, bool, int, int], tuple[Link, ...]]
 
 def _learner(truth: Truth, board: Board, cells: Sequence[Cell], links: Links, drawn: bool) -> str:
     """Show one run, and the others below it."""
-    largest = max(cell.budget for cell in cells)
-    first = next(cell for cell in cells if cell.budget == largest)
-    others = [cell for cell in cells if cell is not first]
+    shown = [cell for cell in cells if cell.declared is None] or list(cells)
+    largest = max(cell.budget for cell in shown)
+    first = next(cell for cell in shown if cell.budget == largest)
+    own = [cell for cell in cells if cell.declared is not None]
+    others = [cell for cell in cells if cell is not first and cell not in own]
     kind = f"{first.learner}, {first.data}" + (", standardised" if first.standardised else "")
     more = ""
     if others:
@@ -174,6 +176,9 @@ def _learner(truth: Truth, board: Board, cells: Sequence[Cell], links: Links, dr
             else _list(others, links)
         )
         more = f"<details><summary>{len(others)} other runs</summary>{inside}</details>"
+    if own:
+        inside = _list(own, links)
+        more += f"<details><summary>{len(own)} runs on other graphs</summary>{inside}</details>"
     return (
         f"<h3>{escape(kind)}</h3><p>{_run(first)}</p>{_pair(truth, board, first, links)}"
         f"{_wrong(links.get(first.key, ()))}{more}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar, final
@@ -43,6 +43,8 @@ class Cell:
         seconds: Wall time [s].
         experiments: How many it used.
         bound: Fewest that can do in theory, if known.
+        declared: The declared edges, where this seed has another graph than the subject shows:
+            each seed draws its own model of a family.
 
     Raises:
         UnknownOption: ``data`` or ``status`` is none of the above.
@@ -62,6 +64,7 @@ class Cell:
     seconds: float = 0.0
     experiments: int = 0
     bound: int | None = None
+    declared: tuple[EdgeKey, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check what cannot be shown."""
@@ -200,6 +203,11 @@ class Exam:
         place = {name: number for number, name in enumerate(self.subjects)}
         return tuple(sorted(self.cells, key=lambda cell: (place[cell.subject], cell.key)))
 
+    def truth_of(self, cell: Cell) -> Truth:
+        """Give the graph that a cell is held against."""
+        truth = self.subjects[cell.subject]
+        return truth if cell.declared is None else replace(truth, edges=cell.declared)
+
     def cells_of(self, subject: str) -> tuple[Cell, ...]:
         """Give the cells of one subject."""
         return tuple(cell for cell in self.ordered if cell.subject == subject)
@@ -312,7 +320,12 @@ def _cell(data: Mapping[str, Any]) -> Cell:
         seconds=float(data["seconds"]),
         experiments=int(data["experiments"]),
         bound=None if data["bound"] is None else int(data["bound"]),
+        declared=None if data["declared"] is None else _edges(data["declared"]),
     )
+
+
+def _edges(data: Iterable[Any]) -> tuple[EdgeKey, ...]:
+    return tuple((str(cause), str(effect), int(lag)) for cause, effect, lag in data)
 
 
 def _number(value: Any) -> Number:
@@ -325,7 +338,7 @@ def _truth(data: Mapping[str, Any]) -> Truth:
     return Truth(
         name=str(data["name"]),
         names=_texts(data["names"]),
-        edges=tuple((str(cause), str(effect), int(lag)) for cause, effect, lag in data["edges"]),
+        edges=_edges(data["edges"]),
         left_out=tuple((str(one), str(other)) for one, other in data["left_out"]),
         about=dict(data["about"]),
     )

@@ -1,0 +1,317 @@
+"""What learners are examined on: models, and views of tasks, each with its declared graph."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, final
+
+from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
+from scm_world.discovery.data.recorded import first_label, settable
+from scm_world.discovery.exam.families import DONE, is_family, model
+from scm_world.discovery.exam.results import Truth
+from scm_world.discovery.learners.apparatus import Apparatus, Model
+from scm_world.discovery.learners.worlds import Outcomes, Steps
+from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.graph import SCM, from_json
+from scm_world.queries.face import World
+from scm_world.queries.identification import nature_graph
+from scm_world.queries.outcomes import as_outcome
+from scm_world.queries.samples import STEPS, Setting
+from scm_world.tasks import TASKS, make_task
+from scm_world.variables import Box, Derived, Draw
+
+View = Literal["outcome", "step"]
+VIEWS: tuple[View, ...] = ("outcome", "step")
+FEW = 10  # control steps of an episode of a model through time
+SENSED = 0.005  # noise of the sensors, as a fraction of half a range
+START = ".cylindrical_position"
+THROWN = (1.5, 1.8, 0.0)  # [m/s] between two fingers and to the wall
+MOST_STARTS = 3  # blocks that find room, each in a sector of its own
+
+
+class Subject(Protocol):
+    """A system with a declared graph, which learners do not see."""
+
+    @property
+    def truth(self) -> Truth:
+        """Give the declared graph."""
+
+    def data(self, source: str, budget: int, seed: int, **options: Any) -> Dataset:
+        """Collect rows: ``"see"`` or ``"do"``; the first rows are the same for any budget."""
+
+    def test(self, seed: int) -> Dataset | None:
+        """Collect rows under interventions that no learner sees; None where there are none."""
+
+    def apparatus(self, seed: int) -> Apparatus:
+        """Give something that does paired experiments."""
+
+    def close(self) -> None:
+        """Give engines back."""
+
+
+@final
+class ModelSubject:
+    """A model without physics. The budget counts rows.
+
+    Args:
+        name: To call it by.
+        scm: The model.
+    """
+
+    def __init__(self, name: str, scm: SCM) -> None:
+        self._scm = scm
+        self._steps = FEW if any(edge.lag for edge in scm.edges) else None
+        edges = tuple(edge.key for edge in scm.edges)
+        about = {"kind": "model", "budget": "rows"}
+        self.truth = Truth(name=name, names=tuple(scm), edges=edges, about=about)
+        self._targets = tuple(v.name for v in scm.variables if v.settable)
+
+    def data(self, source: str, budget: int, seed: int, **options: Any) -> Dataset:
+        """Collect rows; under ``"do"``, a sixth as many again are watched only as one target has.
+
+        The shares are those of 1,000 watched rows beside 500 for each variable.
+        """
+        seen = 2.0 / (len(self._targets) + 2.0)
+        design = Design() if source == "see" else Design("single", self._targets, DONE, seen)
+        episodes = budget if self._steps is None else -(-budget // self._steps)
+        circumstances: Any = {} if self._steps is None else {"steps": self._steps}
+        return collect(self._scm, design, episodes, seed=seed, **circumstances, **options)
+
+    def test(self, seed: int) -> Dataset | None:
+        """Set each variable in turn to 2, where no one has seen it."""
+        if self._steps is not None:
+            return None
+        design = Design("single", self._targets, 2.0, seen=0.0)
+        return collect(self._scm, design, 200 * len(self._targets), seed=seed + 1_000_000)
+
+    def apparatus(self, seed: int) -> Apparatus:
+        """Do paired experiments on the mechanisms."""
+        return Model(self._scm, seed)
+
+    def close(self) -> None:
+        """There is nothing to give back."""
+
+
+@final
+@dataclass(frozen=True)
+class TaskView:
+    """How a task is looked at.
+
+    Attributes:
+        view: ``"outcome"``: one row per episode: what it begins with, and what it ends with.
+            ``"step"``: one row per control step.
+        causes: Patterns of what varies; the physical parameters if None, and in the view of
+            outcomes where the blocks begin.
+        outcomes: Names of variables; the blocks' states, success, and by step the joints, if None.
+        policy: Who acts.
+        steps: Control steps of an episode.
+        sensor_noise: Standard deviation, as a fraction of half the range of what is measured.
+        options: Of the world: backend, preset.
+        arguments: Of the task.
+    """
+
+    view: View = "outcome"
+    causes: tuple[str, ...] | None = None
+    outcomes: tuple[str, ...] | None = None
+    policy: str = "sweep"
+    steps: int = STEPS
+    sensor_noise: float = SENSED
+    options: dict[str, Any] = field(default_factory=dict)
+    arguments: dict[str, Any] = field(default_factory=dict)
+
+
+@final
+class TaskSubject:
+    """A task with its physics. The budget counts episodes, or control steps in the view by step.
+
+    Args:
+        task: Its name.
+        view: How it is looked at.
+
+    Raises:
+        UnknownOption: There is no such task or view.
+        UnknownVariable: A pattern names nothing that can be set.
+    """
+
+    def __init__(self, task: str, view: TaskView) -> None:
+        if view.view not in VIEWS:
+            raise UnknownOption("view", view.view, VIEWS)
+        self._view = view
+        self._world = World(make_task(task, **view.arguments), **view.options)
+        self._causes = self._chosen()
+        given = view.outcomes
+        by_step = view.view == "step"
+        found = default_outcomes(self._world, every_step=by_step) if given is None else given
+        self._outcomes = tuple(map(as_outcome, found))
+        self.truth = self._step_truth(task) if by_step else self._outcome_truth(task)
+
+    def _chosen(self) -> tuple[str, ...]:
+        """Choose what varies: with what is computed from it, since that can be set, too."""
+        world, model = self._world, self._world.model
+        if self._view.causes is not None:
+            return settable(world, self._view.causes)
+        chosen = default_causes(world)
+        starts = tuple(
+            name
+            for name in settable(world, ("*",))
+            if name.endswith(START) and model.declared(model.target(name)).role == "state"
+        )
+        if self._view.view == "step" or len(starts) > MOST_STARTS:
+            starts = ()
+        follow = tuple(
+            name
+            for name in model
+            if isinstance(model.declared(name), Derived)
+            and model.target(name) == name
+            and model.declared(name).settable
+            and any(parent.name in chosen for parent in model.declared(name).all_parents)
+        )
+        return (*chosen, *follow, *starts)
+
+    @property
+    def _nature(self) -> dict[str, Any]:
+        """Let everything vary by itself that has a space of its own.
+
+        Blocks begin near the middle, each in a sector of its own, so that no draw has to be
+        rejected: rejection would make everything that is drawn depend on everything else.
+        """
+        model = self._world.model
+        starts = [n for n in self._causes if n.endswith(START)]
+        drawn: dict[str, Any] = {
+            n: "A"
+            for n in self._causes
+            if not isinstance(model.declared(n), Derived) or model.target(n) != n
+        }
+        for number, name in enumerate(starts):
+            drawn[name] = _sector(model.declared(name).a, number, len(starts))
+        noise = {"sensor_noise": self._view.sensor_noise} if self._view.sensor_noise else {}
+        return {**drawn, **noise}
+
+    def _outcome_truth(self, task: str) -> Truth:
+        model = self._world.model
+        outcomes = [outcome.name for outcome in self._outcomes]
+        graph = nature_graph(model, self._nature, outcomes)
+        named = {n: f"{first_label(model, n)} {n}".strip() for n in self._causes}
+        node = {f"{model.target(n)}@0" if first_label(model, n) else n: f for n, f in named.items()}
+        node |= {outcome: outcome for outcome in outcomes}
+        edges = tuple(
+            (node[c], node[e], 0) for c, e in sorted(graph.edges) if c in node and e in node
+        )
+        ends = tuple(dict.fromkeys(outcomes))
+        pairs = tuple((a, b) for i, a in enumerate(ends) for b in ends[i + 1 :])
+        names = (*named.values(), *ends)
+        return Truth(name=task, names=names, edges=edges, left_out=pairs, about=self._about())
+
+    def _step_truth(self, task: str) -> Truth:
+        names = tuple(dict.fromkeys((*self._causes, *(o.name for o in self._outcomes), "action")))
+        known = set(names)
+        edges = tuple(e.key for e in self._world.model.edges if {e.cause, e.effect} <= known)
+        return Truth(name=f"{task}/step", names=names, edges=edges, about=self._about())
+
+    def _about(self) -> dict[str, Any]:
+        view, backend = self._view, self._world.backend
+        return {
+            "kind": f"task, view by {view.view}",
+            "budget": "episodes" if view.view == "outcome" else "control steps",
+            "engine": f"{backend.name} {backend.version}",
+            "policy": view.policy,
+            "steps": view.steps,
+            "sensor_noise": view.sensor_noise,
+            "options": {k: str(v) for k, v in view.options.items()},
+            "arguments": {k: str(v) for k, v in view.arguments.items()},
+        }
+
+    def data(self, source: str, budget: int, seed: int, **options: Any) -> Dataset:
+        """Collect episodes; under ``"do"`` half of the causes are set in two of three."""
+        by_step = self._view.view == "step"
+        episodes = -(-budget // self._view.steps) if by_step else budget
+        return collect(
+            self._world,
+            Design() if source == "see" else Design("half", self._causes, self._values()),
+            episodes,
+            seed=seed,
+            steps=self._view.steps,
+            policy=self._view.policy,
+            nature=self._nature,
+            causes=self._causes,
+            outcomes=self._outcomes,
+            every_step=by_step,
+            **options,
+        )
+
+    def _values(self) -> Mapping[str, Any]:
+        return dict.fromkeys(self._causes, "A")
+
+    def test(self, seed: int) -> Dataset | None:
+        """There are none: the effects of single values of a world are not linear."""
+        return None
+
+    def apparatus(self, seed: int) -> Apparatus:
+        """Do paired experiments, without noise of the sensors, in turn under three circumstances.
+
+        These are the policy of the view, a finger that pushes across, and blocks that are thrown
+        at the wall.
+        """
+        if self._view.view == "step":
+            return Steps(self._world, seed)
+        nature = {n: act for n, act in self._nature.items() if n != "sensor_noise"}
+        thrown = {f"{block}.linear_velocity": THROWN for block in self._started()}
+        length = self._view.steps
+        settings = (
+            Setting(self._view.policy, nature, length, seed),
+            Setting("across", nature, length, seed),
+            Setting(None, {**nature, **thrown}, length, seed),
+        )
+        return Outcomes(self._world, self._causes, self._outcomes, settings)
+
+    def _started(self) -> tuple[str, ...]:
+        return tuple(n.removesuffix(START) for n in self._causes if n.endswith(START))
+
+    def close(self) -> None:
+        """Give the engine back."""
+        self._world.close()
+
+
+def _sector(space: Any, number: int, count: int) -> Draw:
+    """Draw one of several blocks from its part of the floor, as high as its space says."""
+    inner, outer = (0.0, 0.06) if count == 1 else (0.065, 0.085)
+    wide = 2.0 * math.pi / count
+    low = -math.pi + number * wide
+    high = low + (wide if count == 1 else 0.2 * wide)
+    return Draw(Box((inner, low, space.low[2]), (outer, high, space.high[2])))
+
+
+def subject(name: str, *, seed: int = 0, view: TaskView | None = None) -> Subject:
+    """Find what learners are examined on.
+
+    Args:
+        name: A family with a size (``"er2:20"``), a task, or a JSON file of a model.
+        seed: Which model of the family.
+        view: How a task is looked at.
+
+    Raises:
+        UnknownOption: There is nothing of this name.
+        UnreadableFile: The file holds no model.
+    """
+    if is_family(name):
+        return ModelSubject(name, model(name, seed))
+    if name in TASKS:
+        return TaskSubject(name, view or TaskView())
+    path = Path(name)
+    if path.suffix == ".json":
+        return ModelSubject(path.stem, _read(path))
+    raise UnknownOption("subject", name, (*TASKS, "er2:N", "sf2:N", "tanh4:N", "FILE.json"))
+
+
+def _read(path: Path) -> SCM:
+    try:
+        return from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        advice = "give a file that scm_world.graph.to_json wrote"
+        raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from None
+
+
+__all__ = ["VIEWS", "ModelSubject", "Subject", "TaskSubject", "TaskView", "subject"]
