@@ -185,13 +185,15 @@ def test_a_wall_is_missed_by_who_runs_into_it() -> None:
     assert ("obstacle", "tool_block") in pairs(local_edges(episode))
 
 
-def test_draws_for_others_stay() -> None:
-    """Where something is drawn for the others, it has the same value without the body."""
-    episode = world_of("mujoco").rollout(None, seed=3, steps=2, do=DRAWN)
+@pytest.mark.parametrize("seed", [3, 10])
+def test_draws_for_others_stay(seed: int) -> None:
+    """They keep their values bit for bit, though a first draw that met the body was refused."""
+    drawn = {**DRAWN, f"{TWO}.euler_orientation": "A", f"{TWO}.mass": "B"}
+    episode = world_of("mujoco").rollout(None, seed=seed, steps=2, do=drawn)
     other = without(episode, ONE)
-    np.testing.assert_array_equal(
-        other[f"{TWO}.cartesian_position"][0], episode[f"{TWO}.cartesian_position"][0]
-    )
+    for name in ("cartesian_position", "orientation", "mass"):
+        values = (one[f"{TWO}.{name}"][0] for one in (other, episode))
+        np.testing.assert_array_equal(*values)
     assert bodies_of(other) == (*FINGERS, TWO)
 
 
@@ -227,5 +229,9 @@ def test_what_has_no_bodies_is_refused() -> None:
     for wrong in ("pushing", [], [1]):
         with pytest.raises(ModelError, match="World or of episodes"):
             local_edges(wrong)  # type: ignore[arg-type] # on purpose
+    with pytest.raises(ModelError, match="policy: for a World"):
+        local_edges(world_of("mujoco").rollout(None, steps=1), policy=None)
+    with pytest.raises(UnknownOption, match="steps"):
+        learn_local(world_of("mujoco"), steps=0)
     with pytest.raises(UnknownOption, match="rule"):
         local_edges(world_of("mujoco"), steps=1, rule="touching")

@@ -30,40 +30,42 @@ Given = World | Episode | Sequence[Episode]
 """Episodes, or a world to live them in."""
 
 
-def lived(
-    given: Given,
+def lived(given: Given, **setting: Any) -> tuple[Episode, ...]:
+    """Give the episodes, or let them happen on twins of a world.
+
+    Args:
+        given: A world, an episode or several.
+        setting: Of a world only: ``policy`` (``"random"``) and ``do`` as in ``World.rollout``,
+            ``steps`` of each episode (``STEPS``), ``episodes`` (1) and ``seed`` (0). Without
+            anything drawn in ``do``, a world begins every episode alike.
+
+    Raises:
+        ModelError: It is none of these, or there is a setting for episodes that have happened.
+    """
+    if isinstance(given, World):
+        return _happening(given, **setting)
+    found = (given,) if isinstance(given, Episode) else given
+    is_list = isinstance(found, Sequence) and len(found) > 0
+    if not is_list or not all(isinstance(one, Episode) for one in found):
+        raise ModelError([f"bodies are those of a scm_world.World or of episodes, got {given!r}"])
+    if setting:
+        raise ModelError([f"{', '.join(setting)}: for a World; these episodes have happened"])
+    return tuple(found)
+
+
+def _happening(
+    world: World,
     *,
     policy: Any = "random",
-    steps: int | None = None,
+    steps: int = STEPS,
     seed: int = 0,
     episodes: int = 1,
     do: Mapping[str, Any] | None = None,
 ) -> tuple[Episode, ...]:
-    """Give the episodes, or let them happen on twins of a world.
-
-    Args:
-        given: Episodes are taken as they are: the other arguments are for a world.
-        policy: As in ``World.rollout``.
-        steps: Control steps of each episode; ``STEPS`` if None.
-        seed: Of the noise.
-        episodes: How many.
-        do: What is done in each, such as ``{"tool_block.cartesian_position": "A"}``: without
-            anything drawn, a world begins every episode alike.
-
-    Raises:
-        ModelError: It is neither; or there is no episode.
-    """
-    if isinstance(given, World):
-        return tuple(
-            given.rollout(policy, seed=seed, episode=number, steps=steps or STEPS, do=do)
-            for number in range(whole_number("episodes", episodes, least=1))
-        )
-    found = (given,) if isinstance(given, Episode) else given
-    if not isinstance(found, Sequence) or not found:
-        raise ModelError([f"bodies are those of a World or of episodes, got {given!r}"])
-    if not all(isinstance(one, Episode) for one in found):
-        raise ModelError([f"bodies are those of a World or of episodes, got {given!r}"])
-    return tuple(found)
+    return tuple(
+        world.rollout(policy, seed=seed, episode=number, steps=steps, do=do)
+        for number in range(whole_number("episodes", episodes, least=1))
+    )
 
 
 def bodies_of(*episodes: Episode) -> tuple[str, ...]:
@@ -206,5 +208,17 @@ def learn_local(
         settings: See ``local_edges``.
     """
     if isinstance(given, World):
-        settings |= {"seed": seed, "steps": steps, "episodes": max(1, budget // steps)}
+        settings |= {"seed": seed, "steps": steps, "episodes": affordable(budget, steps)}
     return local_edges(given, **settings)
+
+
+def affordable(budget: int, steps: int, worlds: int = 1) -> int:
+    """Say how many episodes there can be: at least one.
+
+    Args:
+        budget: Control steps.
+        steps: Of an episode.
+        worlds: How often each is lived.
+    """
+    each = whole_number("steps", steps, least=1) * worlds
+    return max(1, whole_number("budget", budget, least=1) // each)

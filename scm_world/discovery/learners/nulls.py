@@ -18,6 +18,7 @@ from scm_world.discovery.learners.bodies import (
     BUDGET,
     STEPS,
     Given,
+    affordable,
     bodies_of,
     lived,
     matrix_of,
@@ -30,8 +31,9 @@ from scm_world.scene import PhysicalState, trifinger
 from scm_world.scene.kinematics import forward
 from scm_world.scene.state import BLOCK_SIZE
 from scm_world.variables import Draw, Hard, Null
+from scm_world.world.declaration import Declaration
 
-THRESHOLD = 1e-8  # [m], [rad], [m/s] or [rad/s]; contacts make more of rounding than in one step
+THRESHOLD = 1e-9  # [m], [rad], [m/s] or [rad/s]; over many steps contacts amplify rounding
 
 
 @final
@@ -104,15 +106,25 @@ def without(episode: Episode, body: str) -> Episode:
 
 
 def _plan_without(episode: Episode, start: int, plan: Plan, body: str) -> Plan:
-    audit = episode.audits.get(start)
-    done = {one.variable: one.applied for one in audit.targets.values()} if audit else {}
     kept: dict[str, Any] = {}
     for name in plan:
-        if name != body and not name.startswith(f"{body}."):
-            value, act = done.get(name), plan[name][0]
-            is_drawn = len(plan[name]) == 1 and isinstance(act, Draw) and value is not None
-            kept[name] = Hard(value) if is_drawn else plan[name]
+        if name == body or name.startswith(f"{body}."):
+            continue
+        target = _drawn(episode, start, plan, name)
+        if target is None:
+            kept[name] = plan[name]
+        else:
+            kept[target] = Hard(episode[target][start])
     return Plan(kept)
+
+
+def _drawn(episode: Episode, start: int, plan: Plan, name: str) -> str | None:
+    """Name the quantity that was drawn; in other coordinates it would be rounded once more."""
+    audit = episode.audits.get(start)
+    applied = {one.variable: one.applied for one in audit.targets.values()} if audit else {}
+    if applied.get(name) is None or not isinstance(plan[name][0], Draw) or len(plan[name]) > 1:
+        return None  # actions are drawn at every step, with noise of their own
+    return _declaration_at(episode, start).model.target(name)
 
 
 def null_effects(episode: Episode, *, threshold: float = THRESHOLD) -> NullReport:
@@ -121,8 +133,7 @@ def null_effects(episode: Episode, *, threshold: float = THRESHOLD) -> NullRepor
     Args:
         episode: It is left as it is.
         threshold: That the difference of an effect exceeds, in any number of the state; ten times
-            the floor if that is more. The default is for about 60 control steps: in longer
-            episodes with many contacts rounding may grow beyond it, see ``docs/body_graphs.md``.
+            the floor if that is more. The default is measured: see ``docs/body_graphs.md``.
 
     Raises:
         ModelError: There is no block and no obstacle.
@@ -174,6 +185,11 @@ def _differences(one: Episode, other: Episode) -> dict[str, _Apart]:
     return found
 
 
+def _declaration_at(episode: Episode, step: int) -> Declaration:
+    declared = reversed(episode.trace.declarations)
+    return next(one for start, one in declared if start <= step)
+
+
 def _apart(mine: Floats, its: Floats) -> tuple[float, float]:
     """Say how far two states of a body are apart: the largest of all numbers, and the place."""
     gap = np.abs(mine - its)
@@ -184,8 +200,7 @@ def _apart(mine: Floats, its: Floats) -> tuple[float, float]:
 
 def _bodies_at(episode: Episode, step: int) -> dict[str, Floats]:
     """Give the state of each body at an instant; the first three numbers are its place [m]."""
-    declared = episode.trace.declarations
-    declaration = next(one for start, one in reversed(declared) if start <= step)
+    declaration = _declaration_at(episode, step)
     state = PhysicalState(declaration.n_blocks, episode.trace.vectors[step])
     tips = forward(state.joint_positions, trifinger.NOMINAL_HEIGHT)
     of_robot = (tips, state.joint_positions, state.joint_velocities)
@@ -256,12 +271,8 @@ def learn_null(
         settings: See ``null_edges``.
     """
     if isinstance(given, World):
-        first = lived(given, **_lifetime(settings), seed=seed, steps=1)
+        first = lived(given, policy=None, do=settings.get("do"), seed=seed, steps=1)
         worlds = 2 + len(set(bodies_of(*first)) - set(FINGERS))
-        count = max(1, budget // (steps * worlds))
+        count = affordable(budget, steps, worlds)
         settings |= {"seed": seed, "steps": steps, "episodes": count}
     return null_edges(given, **settings)
-
-
-def _lifetime(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name in ("policy", "do")}

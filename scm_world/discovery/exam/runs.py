@@ -1,0 +1,322 @@
+"""One run of an exam: a learner, a subject, a budget, a seed; in a process of its own."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from scm_world.discovery.data import Dataset
+from scm_world.discovery.exam.results import Cell, Truth
+from scm_world.discovery.exam.subjects import Subject, TaskView, subject
+from scm_world.discovery.learners.found import Found
+from scm_world.discovery.learners.registry import Learner, learn, learner
+from scm_world.discovery.metrics import effect_rmse, evaluate
+from scm_world.errors import EngineFailure, MissingExtra, ScmWorldError, UnknownOption
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+"""One thread each: seconds are those of one core, and sums do not depend on the machine."""
+
+
+@final
+@dataclass(frozen=True)
+class Job:
+    """What to run.
+
+    Attributes:
+        subject: Name of the subject, as ``subject`` takes it.
+        learner: Name of the learner.
+        data: ``"see"``, ``"do"`` or ``"paired"``.
+        budget: Of the learner.
+        most: Largest budget of the exam: so much is collected.
+        seed: Of the model (of a family), the data and the learner.
+        standardised: Whether columns are standardised.
+        view: How a task is looked at.
+        folder: Where collected data are kept; nowhere if None.
+    """
+
+    subject: str
+    learner: str
+    data: str
+    budget: int
+    most: int
+    seed: int
+    standardised: bool = False
+    view: TaskView = field(default_factory=TaskView)
+    folder: Path | None = None
+
+    def cell(self, **what: Any) -> Cell:
+        """Write down how it ended."""
+        return Cell(
+            subject=self.truth_name,
+            learner=self.learner,
+            data=self.data,
+            budget=self.budget,
+            seed=self.seed,
+            standardised=self.standardised,
+            **what,
+        )
+
+    @property
+    def truth_name(self) -> str:
+        """Name of the subject as it is shown."""
+        return shown_name(self.subject, self.view)
+
+
+def shown_name(name: str, view: TaskView) -> str:
+    """Name a subject as it is shown.
+
+    Example:
+        >>> shown_name("pushing", TaskView("step")), shown_name("er2:20", TaskView())
+        ('pushing/step', 'er2:20')
+    """
+    from scm_world.tasks import TASKS
+
+    if name in TASKS:
+        return f"{name}/step" if view.view == "step" else name
+    return Path(name).stem if name.endswith(".json") else name
+
+
+def source_for(chosen: Learner, wanted: str | None) -> str:
+    """Say which data a learner is given.
+
+    Args:
+        chosen: The learner.
+        wanted: The kind of data; the richest one that it takes if None.
+
+    Raises:
+        UnknownOption: It cannot use this kind.
+    """
+    if wanted is None:
+        return chosen.takes[-1]
+    fits = wanted in chosen.takes or (wanted == "do" and "see" in chosen.takes)
+    if not fits:
+        raise UnknownOption(f"data for {chosen.name}", wanted, chosen.takes)
+    return wanted
+
+
+# --- the work itself ----------------------------------------------------------------------------
+
+
+@final
+class Bench:
+    """Runs jobs one after another, and keeps the last subject and its data for the next one."""
+
+    def __init__(self) -> None:
+        self._key: tuple[Any, ...] = ()
+        self._subject: Subject | None = None
+        self._data: dict[str, Dataset] = {}
+        self._test: list[Dataset | None] = []
+
+    def truth(self, job: Job) -> Truth:
+        """Give the graph of a job's subject, and collect its data."""
+        made = self._of(job)
+        if job.data != "paired":
+            self._rows(job, made)
+        return made.truth
+
+    def run(self, job: Job) -> Cell:
+        """Run a job; what goes wrong in a learner is written down in the cell."""
+        made = self._of(job)
+        chosen = learner(job.learner)
+        started = time.perf_counter()
+        try:
+            if job.data == "paired":
+                table, found = None, self._experimented(job, chosen, made)
+            else:
+                table = self._rows(job, made)
+                started = time.perf_counter()
+                found = learn(chosen, table, seed=job.seed)
+        except MissingExtra:
+            raise
+        except (ScmWorldError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+            seconds = time.perf_counter() - started
+            why = " ".join(str(error).split()) or type(error).__name__
+            return job.cell(status="failed", message=why, seconds=seconds)
+        own = made.truth.edges if job.seed else None
+        return job.cell(
+            found=found.restricted(made.truth.names),
+            scores=self._scores(job, made, found, table),
+            seconds=found.seconds,
+            experiments=found.experiments,
+            bound=found.bound,
+            declared=own if own != self._shown(job) else None,
+        )
+
+    def _of(self, job: Job) -> Subject:
+        key = (job.subject, job.seed, repr(job.view))
+        if self._subject is None or key != self._key:
+            if self._subject is not None:
+                self._subject.close()
+            self._subject = subject(job.subject, seed=job.seed, view=job.view)
+            self._key, self._data, self._test = key, {}, []
+        return self._subject
+
+    def _shown(self, job: Job) -> Any:
+        """Give the edges of the graph that stands for all seeds."""
+        if job.seed == 0:
+            return None
+        first = subject(job.subject, seed=0, view=job.view) if ":" in job.subject else self._subject
+        return None if first is None else first.truth.edges
+
+    def _rows(self, job: Job, made: Subject) -> Dataset:
+        if job.data not in self._data:
+            where = None if job.folder is None else job.folder / f"{job.data}-seed{job.seed}"
+            options: dict[str, Any] = {}
+            if where is not None and made.truth.about["kind"] != "model":
+                written = "parquet" if find_spec("pyarrow") else "csv"
+                options = {"out": where, "format": written}
+            self._data[job.data] = made.data(job.data, job.most, job.seed, **options)
+        whole = self._data[job.data]
+        each = len(whole) / len(np.unique(whole.episode))
+        part = whole.first(math.ceil(job.budget / each))
+        return part.standardised() if job.standardised else part
+
+    def _experimented(self, job: Job, chosen: Learner, made: Subject) -> Found:
+        settings: dict[str, Any] = {"budget": job.budget}
+        if "declared" in inspect.signature(chosen.learn).parameters:
+            settings["declared"] = made.truth.edges
+        found = learn(chosen, made.apparatus(job.seed), seed=job.seed, **settings)
+        return found.told(settings={"budget": job.budget})
+
+    def _scores(
+        self, job: Job, made: Subject, found: Found, table: Dataset | None
+    ) -> dict[str, float | int | None]:
+        truth = made.truth
+        compared = evaluate(found, truth.edges, names=truth.names, pairs=pairs_of(truth))
+        plain = {k: v for k, v in compared.as_dict().items() if isinstance(v, int | float | None)}
+        scores: dict[str, float | int | None] = {**plain, "sid": compared.sid}
+        if table is not None and not job.standardised:
+            scores["effect_rmse"] = self._predicted(job, made, found, table)
+        return scores
+
+    def _predicted(self, job: Job, made: Subject, found: Found, table: Dataset) -> float | None:
+        if not self._test:
+            self._test.append(made.test(job.seed))
+        test = self._test[0]
+        return None if test is None else effect_rmse(found, table, test).rmse
+
+
+def pairs_of(truth: Truth) -> np.ndarray[Any, Any]:
+    """Say which pairs are scored, shape (p, p)."""
+    at = {name: i for i, name in enumerate(truth.names)}
+    mask = np.ones((len(at), len(at)), bool)
+    for one, other in truth.left_out:
+        mask[at[one], at[other]] = mask[at[other], at[one]] = False
+    return mask
+
+
+# --- processes ----------------------------------------------------------------------------------
+
+
+def _serve(pipe: Connection) -> None:
+    """Run jobs until there are no more."""
+    bench = Bench()
+    while True:
+        try:
+            what, job = pipe.recv()
+        except (EOFError, KeyboardInterrupt):
+            return
+        try:
+            pipe.send(getattr(bench, what)(job))
+        except KeyboardInterrupt:
+            return
+        except Exception as error:  # told to the process that asked
+            pipe.send(error)
+
+
+@final
+class Runner:
+    """A process that runs jobs, and is replaced by another one if a job takes too long.
+
+    Args:
+        timeout: Of a job [s]; None for no limit.
+    """
+
+    def __init__(self, timeout: float | None = None) -> None:
+        self._timeout = timeout
+        self._process: Any = None
+        self._pipe: Any = None
+
+    def run(self, job: Job) -> Cell:
+        """Run a job.
+
+        Raises:
+            ScmWorldError: The subject cannot be made, or the learner is not installed.
+        """
+        answer = self._ask("run", job, self._timeout)
+        if answer is None:
+            said = f"stopped after {self._timeout:g} s"
+            return job.cell(status="timeout", message=said, seconds=float(self._timeout or 0.0))
+        cell: Cell = answer
+        return cell
+
+    def truth(self, job: Job) -> Truth:
+        """Give the graph of a job's subject, and collect its data, however long that takes.
+
+        Raises:
+            ScmWorldError: The subject cannot be made, or its data cannot be collected or written.
+        """
+        truth: Truth = self._ask("truth", job, None)
+        return truth
+
+    def _ask(self, what: str, job: Job, timeout: float | None) -> Any:
+        """Ask the process for something; None if that took too long."""
+        if self._process is None:
+            self._start()
+        self._pipe.send((what, job))
+        if not self._pipe.poll(timeout):
+            self.stop()
+            return None
+        try:
+            answer = self._pipe.recv()
+        except EOFError:
+            self.stop()
+            raise EngineFailure(
+                f"the process that ran {job.learner} on {job.subject} died"
+            ) from None
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        with _single_threaded():
+            self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            self._process.start()
+        theirs.close()
+
+    def stop(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._pipe.close()
+            self._process = self._pipe = None
+
+
+@contextmanager
+def _single_threaded() -> Iterator[None]:
+    """Start processes whose libraries use one thread."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
