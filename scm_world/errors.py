@@ -25,6 +25,7 @@ allowed and what to do::
     │   └── EngineFailure        it produced a state that is not finite
     ├── SnapshotMismatch         a snapshot of another scene
     ├── UnreadableFile           a file that is not what it should be
+    ├── UnwritableFolder         a folder without room or permission
     ├── Forbidden                a question that a laboratory does not allow
     ├── BudgetExhausted          an experiment that costs more than is left
     └── MissingExtra             an optional package that is not installed
@@ -356,6 +357,17 @@ class UnreadableFile(ScmWorldError, ValueError):
         super().__init__(f"{path!r} cannot be read: {reason}; {advice}")
 
 
+class UnwritableFolder(ScmWorldError, OSError):
+    """A folder (``path``) that cannot be written to, or not any more (``reason``)."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        self.path, self.reason = path, reason
+        super().__init__(
+            f"{path!r} cannot be written to: {reason}; what is in it already is complete, and the "
+            "same call goes on there once there is room, or the permission"
+        )
+
+
 class Forbidden(ScmWorldError, RuntimeError):
     """A question that a laboratory does not allow; ``allowed`` says what it does."""
 
@@ -414,6 +426,7 @@ __all__ = [
     "UnknownOption",
     "UnknownVariable",
     "UnreadableFile",
+    "UnwritableFolder",
     "WrongShape",
     "WrongType",
     "nearest",

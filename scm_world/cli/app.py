@@ -112,7 +112,14 @@ def root(
 
 @app.command()
 def discover(
-    task: Task,
+    task: Annotated[
+        str,
+        typer.Argument(
+            metavar="SUBJECT",
+            help="A task; with --learner also a family with a size (er2:20, sf2:50, tanh4:100), "
+            "the JSON file of a model, or several with commas between them.",
+        ),
+    ],
     backend: Backend = "mujoco",
     probes: Annotated[int, typer.Option(min=1, help="How many states to experiment in.")] = 32,
     seed: Seed = 0,
@@ -120,81 +127,54 @@ def discover(
     out: Out = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if the SHD is not 0.")] = False,
     option: Arguments = None,
-) -> None:
-    """Recover the causal graph of a task by experiments, and score it.
-
-    Ctrl-C gives the result so far (exit code 130).
-    """
-    from scm_world.cli.discovery import Options, run
-
-    options = Options(task, backend, preset, probes, seed, tuple(option or ()))
-    raise typer.Exit(run(options, out=out, strict=strict))
-
-
-@app.command()
-def collect(
-    task: Task,
-    design: Annotated[
-        str, typer.Option(help="What is done: see, single, all or half of the targets at once.")
-    ] = "single",
-    n: Annotated[int, typer.Option("-n", "--n", min=1, help="How many episodes.")] = 1000,
-    target: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATTERN", help="What is intervened on, such as '*.mass'."),
+    learner: Annotated[
+        str | None,
+        typer.Option(help="Examine these, with commas between them; see 'scm-world list'."),
     ] = None,
+    data: Annotated[
+        str | None,
+        typer.Option(help="see, do, paired, with commas; what each can use best by default."),
+    ] = None,
+    budget: Annotated[
+        str,
+        typer.Option(help="Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c."),
+    ] = "1000",
+    seeds: Annotated[int, typer.Option(min=1, help="How many, from 0 on.")] = 3,
+    view: Annotated[
+        str, typer.Option(help="Of a task: outcome (of episodes) or step (control steps).")
+    ] = "outcome",
     cause: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATTERN", help="Parameters that are written down."),
+        list[str] | None, typer.Option(help="Pattern of what varies; repeat it for more.")
     ] = None,
     outcome: Annotated[
-        list[str] | None,
-        typer.Option(metavar="[HOW:]NAME", help="What is measured, such as sum:reward."),
+        list[str] | None, typer.Option(help="Variable that is measured; repeat it for more.")
     ] = None,
-    values: Annotated[str, typer.Option(help="Where values are drawn: A, B or 'A|B'.")] = "A",
-    seen: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Share of episodes in which nothing is done.")
-    ] = 0.3,
-    nature: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="What varies by itself, such as NAME=draw:A."),
-    ] = None,
-    every_step: Annotated[
-        bool, typer.Option("--every-step", help="A row for each control step.")
-    ] = False,
+    policy: Policy = "sweep",
     steps: Steps = 25,
-    policy: Policy = "random",
-    backend: Backend = "mujoco",
-    seed: Seed = 0,
-    preset: Preset = "fast",
-    shard: Annotated[int, typer.Option(min=1, help="Episodes in one file.")] = 100,
-    format_: Annotated[str, typer.Option("--format", help="parquet or csv.")] = "parquet",
-    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
-    out: Out = None,
-    option: Arguments = None,
+    sensor_noise: Annotated[
+        float, typer.Option(min=0.0, help="Standard deviation, in halves of a range.")
+    ] = 0.005,
+    timeout: Annotated[float, typer.Option(min=0.0, help="Of a run [s]; 0 for no limit.")] = 300.0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that run learners.")] = 1,
 ) -> None:
-    """Collect a dataset from interventions, in a folder.
+    """Recover a causal graph by experiments, and score it; or examine learners.
 
-    Ctrl-C keeps what is complete (exit code 130); the same command goes on.
+    Without --learner the one-step graph of a task is recovered by paired experiments. With it,
+    learners are run over budgets and seeds, and a table, a picture and a report are written; the
+    same command goes on after an interruption. Ctrl-C gives the result so far (exit code 130).
     """
-    from scm_world.cli.collection import Options, run
-    from scm_world.cli.questions import Circumstances
+    if learner is None:
+        from scm_world.cli.discovery import Options, run
 
-    options = Options(
-        Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ())),
-        n,
-        design,
-        targets=tuple(target or ()),
-        causes=tuple(cause or ()),
-        outcomes=tuple(outcome or ()),
-        values=values,
-        seen=seen,
-        nature=tuple(nature or ()),
-        every_step=every_step,
-        shard=shard,
-        files=format_,
-        workers=workers,
+        options = Options(task, backend, preset, probes, seed, tuple(option or ()))
+        raise typer.Exit(run(options, out=out, strict=strict))
+    from scm_world.cli import exam
+
+    chosen = exam.view(view, cause, outcome, policy, steps, sensor_noise, backend, preset)
+    sitting = exam.Options(
+        task, learner, data, budget, seeds, chosen, timeout, workers, tuple(option or ())
     )
-    raise typer.Exit(run(options, out=out))
+    raise typer.Exit(exam.run(sitting, out=out))
 
 
 @app.command()

@@ -11,8 +11,7 @@ import numpy as np
 
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import console, table, written
-from scm_world.cli.questions import Circumstances, read_outcome
-from scm_world.cli.questions import _episodes as shown_episodes
+from scm_world.cli.questions import Circumstances, read_outcome, shown_episodes
 from scm_world.discovery.data import Dataset, Design, collect, default_causes
 from scm_world.discovery.data.folders import SIDECAR
 from scm_world.discovery.data.recorded import settable

@@ -6,6 +6,8 @@ from rich.text import Text
 
 from scm_world.backends import BACKENDS, make_backend
 from scm_world.cli.console import console, table
+from scm_world.discovery.exam.families import FAMILIES
+from scm_world.discovery.learners import Learner, learners
 from scm_world.entities import ACTIONS
 from scm_world.env import IDS
 from scm_world.errors import EngineError
@@ -29,6 +31,12 @@ def _engine(name: str) -> Text:
         backend.close()
 
 
+def _learner(chosen: Learner) -> Text:
+    """Say what a learner does, what it takes, and whether it is there."""
+    missing = "" if chosen.is_installed else f"; needs the extra {chosen.extra!r}"
+    return Text(f"{chosen.doc} ({', '.join(chosen.takes)}{missing})")
+
+
 def run() -> None:
     """List what can be chosen."""
     made = table("", "name", "")
@@ -39,6 +47,8 @@ def run() -> None:
         "presets": {p.name: f"physics steps of {1000 * p.timestep:g} ms" for p in PRESETS.values()},
         "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},
         "conventions": dict.fromkeys(CONVENTIONS, ""),
+        "learners": {name: _learner(chosen) for name, chosen in learners().items()},
+        "families": {f"{family.name}:N": family.doc for family in FAMILIES.values()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }
     for title, rows in sections.items():

@@ -104,7 +104,7 @@ def ask_effect(
     do, other, varies = (parse_assignments(texts) for texts in (assignments, versus, nature))
     world = where.world()
     try:
-        with _episodes() as progress:
+        with shown_episodes() as progress:
             effect = world.effect(
                 outcome,
                 do=do,
@@ -141,7 +141,7 @@ def _effect_table(effect: Effect, title: str) -> Any:
 
 
 @contextmanager
-def _episodes() -> Iterator[Callable[[int, int], None]]:
+def shown_episodes() -> Iterator[Callable[[int, int], None]]:
     """Show how far it is: a bar on a terminal, nothing elsewhere."""
     terminal = console(stderr=True)
     if not terminal.is_terminal:

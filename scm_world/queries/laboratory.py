@@ -89,7 +89,7 @@ class Laboratory:
         self.budget = None if budget is None else whole_number("budget", budget, least=0)
         self.outcomes = self._reported(outcomes)
         self._lock = threading.Lock()
-        self._journal = Journal(log, self._terms(), trusted)
+        self._journal = Journal(log, self.terms(), trusted)
 
     def _reported(self, outcomes: Iterable[Any] | None) -> tuple[Outcome, ...]:
         wanted = self.visible if outcomes is None else tuple(outcomes)
@@ -99,7 +99,7 @@ class Laboratory:
                 raise Forbidden(f"see {outcome.name}", self.visible)
         return found
 
-    def _terms(self) -> dict[str, Any]:
+    def terms(self) -> dict[str, Any]:
         """Say what has to be the same for a log to be gone on with."""
         setting = self._setting
         given = self._world.task.given

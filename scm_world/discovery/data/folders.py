@@ -15,7 +15,7 @@ from typing import Any, final
 from scm_world.discovery.data.dataset import Column
 from scm_world.discovery.data.shards import Place, check_kind, check_names, decoded, encoded
 from scm_world.discovery.data.sources import FORMAT, Part
-from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile, UnwritableFolder
 from scm_world.graph.structure import Edge
 from scm_world.world.start import whole_number
 
@@ -24,17 +24,6 @@ SHARD = 100
 """Episodes in a file by default."""
 
 _PARTIAL = ".part"
-
-
-class UnwritableFolder(ScmWorldError, OSError):
-    """A folder (``path``) that cannot be written to, or not any more (``reason``)."""
-
-    def __init__(self, path: str, reason: str) -> None:
-        self.path, self.reason = path, reason
-        super().__init__(
-            f"{path!r} cannot be written to: {reason}; what is in it already is complete, and the "
-            "same call goes on there once there is room, or the permission"
-        )
 
 
 @final

@@ -42,12 +42,13 @@ class Experiments:
         if left is not None and n > left:
             raise BudgetExhausted(n, left)
         self._laboratory, self._design, self._seed = laboratory, design, seed
-        self._model = laboratory._world.model  # for units and shapes only
+        # For units and shapes only; it is private, since it would show the graph.
+        self._model = laboratory._world.model
         declared = self._model.declared
         self.columns: tuple[Column, ...] = tuple(
             c for o in laboratory.outcomes for c in columns_of_outcome(declared(o.name), o)
         )
-        terms = laboratory._terms()
+        terms = laboratory.terms()
         self.about: dict[str, Any] = {
             "format": FORMAT,
             "system": "laboratory",

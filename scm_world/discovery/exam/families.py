@@ -55,11 +55,21 @@ def model(name: str, seed: int = 0) -> SCM:
         >>> len(list(drawn)), len(drawn.edges) == len(model("er2:20", seed=0).edges)
         (20, True)
     """
+    check_family(name)
+    kind, _, size = name.partition(":")
+    return FAMILIES[kind].build(int(size), seed)
+
+
+def check_family(name: str) -> None:
+    """Refuse what is no family with a size.
+
+    Raises:
+        UnknownOption: There is no such family or size.
+    """
     kind, _, size = name.partition(":")
     if kind not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
         shown = tuple(f"{family}:N" for family in FAMILIES)
         raise UnknownOption("family of models", name, (*shown, f"with N from 2 to {MOST}"))
-    return FAMILIES[kind].build(int(size), seed)
 
 
 def is_family(name: str) -> bool:

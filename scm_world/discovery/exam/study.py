@@ -16,7 +16,7 @@ from scm_world.discovery.exam.html import write_report
 from scm_world.discovery.exam.pictures import draw_budget
 from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json, write_whole
 from scm_world.discovery.exam.runs import Job, Runner, shown_name, source_for
-from scm_world.discovery.exam.subjects import TaskView
+from scm_world.discovery.exam.subjects import TaskView, check_subject
 from scm_world.discovery.exam.tables import write_tables
 from scm_world.discovery.learners.registry import SOURCES, learner
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
@@ -64,6 +64,8 @@ class Study:
         for what in ("subjects", "learners", "budgets"):
             if not getattr(self, what):
                 raise UnknownOption(what, "none", ("one or more",))
+        for name in self.subjects:
+            check_subject(name)
         for budget in self.budgets:
             whole_number("budget", budget, least=1)
         whole_number("seeds", self.seeds, least=1)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, final
+from typing import Any, Protocol, final
+
+import networkx as nx
 
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_label, settable
-from scm_world.discovery.exam.families import DONE, is_family, model
+from scm_world.discovery.exam.families import DONE, FAMILIES, check_family, is_family, model
 from scm_world.discovery.exam.results import Truth
 from scm_world.discovery.learners.apparatus import Apparatus, Model
 from scm_world.discovery.learners.worlds import Outcomes, Steps
@@ -21,13 +23,13 @@ from scm_world.queries.identification import nature_graph
 from scm_world.queries.outcomes import as_outcome
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.tasks import TASKS, make_task
-from scm_world.variables import Box, Derived, Draw
+from scm_world.variables import Box, Derived, Draw, Exogenous
 
-View = Literal["outcome", "step"]
-VIEWS: tuple[View, ...] = ("outcome", "step")
+VIEWS = ("outcome", "step")
 FEW = 10  # control steps of an episode of a model through time
 SENSED = 0.005  # noise of the sensors, as a fraction of half a range
-START = ".cylindrical_position"
+START, HEIGHT = ".cartesian_position", ".cylindrical_position"
+HALF = 0.045  # [m] half the side of the square in which a block begins
 THROWN = (1.5, 1.8, 0.0)  # [m/s] between two fingers and to the wall
 MOST_STARTS = 3  # blocks that find room, each in a sector of its own
 
@@ -105,18 +107,18 @@ class TaskView:
             ``"step"``: one row per control step.
         causes: Patterns of what varies; the physical parameters if None, and in the view of
             outcomes where the blocks begin.
-        outcomes: Names of variables; the blocks' states, success, and by step the joints, if None.
-        policy: Who acts.
+        outcomes: Names of variables; the states of joints and blocks, and success, if None.
+        policy: Who acts, as ``rollout`` takes it.
         steps: Control steps of an episode.
         sensor_noise: Standard deviation, as a fraction of half the range of what is measured.
         options: Of the world: backend, preset.
         arguments: Of the task.
     """
 
-    view: View = "outcome"
+    view: str = "outcome"
     causes: tuple[str, ...] | None = None
     outcomes: tuple[str, ...] | None = None
-    policy: str = "sweep"
+    policy: str | None = "sweep"
     steps: int = STEPS
     sensor_noise: float = SENSED
     options: dict[str, Any] = field(default_factory=dict)
@@ -144,7 +146,7 @@ class TaskSubject:
         self._causes = self._chosen()
         given = view.outcomes
         by_step = view.view == "step"
-        found = default_outcomes(self._world, every_step=by_step) if given is None else given
+        found = default_outcomes(self._world, every_step=True) if given is None else given
         self._outcomes = tuple(map(as_outcome, found))
         self.truth = self._step_truth(task) if by_step else self._outcome_truth(task)
 
@@ -154,11 +156,7 @@ class TaskSubject:
         if self._view.causes is not None:
             return settable(world, self._view.causes)
         chosen = default_causes(world)
-        starts = tuple(
-            name
-            for name in settable(world, ("*",))
-            if name.endswith(START) and model.declared(model.target(name)).role == "state"
-        )
+        starts = tuple(name for name in settable(world, ("*",)) if self._is_start(name))
         if self._view.view == "step" or len(starts) > MOST_STARTS:
             starts = ()
         follow = tuple(
@@ -167,6 +165,7 @@ class TaskSubject:
             if isinstance(model.declared(name), Derived)
             and model.target(name) == name
             and model.declared(name).settable
+            and model.declared(name).space("A") is not None
             and any(parent.name in chosen for parent in model.declared(name).all_parents)
         )
         return (*chosen, *follow, *starts)
@@ -179,14 +178,13 @@ class TaskSubject:
         rejected: rejection would make everything that is drawn depend on everything else.
         """
         model = self._world.model
-        starts = [n for n in self._causes if n.endswith(START)]
+        starts = [n for n in self._causes if self._is_start(n)]
         drawn: dict[str, Any] = {
-            n: "A"
-            for n in self._causes
-            if not isinstance(model.declared(n), Derived) or model.target(n) != n
+            n: "A" for n in self._causes if isinstance(model.declared(n), Exogenous)
         }
         for number, name in enumerate(starts):
-            drawn[name] = _sector(model.declared(name).a, number, len(starts))
+            standing: Any = model.declared(name.removesuffix(START) + HEIGHT).a
+            drawn[name] = _place(standing.low[2], number, len(starts))
         noise = {"sensor_noise": self._view.sensor_noise} if self._view.sensor_noise else {}
         return {**drawn, **noise}
 
@@ -197,9 +195,7 @@ class TaskSubject:
         named = {n: f"{first_label(model, n)} {n}".strip() for n in self._causes}
         node = {f"{model.target(n)}@0" if first_label(model, n) else n: f for n, f in named.items()}
         node |= {outcome: outcome for outcome in outcomes}
-        edges = tuple(
-            (node[c], node[e], 0) for c, e in sorted(graph.edges) if c in node and e in node
-        )
+        edges = tuple((node[c], node[e], 0) for c, e in _projected(graph, node))
         ends = tuple(dict.fromkeys(outcomes))
         pairs = tuple((a, b) for i, a in enumerate(ends) for b in ends[i + 1 :])
         names = (*named.values(), *ends)
@@ -225,12 +221,12 @@ class TaskSubject:
         }
 
     def data(self, source: str, budget: int, seed: int, **options: Any) -> Dataset:
-        """Collect episodes; under ``"do"`` half of the causes are set in two of three."""
+        """Collect episodes; under ``"do"`` half of the causes are set in seven of ten, in A|B."""
         by_step = self._view.view == "step"
         episodes = -(-budget // self._view.steps) if by_step else budget
         return collect(
             self._world,
-            Design() if source == "see" else Design("half", self._causes, self._values()),
+            Design() if source == "see" else Design("half", self._causes, self._values),
             episodes,
             seed=seed,
             steps=self._view.steps,
@@ -242,8 +238,11 @@ class TaskSubject:
             **options,
         )
 
+    @property
     def _values(self) -> Mapping[str, Any]:
-        return dict.fromkeys(self._causes, "A")
+        nature, declared = self._nature, self._world.model.declared
+        wide = {n: "A|B" for n in self._causes if declared(n).space("B") is not None}
+        return {**{name: nature.get(name, "A") for name in self._causes}, **wide}
 
     def test(self, seed: int) -> Dataset | None:
         """There are none: the effects of single values of a world are not linear."""
@@ -268,20 +267,43 @@ class TaskSubject:
         return Outcomes(self._world, self._causes, self._outcomes, settings)
 
     def _started(self) -> tuple[str, ...]:
-        return tuple(n.removesuffix(START) for n in self._causes if n.endswith(START))
+        return tuple(n.removesuffix(START) for n in self._causes if self._is_start(n))
+
+    def _is_start(self, name: str) -> bool:
+        return name.endswith(START) and self._world.model.declared(name).role == "state"
 
     def close(self) -> None:
         """Give the engine back."""
         self._world.close()
 
 
-def _sector(space: Any, number: int, count: int) -> Draw:
-    """Draw one of several blocks from its part of the floor, as high as its space says."""
-    inner, outer = (0.0, 0.06) if count == 1 else (0.065, 0.085)
-    wide = 2.0 * math.pi / count
-    low = -math.pi + number * wide
-    high = low + (wide if count == 1 else 0.2 * wide)
-    return Draw(Box((inner, low, space.low[2]), (outer, high, space.high[2])))
+def _projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
+    """Leave out nodes that follow from others without noise: their causes act in their place."""
+    found = set()
+    for cause in kept:
+        ahead = [cause] if cause in graph else []
+        while ahead:
+            for effect in graph.successors(ahead.pop()):
+                if effect in kept:
+                    found.add((cause, effect))
+                else:
+                    ahead.append(effect)
+    return sorted(found)
+
+
+def _place(height: Any, number: int, count: int) -> Draw:
+    """Draw where one of several blocks begins: near the middle, at least as high as it has to be.
+
+    Args:
+        height: Of its center, as its space A says.
+        number: Of the block.
+        count: Of the blocks.
+    """
+    far = 0.0 if count == 1 else 0.075
+    angle = 2.0 * math.pi * number / count
+    x, y = far * math.cos(angle), far * math.sin(angle)
+    half = HALF if count == 1 else 0.2 * HALF
+    return Draw(Box((x - half, y - half, height), (x + half, y + half, height)))
 
 
 def subject(name: str, *, seed: int = 0, view: TaskView | None = None) -> Subject:
@@ -296,14 +318,28 @@ def subject(name: str, *, seed: int = 0, view: TaskView | None = None) -> Subjec
         UnknownOption: There is nothing of this name.
         UnreadableFile: The file holds no model.
     """
-    if is_family(name):
-        return ModelSubject(name, model(name, seed))
+    check_subject(name)
     if name in TASKS:
         return TaskSubject(name, view or TaskView())
-    path = Path(name)
-    if path.suffix == ".json":
-        return ModelSubject(path.stem, _read(path))
-    raise UnknownOption("subject", name, (*TASKS, "er2:N", "sf2:N", "tanh4:N", "FILE.json"))
+    if is_family(name):
+        return ModelSubject(name, model(name, seed))
+    return ModelSubject(Path(name).stem, _read(Path(name)))
+
+
+def check_subject(name: str) -> None:
+    """Refuse what is no subject, without making one.
+
+    Raises:
+        UnknownOption: There is nothing of this name.
+        UnreadableFile: The file holds no model.
+    """
+    if is_family(name):
+        check_family(name)
+    elif name.endswith(".json"):
+        _read(Path(name))
+    elif name not in TASKS:
+        families = (f"{family}:N" for family in FAMILIES)
+        raise UnknownOption("subject", name, (*TASKS, *families, "FILE.json"))
 
 
 def _read(path: Path) -> SCM:

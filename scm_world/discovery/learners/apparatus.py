@@ -12,6 +12,7 @@ from typing import Protocol, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
+from scm_world.errors import ModelError
 from scm_world.graph import SCM, Moment
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.models import paired_effects
@@ -85,9 +86,13 @@ class Model:
         seed: Of the units.
         lag: Whether what is moved is moved at the same instant (0) or one control step before (1);
             what the model has if None. 1 if it has both.
+
+    Raises:
+        ModelError: A variable cannot be set.
     """
 
     def __init__(self, model: SCM, seed: int = 0, *, lag: int | None = None) -> None:
+        _refuse([v.name for v in model.variables if not v.settable], "cannot be set")
         self._model, self._seed = model, seed
         lags = {edge.lag for edge in model.edges}
         self.lag = max(lags, default=0) if lag is None else lag
@@ -101,7 +106,13 @@ class Model:
         return paired_effects(self._model, probes=probes, seed=self._seed)
 
     def prepare(self, unit: int) -> None:
-        """Draw a unit: two instants of it."""
+        """Draw a unit: two instants of it.
+
+        Raises:
+            ModelError: A variable is a vector or not real, so that it cannot be moved a little.
+        """
+        still = [v.name for v in self._model.variables if v.shape or v.dtype != "real"]
+        _refuse(still, "is not one real number, so it cannot be moved a little")
         noise = Noise(self._seed)
         self._before = self._model.solve(moment=Moment(noise, unit, 0))
         self._moment = Moment(noise, unit, 1)
@@ -134,6 +145,11 @@ class Model:
             for name in self.watched
         )
         return np.array([float(value) for value in found])
+
+
+def _refuse(names: list[str], why: str) -> None:
+    if names:
+        raise ModelError([f"{name!r} {why}" for name in names])
 
 
 __all__ = ["SMALL", "Apparatus", "Model", "Movable"]

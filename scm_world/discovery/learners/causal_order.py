@@ -121,8 +121,6 @@ def _best_place(cost: _Cost, order: list[int], column: int) -> list[int]:
             at, gained = at + way, gained + gain
             if gained > most:
                 best, most = list(trial), gained
-            if gain < -GAIN:
-                break
     return best
 
 

@@ -14,6 +14,7 @@ from scm_world.discovery.learners.apparatus import SMALL, Apparatus, Movable
 from scm_world.discovery.learners.found import Found
 from scm_world.errors import ModelError
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.world.start import whole_number
 
 TOLERANCE = 1e-4  # of the answers: what a linear account may leave, since moves are small
 CONFIRMED = 3  # experiments in a row that have to come out as foretold
@@ -33,6 +34,7 @@ def paired(apparatus: Apparatus, *, seed: int = 0, budget: int = 1000) -> Found:
         threshold, in powers of ten.
     """
     del seed
+    whole_number("budget", budget, least=1)
     effects = apparatus.effects(budget)
     names = apparatus.names
     at = {name: i for i, name in enumerate(names)}
@@ -176,6 +178,8 @@ def verified(
     Returns:
         The edges that showed. An edge counts as seen where its effect answered to the color.
     """
+    whole_number("budget", budget, least=1)
+    whole_number("units", units, least=1)
     names, lag = apparatus.names, apparatus.lag
     rng = np.random.default_rng(seed)
     wanted = {(c, e) for c, e, at in declared if at == lag}

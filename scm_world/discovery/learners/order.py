@@ -5,7 +5,8 @@ it, over the rows in which it was not intervened on itself. A cause is kept if i
 than chance would; over all tests the share of false edges is bounded.
 
 Only what was intervened on somewhere can be found to be a cause: what was merely watched is an
-effect, never a cause. Earlier control steps are causes without that, because time has an order.
+effect, never a cause. Nor is it found to be a cause of what was set in all the same rows. Earlier
+control steps are causes without that, because time has an order.
 
 It assumes that effects add up (``features`` gives them curves) and that no unobserved variable acts
 on two of those that were intervened on. Scales do not matter: standardised data give the same.
@@ -65,7 +66,7 @@ def do_order(
     del seed
     if not 0.0 < q < 1.0:
         raise UnknownOption("q", q, ("a share between 0 and 1",))
-    if features not in POWERS:
+    if not isinstance(features, int) or features not in POWERS:
         raise UnknownOption("features", features, map(str, POWERS))
     rows = _rows(data, blocks)
     causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
@@ -80,12 +81,14 @@ def do_order(
     before = before_each(summed, causes)
     straight = features == 1 and not ranks and not spread
     p_values = _tested(summed if straight else rows, before, features, ranks, spread)
+    told = _told(rows)
+    p_values[~np.array([told[where].any(axis=0) for where in rows.blocks])] = 2.0
     tested = p_values <= 1.0
     chosen = np.zeros(p_values.shape, bool)
     chosen[tested] = discoveries(p_values[tested], q)
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = _columns(rows, chosen), _columns(rows, weight)
-    notes = _notes(data, rows, causes)
+    notes = _notes(data, rows, causes, told)
     settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}
     return Found.of(data.names, matrix, sureness=sure, settings=settings, notes=notes)
 
@@ -178,11 +181,32 @@ def _columns(rows: Rows, by_block: Any) -> Any:
     return made
 
 
-def _notes(data: Dataset, rows: Rows, causes: Bools) -> tuple[str, ...]:
+def _told(rows: Rows) -> Bools:
+    """Say where a column was set while another was free, shape (p, p).
+
+    Of two that were only ever set together, no row tells which one acts on the other.
+    """
+    told = (rows.targeted.T.astype(np.float64) @ ~rows.targeted) > 0.0
+    told[rows.past] = True
+    return np.asarray(told)
+
+
+def _notes(data: Dataset, rows: Rows, causes: Bools, told: Bools) -> tuple[str, ...]:
     found = []
     still = [name for name, lives in zip(data.names, rows.alive, strict=True) if not lives]
     if still:
         found.append(f"never varied, no edges: {', '.join(still)}")
+    chosen = np.flatnonzero(causes & ~rows.past)
+    block = np.zeros(len(causes))
+    for number, where in enumerate(rows.blocks):
+        block[where] = number
+    between = told[np.ix_(chosen, chosen)] | (block[chosen, None] == block[chosen])
+    if not between.all():
+        together = ", ".join(data.names[i] for i in chosen[~between.all(axis=0)])
+        found.append(f"always set where another one is, so some edges are not told: {together}")
+    few = int((rows.alive & ((~rows.targeted).sum(axis=0) <= causes.sum() + 1)).sum())
+    if few:
+        found.append(f"{few} columns have too few rows for {int(causes.sum())} possible causes")
     watched = int((rows.alive & ~causes & ~rows.past).sum())
     if watched:
         found.append(f"{watched} columns were never intervened on: they can be effects only")
