@@ -34,6 +34,7 @@ from scm_world.errors import (
     UnknownOption,
     UnknownVariable,
     UnreadableFile,
+    UnwritableFolder,
     WrongShape,
     WrongType,
     nearest,
@@ -136,6 +137,12 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         UnreadableFile("p.zip", "it is no zip archive", "give another one"),
         "'p.zip' cannot be read: it is no zip archive; give another one",
         {"path": "p.zip", "reason": "it is no zip archive"},
+    ),
+    (
+        UnwritableFolder("results", "No space left on device"),
+        "'results' cannot be written to: No space left on device; what is in it already is "
+        "complete, and the same call goes on there once there is room, or the permission",
+        {"path": "results", "reason": "No space left on device"},
     ),
     (
         MissingExtra("trimesh", "mesh"),

@@ -178,6 +178,72 @@ def discover(
 
 
 @app.command()
+def collect(
+    task: Task,
+    design: Annotated[
+        str, typer.Option(help="What is done: see, single, all or half of the targets at once.")
+    ] = "single",
+    n: Annotated[int, typer.Option("-n", "--n", min=1, help="How many episodes.")] = 1000,
+    target: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATTERN", help="What is intervened on, such as '*.mass'."),
+    ] = None,
+    cause: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATTERN", help="Parameters that are written down."),
+    ] = None,
+    outcome: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[HOW:]NAME", help="What is measured, such as sum:reward."),
+    ] = None,
+    values: Annotated[str, typer.Option(help="Where values are drawn: A, B or 'A|B'.")] = "A",
+    seen: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of episodes in which nothing is done.")
+    ] = 0.3,
+    nature: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="What varies by itself, such as NAME=draw:A."),
+    ] = None,
+    every_step: Annotated[
+        bool, typer.Option("--every-step", help="A row for each control step.")
+    ] = False,
+    steps: Steps = 25,
+    policy: Policy = "random",
+    backend: Backend = "mujoco",
+    seed: Seed = 0,
+    preset: Preset = "fast",
+    shard: Annotated[int, typer.Option(min=1, help="Episodes in one file.")] = 100,
+    format_: Annotated[str, typer.Option("--format", help="parquet or csv.")] = "parquet",
+    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
+    out: Out = None,
+    option: Arguments = None,
+) -> None:
+    """Collect a dataset from interventions, in a folder.
+
+    Ctrl-C keeps what is complete (exit code 130); the same command goes on.
+    """
+    from scm_world.cli.collection import Options, run
+    from scm_world.cli.questions import Circumstances
+
+    options = Options(
+        Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ())),
+        n,
+        design,
+        targets=tuple(target or ()),
+        causes=tuple(cause or ()),
+        outcomes=tuple(outcome or ()),
+        values=values,
+        seen=seen,
+        nature=tuple(nature or ()),
+        every_step=every_step,
+        shard=shard,
+        files=format_,
+        workers=workers,
+    )
+    raise typer.Exit(run(options, out=out))
+
+
+@app.command()
 def verify(
     task: Annotated[str, typer.Argument(help="Name of a task, or 'all'.")],
     backend: Backend = "mujoco",

@@ -4,7 +4,6 @@ from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
 from scm_world.discovery.data.files import load, save
-from scm_world.errors import UnwritableFolder
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sources import Part, Source
 from scm_world.discovery.data.views import (
@@ -16,6 +15,7 @@ from scm_world.discovery.data.views import (
     from_frame,
     from_tigramite,
 )
+from scm_world.errors import UnwritableFolder
 
 __all__ = [
     "DESIGNS",

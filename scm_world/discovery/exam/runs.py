@@ -283,9 +283,8 @@ class Runner:
             answer = self._pipe.recv()
         except EOFError:
             self.stop()
-            raise EngineFailure(
-                f"the process that ran {job.learner} on {job.subject} died"
-            ) from None
+            said = f"the process that ran {job.learner} on {job.subject} died"
+            raise EngineFailure(said, "process") from None
         if isinstance(answer, BaseException):
             raise answer
         return answer

@@ -174,6 +174,9 @@ class Found:
             names = tuple(map(str, data["names"]))
             edges = np.zeros((int(data["lags"]) + 1, len(names), len(names)), bool)
             sureness = np.zeros(edges.shape)
+            places = [*data["edges"], *(place[:3] for place in data["sureness"])]
+            if any(number < 0 for place in places for number in place):
+                raise ValueError("an edge has a negative number")
             for lag, i, j in data["edges"]:
                 edges[lag, i, j] = True
             for lag, i, j, size in data["sureness"]:

@@ -1,0 +1,244 @@
+"""What learners found as a value, the book of learners, and the statistics behind ours."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from scm_world.discovery.data import Dataset
+from scm_world.discovery.learners import Found, Learner, learn, learner, learners, register
+from scm_world.discovery.learners.statistics import (
+    chi_square_tail,
+    discoveries,
+    normal_scores,
+    regression_tail,
+)
+from scm_world.errors import MissingExtra, ModelError, UnknownOption
+
+NAMES = ("x", "y", "z")
+TABLE = Dataset.of(np.arange(12.0).reshape(4, 3), NAMES)
+Shares = st.lists(st.floats(0.0, 1.0), max_size=40).map(np.array)
+
+
+def chain() -> Found:
+    """Make a graph with an edge of each kind."""
+    edges = [("x", "y", 0), ("y", "z", 0), ("z", "y", 0), ("x", "x", 1)]
+    return Found.of_edges(NAMES, edges, learner="mine", notes=("a note",), experiments=7, bound=3)
+
+
+# --- graphs ---------------------------------------------------------------------------------------
+
+
+def test_directions_are_told_apart() -> None:
+    """Both ways within an instant is no direction; a loop through time is an edge."""
+    assert set(chain().directed) == {("x", "y", 0), ("x", "x", 1)}
+    assert chain().undirected == (("y", "z"),)
+
+
+def test_a_graph_comes_back_from_json() -> None:
+    """Everything that is said about it is written."""
+    there = json.loads(json.dumps(chain().as_dict()))
+    again = Found.from_dict(there)
+    assert again.as_dict() == chain().as_dict()
+    assert (again.directed, again.notes, again.bound) == (chain().directed, ("a note",), 3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format": "other"},
+        {"edges": [[0, 0, 9]]},
+        {"edges": [[0, 1]]},
+        {"lags": "many"},
+        {"names": ["x"]},
+        {"sureness": [[3, 0, 1, 0.5]]},
+    ],
+)
+def test_what_is_no_graph_is_not_read(change: dict[str, Any]) -> None:
+    """Another format, or an edge that leads nowhere, is refused."""
+    with pytest.raises(ModelError, match="not a graph that a learner found"):
+        Found.from_dict({**chain().as_dict(), **change})
+    with pytest.raises(ModelError, match="not a graph"):
+        Found.from_dict({})
+
+
+@pytest.mark.parametrize(
+    "change", [{"edges": [[-1, 0, 1]]}, {"edges": [[0, -2, 1]]}, {"sureness": [[0, 0, -1, 0.5]]}]
+)
+def test_negative_places_are_not_read(change: dict[str, Any]) -> None:
+    """An index from the end would be another edge than the one written."""
+    with pytest.raises(ModelError, match="not a graph"):
+        Found.from_dict({**chain().as_dict(), **change})
+
+
+def test_the_part_on_some_variables_keeps_its_edges() -> None:
+    """In the order asked for; a variable it lacks has no edges."""
+    part = chain().restricted(["z", "q", "x", "y"])
+    assert part.names == ("z", "q", "x", "y")
+    assert set(part.directed) == set(chain().directed)
+    assert set(map(frozenset, part.undirected)) == {frozenset("yz")}
+    assert set(chain().restricted(["x"]).directed) == {("x", "x", 1)}
+
+
+def test_matrices_of_another_shape_are_refused() -> None:
+    """The message has both shapes."""
+    with pytest.raises(ModelError, match=r"shape \(1, 2, 2\), not \(3, 3\)"):
+        Found.of(NAMES, np.zeros((2, 2)))
+    with pytest.raises(ModelError, match="of 3 variables"):
+        Found(NAMES, np.zeros((1, 2, 2), bool), np.zeros((1, 2, 2)))
+
+
+def test_chosen_lags_have_their_places() -> None:
+    """A matrix may speak of one lag only."""
+    found = Found.of(["x", "y"], [[[0, 1], [0, 0]]], lags=[2])
+    assert found.directed == (("x", "y", 2),)
+    assert found.edges.shape == (3, 2, 2)
+
+
+# --- the book -------------------------------------------------------------------------------------
+
+
+def test_ours_are_there() -> None:
+    """Every learner of ours is known by its name, and says what it does in one line."""
+    known = learners()
+    assert {"paired", "pooled", "coloring", "do_order", "do_order_ranks"} <= set(known)
+    assert all(one.doc and one.takes for one in known.values())
+
+
+@pytest.mark.parametrize(
+    "name", ["nobody", "no_module_here:f", "json:nothing", "json:__doc__", ":f"]
+)
+def test_unknown_learners_are_named(name: str) -> None:
+    """Not registered, no such module, no such attribute, no function."""
+    with pytest.raises(UnknownOption, match="no learner is named|learner cannot be"):
+        learner(name)
+
+
+def test_a_name_is_taken_once() -> None:
+    """The same learner may be registered again, another one may not."""
+    ours = learner("do_order")
+    assert register(ours) is ours
+    with pytest.raises(UnknownOption, match="a name that is not taken"):
+        register(replace(ours, learn=lambda data: data))
+
+
+def test_what_a_learner_needs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without its package it is not run."""
+    missing = Learner("far", lambda data, seed: None, package="no-such-package", extra="far")
+    with pytest.raises(MissingExtra, match=r"scm-world\[far\]"):
+        learn(missing, TABLE)
+
+
+def test_a_plain_matrix_is_a_graph() -> None:
+    """A function that gives a matrix is a learner; settings and time are noted."""
+    mine = Learner("mine", lambda data, seed, by: by * np.eye(3, k=1))
+    found = learn(mine, TABLE, seed=3, by=2)
+    assert found.directed == (("x", "y", 0), ("y", "z", 0))
+    assert (found.learner, found.settings, found.experiments) == ("mine", {"by": 2}, 4)
+    assert found.sureness[0, 0, 1] == 2.0
+    with pytest.raises(ModelError, match="has shape"):
+        learn(Learner("bad", lambda data, seed: np.zeros((2, 2))), TABLE)
+    with pytest.raises(ModelError, match="has to give a Found"):
+        learn(Learner("bad", lambda data, seed: np.zeros((2, 2))), object())
+
+
+def test_an_edge_into_the_past_is_turned() -> None:
+    """Earlier columns are causes: an edge from now to then is one from then to now."""
+    table = Dataset.of(
+        np.arange(8.0)[:, None], ["x"], episode=[0] * 4 + [1] * 4, step=[*range(4)] * 2
+    )
+    back = Learner("back", lambda data, seed: np.array([[0, 1], [0, 0]]))
+    assert learn(back, table).directed == (("x", "x", 1),)
+
+
+# --- statistics -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("m", range(1, 11))
+def test_the_tail_of_chi_square(m: int) -> None:
+    """It agrees with scipy from the middle far into the tail."""
+    stats = pytest.importorskip("scipy.stats")
+    for x in (1e-9, 0.1, 1.0, m, 10.0, 50.0, 300.0, 1200.0):
+        assert chi_square_tail(x, m) == pytest.approx(stats.chi2.sf(x, m), rel=1e-9, abs=1e-300)
+    assert chi_square_tail(0.0, m) == chi_square_tail(-1.0, m) == 1.0
+    assert chi_square_tail(1e6, m) == 0.0
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 6])
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0, 4.0])
+def test_the_tail_of_a_regression_is_nearly_that_of_f(m: int, ratio: float) -> None:
+    """With 100 rows it is within 3 % of the F test."""
+    stats = pytest.importorskip("scipy.stats")
+    free = 100.0
+    p = regression_tail(ratio * m, free, m, free)
+    assert p == pytest.approx(stats.f.sf(ratio, m, free), rel=0.03)
+
+
+def test_a_regression_without_rows_tells_nothing() -> None:
+    """No degrees of freedom, or nothing explained: no evidence. All explained: no doubt."""
+    assert regression_tail(1.0, 0.0, 1, 0.0) == 1.0
+    assert regression_tail(0.0, 1.0, 1, 10.0) == 1.0
+    assert regression_tail(1.0, 0.0, 1, 10.0) < 1e-100
+
+
+@given(p=Shares, q=st.floats(0.01, 0.9), dependent=st.booleans())
+def test_discoveries_are_the_smallest(p: NDArray[np.float64], q: float, dependent: bool) -> None:
+    """All rejected ones are below all others; at most q of p counts as found by chance."""
+    chosen = discoveries(p, q, dependent=dependent)
+    assert chosen.shape == p.shape
+    if chosen.any():
+        assert p[chosen].max() <= q
+        assert not chosen.all() or p.max() <= q
+        if not chosen.all():
+            assert p[chosen].max() < p[~chosen].min()
+    assert not (chosen & ~discoveries(p, min(1.5 * q, 1.0), dependent=dependent)).any()
+    assert not (discoveries(p, q) & ~discoveries(p, q, dependent=False)).any()
+    np.testing.assert_array_equal(discoveries(p[::-1], q, dependent=dependent), chosen[::-1])
+
+
+@given(p=Shares.filter(len), q=st.floats(0.01, 0.5))
+def test_discoveries_are_those_of_scipy(p: NDArray[np.float64], q: float) -> None:
+    """Adjusted probabilities up to q are those that are rejected."""
+    stats = pytest.importorskip("scipy.stats")
+    for dependent, method in ((True, "by"), (False, "bh")):
+        adjusted = stats.false_discovery_control(p, method=method)
+        clear = np.abs(adjusted - q) > 1e-9
+        chosen = discoveries(p, q, dependent=dependent)
+        np.testing.assert_array_equal(chosen[clear], (adjusted <= q)[clear])
+
+
+def test_the_share_of_false_discoveries_is_bounded() -> None:
+    """Of 50 true hypotheses beside 50 false ones, at most a tenth of what is rejected is true."""
+    rng = np.random.default_rng(0)
+    shares = []
+    for _ in range(200):
+        p = np.concatenate([rng.random(50), 1e-3 * rng.random(50)])
+        chosen = discoveries(p, 0.1, dependent=False)
+        shares.append(chosen[:50].sum() / max(chosen.sum(), 1))
+    assert 0.01 < np.mean(shares) <= 0.06  # half of the hypotheses are true: 0.05
+
+
+@given(st.lists(st.integers(-5, 5), min_size=1, max_size=60).map(np.array))
+def test_normal_scores_follow_the_order(values: NDArray[np.int64]) -> None:
+    """Equal numbers share a score, larger ones have a larger one, and signs turn around."""
+    scores = normal_scores(values.astype(float))
+    for i in range(len(values)):
+        np.testing.assert_array_equal(np.sign(scores - scores[i]), np.sign(values - values[i]))
+    np.testing.assert_allclose(normal_scores(-values.astype(float)), -scores, atol=1e-12)
+    assert np.isfinite(scores).all()
+
+
+def test_normal_scores_are_those_of_blom() -> None:
+    """Without ties they are the quantiles of (rank - 3/8) / (n + 1/4)."""
+    stats = pytest.importorskip("scipy.stats")
+    values = np.random.default_rng(0).permutation(101).astype(float) ** 3
+    expected = stats.norm.ppf((stats.rankdata(values) - 0.375) / 101.25)
+    np.testing.assert_allclose(normal_scores(values), expected, atol=1e-9)
+    assert normal_scores(np.full(4, 2.0)).tolist() == [0.0] * 4

@@ -1,0 +1,248 @@
+"""Learners that do paired experiments on models: one at a time, pooled, by color."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world._types import Floats
+from scm_world.discovery.exam.families import model
+from scm_world.discovery.learners import Found, learn
+from scm_world.discovery.learners.apparatus import Model
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.graph import SCM
+from scm_world.variables import Box, Derived, Exogenous, Function, Linear, Measured
+from scm_world.variables.distributions import Normal
+
+FAMILIES = ("er2:20", "sf2:20", "tanh4:20")
+Edges = set[tuple[str, str, int]]
+
+
+def true_edges(scm: SCM) -> Edges:
+    """List what the model declares."""
+    return {edge.key for edge in scm.edges}
+
+
+def wrong(found: Found, scm: SCM) -> int:
+    """Count missing and false edges."""
+    return len(set(found.directed) ^ true_edges(scm))
+
+
+class Counted:
+    """An apparatus that counts the lives of units by itself."""
+
+    def __init__(self, inner: Model) -> None:
+        self.inner, self.lives = inner, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+    def prepare(self, unit: int) -> None:
+        """Count one life."""
+        self.lives += 1
+        self.inner.prepare(unit)
+
+    def answers(self, moves: Mapping[str, float]) -> Floats:
+        """Count one life."""
+        self.lives += 1
+        return self.inner.answers(moves)
+
+
+def lines(**parents: dict[str, float]) -> SCM:
+    """Make a linear model of named variables with weights."""
+    return SCM(
+        Derived(
+            name=name,
+            parents=tuple(causes),
+            mechanism=Linear(weights=tuple(causes.values())),
+            noise=Normal(mean=0.0, std=1.0),
+        )
+        for name, causes in parents.items()
+    )
+
+
+def first_of(first: Any, second: Any) -> Any:
+    """Pass the first cause on."""
+    return first + 0.0 * second
+
+
+# --- exact ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_one_variable_at_a_time_finds_the_graph(family: str, seed: int) -> None:
+    """Four units are enough; what is spent is counted, and twice the budget changes nothing."""
+    scm = model(family, seed)
+    found = learn("paired", Model(scm, seed), budget=88)
+    assert wrong(found, scm) == 0
+    assert 66 <= found.experiments <= 88
+    assert "floor 0," in found.notes[0]
+    assert found.bound is not None
+    assert found.bound <= found.experiments
+    assert wrong(learn("paired", Model(scm, seed), budget=176), scm) == 0
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_moving_all_at_once_finds_the_graph(family: str, seed: int) -> None:
+    """Few random experiments are enough, and the signs of the weights do not matter."""
+    scm = model(family, seed)
+    apparatus = Counted(Model(scm, seed))
+    found = learn("pooled", apparatus, seed=seed)
+    assert wrong(found, scm) == 0
+    assert found.experiments == apparatus.lives <= 25
+    assert found.notes == ()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_hundred_variables_need_forty_experiments(seed: int) -> None:
+    """Pooled, the graph of 100 variables is exact; by color six experiments confirm it."""
+    scm = model("tanh4:100", seed)
+    found = learn("pooled", Model(scm, seed), seed=seed)
+    assert wrong(found, scm) == 0
+    assert found.experiments <= 40
+    checked = learn("coloring", Model(scm, seed), declared=true_edges(scm), units=1)
+    assert wrong(checked, scm) == 0
+    assert checked.experiments <= 6
+    assert checked.bound is not None
+    assert checked.bound < checked.experiments
+
+
+def test_the_weights_are_found() -> None:
+    """The sureness of a pooled edge is its absolute weight."""
+    scm = lines(x={}, y={"x": -2.0}, z={"x": 0.5, "y": 1.0})
+    found = learn("pooled", Model(scm), budget=20)
+    at = {(c, e): found.sureness[0, found.names.index(c), found.names.index(e)] for c, e in ("xy", "xz", "yz")}  # fmt: skip
+    assert at == pytest.approx({("x", "y"): 2.0, ("x", "z"): 0.5, ("y", "z"): 1.0}, rel=1e-6)
+
+
+# --- a declared graph -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_dropped_edge_is_found(family: str) -> None:
+    """Whichever edge is left out of the declaration, it is named as one that is not declared."""
+    scm = model(family, 1)
+    for edge in sorted(true_edges(scm))[::7]:
+        apparatus = Counted(Model(scm, 1))
+        found = learn("coloring", apparatus, declared=true_edges(scm) - {edge})
+        assert wrong(found, scm) == 0
+        assert "1 edges are not declared, 0 declared ones did not show" in found.notes
+        assert found.experiments == apparatus.lives
+
+
+def test_culprits_are_counted_as_experiments() -> None:
+    """To look for a cause costs more than to confirm one."""
+    scm = model("er2:20", 2)
+    edge = max(true_edges(scm))
+    whole = learn("coloring", Model(scm), declared=true_edges(scm), units=1)
+    part = learn("coloring", Model(scm), declared=set(), units=1)
+    assert part.experiments > whole.experiments + len(true_edges(scm))
+    assert set(part.directed) == true_edges(scm)
+    assert edge in part.directed
+
+
+def test_a_declared_edge_that_never_shows_is_told() -> None:
+    """An edge without effect is left out, and counted in a note."""
+    scm = lines(x={}, y={"x": 1.0}, z={"y": 1.0})
+    declared = {*true_edges(scm), ("x", "z", 0)}
+    found = learn("coloring", Model(scm), declared=declared)
+    assert set(found.directed) == true_edges(scm)
+    assert "0 edges are not declared, 1 declared ones did not show" in found.notes
+
+
+def test_edges_of_another_lag_are_not_checked() -> None:
+    """An apparatus moves causes at one lag; what is declared of another one is left aside."""
+    scm = model("tanh4:20")
+    within = {(c, e, 0) for c, e, _ in true_edges(scm) if c != e}
+    found = learn("coloring", Model(scm), declared=true_edges(scm) | within)
+    assert wrong(found, scm) == 0
+
+
+def test_colors_end_with_the_budget() -> None:
+    """No unit is begun that the budget has no room for."""
+    scm = model("er2:20")
+    found = learn("coloring", Model(scm), declared=true_edges(scm), budget=7)
+    assert found.notes[0].startswith("2 units")
+
+
+# --- limits ---------------------------------------------------------------------------------------
+
+
+def test_what_the_budget_does_not_explain_is_told() -> None:
+    """With too few experiments no edge is made up, and the variables are named."""
+    found = learn("pooled", Model(model("er2:20")), budget=5)
+    assert found.directed == ()
+    assert found.experiments == 5
+    assert found.notes[0].startswith("not explained within the budget: x00, x01")
+
+
+def test_what_depends_on_nearly_everything_is_not_explained_early() -> None:
+    """An effect with many causes stays open while the others are found."""
+    names = [f"x{i:02d}" for i in range(24)]
+    many = lines(**{name: {} for name in names}, y=dict.fromkeys(names, 1.0), z={"x00": 1.0})
+    found = learn("pooled", Model(many), budget=25)
+    assert set(found.directed) == {("x00", "z", 0)}
+    assert found.notes == ("not explained within the budget: y",)
+    assert wrong(learn("pooled", Model(many), budget=200), many) == 0
+
+
+@pytest.mark.parametrize("learner", ["paired", "pooled", "coloring"])
+@pytest.mark.parametrize("budget", [0, -3])
+def test_a_budget_of_nothing_is_refused(learner: str, budget: int) -> None:
+    """The message has the budget."""
+    settings: dict[str, Any] = {"declared": ()} if learner == "coloring" else {}
+    with pytest.raises((ModelError, UnknownOption), match="budget"):
+        learn(learner, Model(model("er2:5")), budget=budget, **settings)
+
+
+def test_a_model_without_edges_has_none() -> None:
+    """Nothing answers, and no experiment is wasted on it."""
+    scm = lines(x={}, y={}, z={})
+    for name in ("paired", "pooled"):
+        found = learn(name, Model(scm))
+        assert found.directed == ()
+    assert learn("coloring", Model(scm), declared=()).experiments == 8
+
+
+def test_what_cannot_be_set_is_named() -> None:
+    """A measured variable has no mechanism that could be asked alone."""
+    scm = SCM([Exogenous(name="a"), Measured(name="b", parents=("a",))])
+    with pytest.raises(ModelError, match="'b' cannot be set"):
+        Model(scm)
+
+
+def test_vectors_and_whole_numbers_are_not_moved_a_little() -> None:
+    """They are named where all are moved at once; one at a time they are no problem."""
+    wide = Box((0.0, 0.0), (1.0, 1.0))
+    scm = SCM(
+        [
+            Exogenous(name="v", shape=(2,), default=(0.0, 0.0), a=wide),
+            Exogenous(name="k", dtype="integer", default=1),
+            Derived(name="y", parents=("k", "k"), mechanism=Function(first_of)),
+        ]
+    )
+    with pytest.raises(ModelError) as told:
+        learn("pooled", Model(scm))
+    assert [problem.split()[0] for problem in told.value.problems] == ["'v'", "'k'"]
+    with pytest.raises(ModelError, match="cannot be moved a little"):
+        learn("coloring", Model(scm), declared=())
+    assert learn("paired", Model(scm), budget=20).directed == (("k", "y", 0),)
+
+
+def test_moves_are_in_the_size_of_a_variable() -> None:
+    """A variable with bounds is moved by a part of them, whatever its unit."""
+    scm = SCM(
+        [
+            Exogenous(name="x", bounds=Box(0.0, 1000.0), default=500.0),
+            Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
+        ]
+    )
+    apparatus = Model(scm)
+    apparatus.prepare(0)
+    np.testing.assert_allclose(apparatus.answers({"x": 0.1}), [0.0, 200.0])
+    assert apparatus.used == 2
