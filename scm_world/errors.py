@@ -56,6 +56,7 @@ def _suggest(suggestion: str | None) -> str:
 def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> ScmWorldError:
     """Make an error from its message and attributes, without its constructor."""
     error = kind.__new__(kind, message)
+    error.args = (message,)  # an OSError takes no message before its constructor
     error.__dict__.update(data)
     return error
 

@@ -117,7 +117,7 @@ def test_ours_are_there() -> None:
 )
 def test_unknown_learners_are_named(name: str) -> None:
     """Not registered, no such module, no such attribute, no function."""
-    with pytest.raises(UnknownOption, match="no learner is named|learner cannot be"):
+    with pytest.raises(UnknownOption, match=r"no learner is named|learner cannot be"):
         learner(name)
 
 

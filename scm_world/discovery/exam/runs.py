@@ -6,6 +6,8 @@ import inspect
 import math
 import multiprocessing
 import os
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -140,10 +142,9 @@ class Bench:
                 found = learn(chosen, table, seed=job.seed)
         except MissingExtra:
             raise
-        except (ScmWorldError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        except Exception as error:  # of whatever kind: learners are not all ours
             seconds = time.perf_counter() - started
-            why = " ".join(str(error).split()) or type(error).__name__
-            return job.cell(status="failed", message=why, seconds=seconds)
+            return job.cell(status="failed", message=_said(error), seconds=seconds)
         own = made.truth.edges if job.seed else None
         return job.cell(
             found=found.restricted(made.truth.names),
@@ -221,19 +222,34 @@ def pairs_of(truth: Truth) -> np.ndarray[Any, Any]:
 
 
 def _serve(pipe: Connection) -> None:
-    """Run jobs until there are no more."""
+    """Run jobs until there are no more, or until the process that asks has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks ends this one
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     bench = Bench()
     while True:
         try:
             what, job = pipe.recv()
-        except (EOFError, KeyboardInterrupt):
+        except EOFError:
             return
         try:
             pipe.send(getattr(bench, what)(job))
-        except KeyboardInterrupt:
-            return
         except Exception as error:  # told to the process that asked
             pipe.send(error)
+
+
+def _end_with_parent() -> None:
+    """End this process, whatever it is doing, when the one that started it is no more."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _said(error: Exception) -> str:
+    """Write an error in one line; with its name, unless it is one of ours."""
+    text = " ".join(str(error).split())
+    name = type(error).__name__
+    return text if text and isinstance(error, ScmWorldError) else f"{name}: {text}".rstrip(": ")
 
 
 @final
@@ -248,14 +264,20 @@ class Runner:
         self._timeout = timeout
         self._process: Any = None
         self._pipe: Any = None
+        self._interrupted = False
 
     def run(self, job: Job) -> Cell:
-        """Run a job.
+        """Run a job; a learner that takes its process with it has failed.
 
         Raises:
             ScmWorldError: The subject cannot be made, or the learner is not installed.
         """
-        answer = self._ask("run", job, self._timeout)
+        try:
+            answer = self._ask("run", job, self._timeout)
+        except EOFError as died:
+            if self._interrupted:
+                raise EngineFailure(str(died), "process") from None
+            return job.cell(status="failed", message=str(died))
         if answer is None:
             said = f"stopped after {self._timeout:g} s"
             return job.cell(status="timeout", message=said, seconds=float(self._timeout or 0.0))
@@ -268,23 +290,30 @@ class Runner:
         Raises:
             ScmWorldError: The subject cannot be made, or its data cannot be collected or written.
         """
-        truth: Truth = self._ask("truth", job, None)
+        try:
+            truth: Truth = self._ask("truth", job, None)
+        except EOFError as died:
+            raise EngineFailure(f"{job.subject}: {died}", "process") from None
         return truth
 
     def _ask(self, what: str, job: Job, timeout: float | None) -> Any:
         """Ask the process for something; None if that took too long."""
         if self._process is None:
             self._start()
-        self._pipe.send((what, job))
-        if not self._pipe.poll(timeout):
+        if self._interrupted:
             self.stop()
-            return None
+            raise EOFError("interrupted")
         try:
+            self._pipe.send((what, job))
+            if not self._pipe.poll(timeout):
+                self.stop()
+                return None
             answer = self._pipe.recv()
-        except EOFError:
+        except (EOFError, OSError):
+            self._process.join(1.0)
+            code = self._process.exitcode
             self.stop()
-            said = f"the process that ran {job.learner} on {job.subject} died"
-            raise EngineFailure(said, "process") from None
+            raise EOFError(f"its process ended with exit code {code}") from None
         if isinstance(answer, BaseException):
             raise answer
         return answer
@@ -292,10 +321,17 @@ class Runner:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        with _single_threaded():
+        with _single_threaded(), _uninterrupted():
             self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
             self._process.start()
         theirs.close()
+
+    def interrupt(self) -> None:
+        """End the process from another thread; who waits for an answer gets an error."""
+        self._interrupted = True
+        process = self._process
+        if process is not None:
+            process.kill()
 
     def stop(self) -> None:
         """End the process."""
@@ -304,6 +340,19 @@ class Runner:
             self._process.join()
             self._pipe.close()
             self._process = self._pipe = None
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, where a system has such."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -161,6 +161,7 @@ def examine(
     total = sum(map(len, groups))
     cells: list[Cell] = []
     truths: dict[str, Truth] = {}
+    runners: list[Runner] = []
     stopped = Event()
 
     def told(cell: Cell) -> None:
@@ -170,7 +171,10 @@ def examine(
 
     def work(jobs: Sequence[Job]) -> None:
         runner = Runner(study.timeout)
+        runners.append(runner)
         try:
+            if stopped.is_set():
+                return
             truth = runner.truth(jobs[0])
             truths.setdefault(truth.name, truth) if jobs[0].seed else truths.update(
                 {truth.name: truth}
@@ -191,6 +195,8 @@ def examine(
             stopped.set()
             for future in futures:
                 future.cancel()
+            for runner in runners:
+                runner.interrupt()
             raise
     ordered = {shown_name(n, study.view): truths[shown_name(n, study.view)] for n in study.subjects}
     exam = Exam(ordered, tuple(cells), {"study": study.as_dict(), "versions": versions()})

@@ -140,8 +140,11 @@ class Model:
         return np.asarray(np.where(np.isfinite(high - low), high - low, 1.0))
 
     def _mechanisms(self, now: Values, before: Values) -> Floats:
+        """Compute what each mechanism says; 0 where there is none, whatever the value is."""
         found = (
             self._model.solve(now, previous=before, moment=self._moment, only=(name,))[name]
+            if self._model[name].all_parents
+            else 0.0
             for name in self.watched
         )
         return np.array([float(value) for value in found])
