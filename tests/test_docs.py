@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import runpy
 import subprocess
@@ -40,7 +41,10 @@ def test_the_tables_of_variables_are_up_to_date() -> None:
     assert (ROOT / "docs" / "variables.md").read_text() == markdown()
 
 
-@pytest.mark.parametrize("name", ["interventions", "discovery", "environments", "new_family"])
+EXAMPLES = ("interventions", "discovery", "environments", "learners", "new_family", "own_learner")
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Every example runs and prints something."""
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"))["main"]()
@@ -60,9 +64,30 @@ def test_import_is_silent_and_light() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_all_is_honest() -> None:
-    """Every public name of the package exists."""
-    import scm_world
+@pytest.mark.parametrize("name", ["scm_world", "scm_world.discovery"])
+def test_all_is_honest(name: str) -> None:
+    """Every public name of a package exists, and is what its other spelling means."""
+    package = importlib.import_module(name)
+    found: dict[str, object] = {}
+    exec(f"from {name} import *", found)  # noqa: S102 # our own text
+    assert {*package.__all__} <= {*found} & {*dir(package)}
+    assert all(getattr(package, public) is found[public] for public in package.__all__)
+    assert not hasattr(package, "no_such_name")
 
-    assert all(getattr(scm_world, name) is not None for name in scm_world.__all__)
-    assert not hasattr(scm_world, "no_such_name")
+
+def test_discovery_is_loaded_when_it_is_used() -> None:
+    """Importing it loads no optional library, no engine and none of its own parts."""
+    program = (
+        "import sys, scm_world.discovery; "
+        "heavy = {'pandas', 'pyarrow', 'scipy', 'matplotlib', 'numba', 'mujoco', 'pybullet', "
+        "'gadjid', 'scm_world.world', 'scm_world.discovery.data'} & set(sys.modules); "
+        "assert not heavy, heavy; "
+        "from scm_world.discovery import collect, evaluate, learners, subject; "
+        "assert learners.learners(); "
+        "heavy = {'pandas', 'pyarrow', 'matplotlib', 'gadjid', 'causallearn'} & set(sys.modules); "
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run(  # noqa: S603 # our own text
+        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 INTERRUPTED = 130
+PROGRESS = "progress.json"
 LONG = 80  # [characters] what is longer is not repeated
 EXTRA, MISSING = "bold dark_orange", "bold red"
 
@@ -65,7 +66,13 @@ def run(options: Options, *, out: Path | None, strict: bool) -> int:
     world = World(task, backend=options.backend, preset=options.preset)
     try:
         with shown_progress(options.probes) as progress:
-            report = discover(world, probes=options.probes, seed=options.seed, progress=progress)
+            report = discover(
+                world,
+                probes=options.probes,
+                seed=options.seed,
+                progress=progress,
+                checkpoint=folder / PROGRESS,
+            )
     finally:
         world.close()
     report = replace(report, arguments=options.arguments)
@@ -170,7 +177,7 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
     if report.arguments:
         yield "options", ", ".join(report.arguments), None
     yield "probe states", states, None if complete else False
-    yield "rollouts", str(report.rollouts), None
+    yield "rollouts, at least needed", f"{report.rollouts}, {report.bound}", None
     yield "floor (do and undo)", f"{report.floor:.3g}", None
     yield "threshold", f"{report.threshold:.3g}", None
     yield "largest effect without an edge", f"{report.inert:.3g}", None

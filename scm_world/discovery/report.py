@@ -26,6 +26,8 @@ class DiscoveryReport:
         probes: Probe states that were used.
         planned: Probe states that were asked for; more than ``probes`` if it was interrupted.
         rollouts: Control steps simulated in an experiment of their own.
+        bound: Fewest of them that find a graph without prior knowledge: one for each variable that
+            can be set, in each probe state; see ``design.bounds.paired_single_target``.
         floor: Largest difference after something was done and undone.
         threshold: An effect must exceed it.
         inert: Largest effect among the pairs that are no edge in the found graph.
@@ -46,6 +48,7 @@ class DiscoveryReport:
     probes: int
     planned: int
     rollouts: int
+    bound: int
     floor: float
     threshold: float
     inert: float
@@ -71,6 +74,7 @@ class DiscoveryReport:
             "planned_probes": self.planned,
             "complete": self.probes == self.planned,
             "rollouts": self.rollouts,
+            "fewest_rollouts": self.bound,
             "floor": self.floor,
             "threshold": self.threshold,
             "largest_effect_without_edge": self.inert,

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
+from scm_world.discovery.checkpoints import Checkpoint
+from scm_world.discovery.design import bounds
 from scm_world.discovery.report import DiscoveryReport
 from scm_world.discovery.scores import score
 from scm_world.graph import SCM
@@ -24,6 +27,7 @@ def discover(
     probes: int = 32,
     seed: int = 0,
     progress: Progress | None = None,
+    checkpoint: Path | None = None,
     **options: Any,
 ) -> DiscoveryReport:
     """Recover a causal graph by paired single-target interventions, and score it.
@@ -37,10 +41,13 @@ def discover(
         probes: How many states to experiment in.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
+        checkpoint: A file to write to after each probe state of a world; the same call goes on
+            from there, with the same result. It is removed when all are finished.
         options: Arguments of ``World``, where ``system`` is a name.
 
     Raises:
         UnknownOption: ``probes`` is not a positive number, or a name does not exist.
+        UnreadableFile: The checkpoint is damaged, or of another discovery.
 
     Example:
         >>> from scm_world.variables import Derived, Exogenous, Linear
@@ -59,7 +66,7 @@ def discover(
         return _report(system, effects, probes, probes, seed, about, started)
     world = World(system, **options) if isinstance(system, str) else system
     try:
-        effects, done = _experiments(world, probes, seed, progress)
+        effects, done = _experiments(world, probes, seed, progress, checkpoint)
         about = {
             "task": world.task.name,
             "backend": world.backend.name,
@@ -73,11 +80,35 @@ def discover(
 
 
 def _experiments(
-    world: World, probes: int, seed: int, progress: Progress | None
+    world: World, probes: int, seed: int, progress: Progress | None, path: Path | None
 ) -> tuple[Effects, int]:
-    series = Series(Paired(world, seed), probes, progress)
-    series.run(probe_states(world, probes, seed))
+    paired = Paired(world, seed)
+    saved = None if path is None else Checkpoint(path, _terms(world, seed))
+    first = 0 if saved is None else min(saved.read(paired), probes)
+    series = Series(paired, probes, progress, done=first)
+
+    def written(effects: Effects, done: int) -> bool:
+        if saved is not None:
+            saved.write(effects, done, paired)
+        return False
+
+    series.run(probe_states(world, probes, seed, first=first), written)
+    if saved is not None and series.done == probes:
+        saved.end()
     return series.effects, series.done
+
+
+def _terms(world: World, seed: int) -> dict[str, Any]:
+    given = {name: str(value) for name, value in sorted(world.task.given.items())}
+    backend = world.backend
+    return {
+        "task": world.task.name,
+        "arguments": given,
+        "action_mode": world.action_mode,
+        "preset": world.structure.preset.name,
+        "seed": seed,
+        "versions": versions(f"{backend.name} {backend.version}"),
+    }
 
 
 def _report(
@@ -101,6 +132,7 @@ def _report(
         probes=done,
         planned=planned,
         rollouts=effects.rollouts,
+        bound=done * bounds.paired_single_target(len(effects.undone) or len(list(model))),
         floor=effects.floor,
         threshold=threshold,
         inert=max(inert, default=0.0),

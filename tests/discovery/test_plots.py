@@ -36,6 +36,7 @@ def report(found: tuple[EdgeKey, ...], declared: tuple[EdgeKey, ...]) -> Discove
         probes=1,
         planned=1,
         rollouts=1,
+        bound=0,
         floor=0.0,
         threshold=1e-12,
         inert=0.0,

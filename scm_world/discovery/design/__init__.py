@@ -15,6 +15,7 @@ from scm_world.discovery.design.search import (
     Search,
     adaptive_search,
     answer_from_dag,
+    answer_from_model,
     is_verified_by,
     verifying_set,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "Search",
     "adaptive_search",
     "answer_from_dag",
+    "answer_from_model",
     "bisect",
     "bounds",
     "coloring",

@@ -12,6 +12,7 @@ import numpy as np
 from scm_world.discovery.design import bounds
 from scm_world.discovery.design.plan import Design
 from scm_world.errors import ModelError
+from scm_world.graph import SCM, Moment
 from scm_world.graph.equivalence import (
     Bools,
     chain_components,
@@ -23,6 +24,7 @@ from scm_world.graph.equivalence import (
     topological_order,
     v_structures,
 )
+from scm_world.variables import Noise
 
 Answer = Callable[[int], Iterable[tuple[int, int]]]
 """What an experiment on a variable tells: edges at it, as (cause, effect)."""
@@ -159,6 +161,42 @@ def answer_from_dag(dag: Bools) -> Answer:
     return answer
 
 
+def answer_from_model(model: SCM, graph: Bools, *, seed: int = 0, step: float = 1.0) -> Answer:
+    """Answer by one paired experiment on a target: which of its neighbors follow it.
+
+    A unit lives twice with the same noise, once with the target moved. A neighbor that differs is
+    an effect, for it comes later; one that does not is a cause.
+
+    Args:
+        model: Static; its variables are numbers that can be set.
+        graph: Essential graph over its variables, in their order, shape (p, p).
+        seed: Of the unit.
+        step: By how much the target is moved.
+
+    Example:
+        >>> from scm_world.variables import Derived, Exogenous, Linear
+        >>> chain = SCM([
+        ...     Exogenous(name="a"),
+        ...     Derived(name="b", parents=("a",), mechanism=Linear(weights=(2.0,))),
+        ... ])
+        >>> list(answer_from_model(chain, np.ones((2, 2), bool))(0))
+        [(0, 1)]
+    """
+    names = list(model)
+    moment = Moment(Noise(seed))
+    unit = model.solve(moment=moment)
+
+    def answer(target: int) -> Iterator[tuple[int, int]]:
+        value = float(unit[names[target]]) + step
+        moved = model.do({names[target]: value}).solve(moment=moment)
+        for other in np.flatnonzero(graph[target] | graph[:, target]).tolist():
+            if other != target:
+                follows = bool(np.any(moved[names[other]] != unit[names[other]]))
+                yield (target, other) if follows else (other, target)
+
+    return answer
+
+
 def clique_separator(free: Bools) -> tuple[int, ...]:
     """Find a small clique of a connected chordal graph that leaves parts of at most half its size.
 
@@ -260,6 +298,7 @@ __all__ = [
     "Search",
     "adaptive_search",
     "answer_from_dag",
+    "answer_from_model",
     "clique_separator",
     "is_verified_by",
     "verifying_set",

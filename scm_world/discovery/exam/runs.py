@@ -264,6 +264,7 @@ class Runner:
         self._timeout = timeout
         self._process: Any = None
         self._pipe: Any = None
+        self._ready: set[tuple[str, int, str]] = set()
         self._interrupted = False
 
     def run(self, job: Job) -> Cell:
@@ -272,6 +273,8 @@ class Runner:
         Raises:
             ScmWorldError: The subject cannot be made, or the learner is not installed.
         """
+        if (job.subject, job.seed, job.data) not in self._ready:
+            self.truth(job)  # what is collected is not part of the time of a learner
         try:
             answer = self._ask("run", job, self._timeout)
         except EOFError as died:
@@ -294,6 +297,7 @@ class Runner:
             truth: Truth = self._ask("truth", job, None)
         except EOFError as died:
             raise EngineFailure(f"{job.subject}: {died}", "process") from None
+        self._ready.add((job.subject, job.seed, job.data))
         return truth
 
     def _ask(self, what: str, job: Job, timeout: float | None) -> Any:
@@ -340,6 +344,7 @@ class Runner:
             self._process.join()
             self._pipe.close()
             self._process = self._pipe = None
+            self._ready = set()
 
 
 @contextmanager

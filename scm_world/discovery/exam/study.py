@@ -16,11 +16,12 @@ from scm_world.discovery.exam.html import write_report
 from scm_world.discovery.exam.pictures import draw_budget
 from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json, write_whole
 from scm_world.discovery.exam.runs import Job, Runner, shown_name, source_for
-from scm_world.discovery.exam.subjects import TaskView, check_subject
+from scm_world.discovery.exam.subjects import TaskView, check_subject, subject
 from scm_world.discovery.exam.tables import write_tables
 from scm_world.discovery.learners.registry import SOURCES, learner
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.policies import as_policy
 from scm_world.queries.progress import Progress
 from scm_world.world.start import whole_number
 
@@ -66,6 +67,7 @@ class Study:
                 raise UnknownOption(what, "none", ("one or more",))
         for name in self.subjects:
             check_subject(name)
+        self._check_names_and_time()
         for budget in self.budgets:
             whole_number("budget", budget, least=1)
         whole_number("seeds", self.seeds, least=1)
@@ -78,6 +80,14 @@ class Study:
                 raise MissingExtra(chosen.package, chosen.extra)
             for kind in self.data:
                 source_for(chosen, kind)
+
+    def _check_names_and_time(self) -> None:
+        shown = tuple(shown_name(name, self.view) for name in self.subjects)
+        for what, names in (("subjects", shown), ("learners", self.learners), ("data", self.data)):
+            if len(set(names)) < len(names):
+                raise UnknownOption(what, ", ".join(names), ("names, each of them once",))
+        if self.timeout is not None and not self.timeout > 0.0:
+            raise UnknownOption("timeout", self.timeout, ("seconds, more than 0", "None"))
 
     @property
     def spent(self) -> tuple[int, ...]:
@@ -118,7 +128,7 @@ def slug(name: str) -> str:
 
     Example:
         >>> slug("er2:20"), slug("pcmci+")
-        ('er2_20-7b9c', 'pcmci_-0bd1')
+        ('er2_20-45d3', 'pcmci_-be55')
     """
     plain = re.sub(r"[^A-Za-z0-9.-]", "_", name)
     mark = hashlib.sha256(name.encode()).hexdigest()[:4]
@@ -156,51 +166,66 @@ def examine(
         ScmWorldError: A subject cannot be made, or data cannot be collected or written.
     """
     folder = Path(out)
+    whole_number("workers", workers, least=1)
     _begun(study, folder)
     groups = list(study.jobs(folder))
-    total = sum(map(len, groups))
-    cells: list[Cell] = []
-    truths: dict[str, Truth] = {}
-    runners: list[Runner] = []
-    stopped = Event()
-
-    def told(cell: Cell) -> None:
-        cells.append(cell)
-        if progress is not None:
-            progress(len(cells), total)
-
-    def work(jobs: Sequence[Job]) -> None:
-        runner = Runner(study.timeout)
-        runners.append(runner)
-        try:
-            if stopped.is_set():
-                return
-            truth = runner.truth(jobs[0])
-            truths.setdefault(truth.name, truth) if jobs[0].seed else truths.update(
-                {truth.name: truth}
-            )
-            for job in jobs:
-                if stopped.is_set():
-                    return
-                told(_ran(runner, folder, job))
-        finally:
-            runner.stop()
-
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        futures = [pool.submit(work, jobs) for jobs in groups]
+    sitting = _Sitting(study, folder, sum(map(len, groups)), progress)
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(sitting.work, jobs) for jobs in groups]
         try:
             for future in futures:
                 future.result()
         except BaseException:
-            stopped.set()
-            for future in futures:
-                future.cancel()
-            for runner in runners:
-                runner.interrupt()
+            sitting.stop()
             raise
-    ordered = {shown_name(n, study.view): truths[shown_name(n, study.view)] for n in study.subjects}
-    exam = Exam(ordered, tuple(cells), {"study": study.as_dict(), "versions": versions()})
+    names = [shown_name(name, study.view) for name in study.subjects]
+    about = {"study": study.as_dict(), "versions": versions()}
+    exam = Exam({n: sitting.truths[n] for n in names}, tuple(sitting.cells), about)
     return written(exam, folder)
+
+
+@final
+class _Sitting:
+    """What several threads do together: each has a process that runs jobs.
+
+    Attributes:
+        cells: What is done, in the order in which it was.
+        truths: Of the subjects; of a family, that of the first seed.
+    """
+
+    def __init__(self, study: Study, folder: Path, total: int, progress: Progress | None) -> None:
+        self.cells: list[Cell] = []
+        self.truths: dict[str, Truth] = {}
+        self._study, self._folder, self._total, self._progress = study, folder, total, progress
+        self._runners: list[Runner] = []
+        self._stopped = Event()
+
+    def work(self, jobs: Sequence[Job]) -> None:
+        """Run the jobs of one subject and seed."""
+        runner = Runner(self._study.timeout)
+        self._runners.append(runner)
+        try:
+            for job in jobs:
+                if self._stopped.is_set():
+                    return
+                if job is jobs[0]:
+                    truth = runner.truth(job)
+                    if job.seed == 0 or truth.name not in self.truths:
+                        self.truths[truth.name] = truth
+                self._tell(_ran(runner, self._folder, job))
+        finally:
+            runner.stop()
+
+    def stop(self) -> None:
+        """End all processes; jobs that have not begun are not run."""
+        self._stopped.set()
+        for runner in tuple(self._runners):
+            runner.interrupt()
+
+    def _tell(self, cell: Cell) -> None:
+        self.cells.append(cell)
+        if self._progress is not None:
+            self._progress(len(self.cells), self._total)
 
 
 def _ran(runner: Runner, folder: Path, job: Job) -> Cell:
@@ -219,9 +244,12 @@ def _begun(study: Study, folder: Path) -> None:
     head = json.loads(json.dumps({**study.as_dict(), "versions": versions()}))
     path = folder / "study.json"
     if not path.exists():
-        if folder.exists() and any(folder.iterdir()):
+        if folder.exists() and not _is_free(folder):
             advice = "give an empty folder, or one of an earlier exam"
             raise UnreadableFile(str(folder), "it holds something else", advice)
+        as_policy(study.view.policy)
+        for name in study.subjects:
+            subject(name, view=study.view).close()
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(json.dumps(head, indent=1) + "\n", path)
         return
@@ -234,6 +262,11 @@ def _begun(study: Study, folder: Path) -> None:
     if different:
         reason = f"it is one of another exam: {', '.join(different)} differ"
         raise UnreadableFile(str(folder), reason, "give another folder")
+
+
+def _is_free(folder: Path) -> bool:
+    """Tell whether a folder holds nothing, but for a beginning that was interrupted."""
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= {"study.json.part"}
 
 
 def written(exam: Exam, folder: Path) -> Exam:

@@ -30,7 +30,8 @@ FEW = 10  # control steps of an episode of a model through time
 SENSED = 0.005  # noise of the sensors, as a fraction of half a range
 START, HEIGHT = ".cartesian_position", ".cylindrical_position"
 HALF = 0.045  # [m] half the side of the square in which a block begins
-THROWN = (1.5, 1.8, 0.0)  # [m/s] between two fingers and to the wall
+THROWN = ((1.5, 1.8, 0.0), (2.6, -1.5, 0.0))
+"""How fast blocks are thrown [m/s]: between two fingers to the wall, and so that they come back."""
 MOST_STARTS = 3  # blocks that find room, each in a sector of its own
 
 
@@ -249,25 +250,25 @@ class TaskSubject:
         return None
 
     def apparatus(self, seed: int) -> Apparatus:
-        """Do paired experiments, without noise of the sensors, in turn under three circumstances.
+        """Do paired experiments, without noise of the sensors, in turn under four circumstances.
 
         These are the policy of the view, a finger that pushes across, and blocks that are thrown
-        at the wall.
+        at the wall: past the fingers, and so hard that they come back and hit one.
         """
         if self._view.view == "step":
             return Steps(self._world, seed)
         nature = {n: act for n, act in self._nature.items() if n != "sensor_noise"}
-        thrown = {f"{block}.linear_velocity": THROWN for block in self._started()}
         length = self._view.steps
         settings = (
             Setting(self._view.policy, nature, length, seed),
             Setting("across", nature, length, seed),
-            Setting(None, {**nature, **thrown}, length, seed),
+            *(Setting(None, {**nature, **self._thrown(fast)}, length, seed) for fast in THROWN),
         )
         return Outcomes(self._world, self._causes, self._outcomes, settings)
 
-    def _started(self) -> tuple[str, ...]:
-        return tuple(n.removesuffix(START) for n in self._causes if self._is_start(n))
+    def _thrown(self, fast: tuple[float, float, float]) -> dict[str, Any]:
+        blocks = (n.removesuffix(START) for n in self._causes if self._is_start(n))
+        return {f"{block}.linear_velocity": fast for block in blocks}
 
     def _is_start(self, name: str) -> bool:
         return name.endswith(START) and self._world.model.declared(name).role == "state"

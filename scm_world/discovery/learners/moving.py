@@ -202,13 +202,13 @@ def verified(
     made = Found.of_edges(names, [(c, e, lag) for c, e in sorted(account.found)])
     degree = max((sum(e == effect for _, e in wanted) for effect in names), default=0)
     never = len(wanted - account.seen)
-    notes = (
+    notes = [
         f"{len(colors)} units, {min(colors, default=0)} to {max(colors, default=0)} colors each",
         f"{len(account.intruders)} edges are not declared, {never} declared ones did not show",
-    )
+    ]
     if not account.looked.all():
-        notes += (f"{int((~account.looked).sum())} pairs hid behind declared causes",)
-    return made.told(experiments=apparatus.used, bound=degree, notes=notes)
+        notes.append(f"{int((~account.looked).sum())} pairs hid behind declared causes")
+    return made.told(experiments=apparatus.used, bound=degree, notes=tuple(notes))
 
 
 def _moves(together: Iterable[str], rng: np.random.Generator) -> dict[str, float]:

@@ -12,8 +12,8 @@ computed variable has a lagged cause if it still differs while all present value
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import final
+from collections.abc import Iterable, Mapping
+from typing import Any, final
 
 import numpy as np
 
@@ -95,6 +95,19 @@ class Paired:
             self._vary_readout(name)
             self._pool[name] = [*self._pool[name], self._at_once[name], self._later[name]]
             self._pool[name] = self._pool[name][-SEEN_ELSEWHERE:]
+
+    def memory(self) -> dict[str, list[Any]]:
+        """Give what later probes need of earlier ones: values of readouts, as plain data."""
+        return {name: [np.asarray(v).tolist() for v in seen] for name, seen in self._pool.items()}
+
+    def remember(self, effects: Effects, memory: Mapping[str, Iterable[Any]]) -> None:
+        """Go on from what earlier probes found."""
+        self.effects = effects
+        model = self._world.model
+        self._pool = {
+            name: [model.declared(name).array(value) for value in seen]
+            for name, seen in memory.items()
+        }
 
     # --- the pieces of an experiment ----------------------------------------------------------
 

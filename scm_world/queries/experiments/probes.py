@@ -37,20 +37,23 @@ class Probe:
     action: Floats
 
 
-def probes(world: World, n: int, seed: int, *, settled: bool = True) -> Iterator[Probe]:
+def probes(
+    world: World, n: int, seed: int, *, settled: bool = True, first: int = 0
+) -> Iterator[Probe]:
     """Prepare probe states one after another.
 
     Args:
         world: To experiment with; it is reset for each probe.
-        n: How many.
+        n: How many, those before the first one included.
         seed: Of the choices.
+        first: Number of the first one.
         settled: Whether control steps may be taken first. Without them a probe state is made of
             the same numbers on every engine.
     """
     noise = Noise(seed)
     world.reset(seed=seed)
     kinds = scenarios(world)
-    for number in range(n):
+    for number in range(first, n):
         yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
 
 

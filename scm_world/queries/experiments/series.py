@@ -20,15 +20,18 @@ class Series:
         paired: Does the experiments.
         planned: How many probe states there are.
         progress: Is told how far it is.
+        done: How many of them were finished before.
 
     Attributes:
         effects: What was seen in the probe states that are finished.
         done: How many these are.
     """
 
-    def __init__(self, paired: Paired, planned: int, progress: Progress | None = None) -> None:
+    def __init__(
+        self, paired: Paired, planned: int, progress: Progress | None = None, *, done: int = 0
+    ) -> None:
         self._paired, self._planned, self._progress = paired, planned, progress
-        self.effects, self.done = paired.effects, 0
+        self.effects, self.done = paired.effects, done
 
     def run(
         self, probes: Iterable[Probe], enough: Callable[[Effects, int], bool] | None = None
@@ -44,7 +47,7 @@ class Series:
             KeyboardInterrupt: It was interrupted before the first probe state was finished.
         """
         try:
-            for number, probe in enumerate(probes):
+            for number, probe in enumerate(probes, self.done):
                 self._paired.run(number, probe)
                 self.done, self.effects = number + 1, self._paired.effects.copy()
                 last = enough is not None and enough(self.effects, self.done)

@@ -1,0 +1,109 @@
+"""Discovery that is interrupted, or killed, goes on where it was."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scm_world import World, discover
+from scm_world.discovery import DiscoveryReport
+from scm_world.errors import UnreadableFile
+
+PROBES = 5
+
+
+def whole(report: DiscoveryReport) -> dict[str, Any]:
+    """Give all of a report but the time it took."""
+    return {name: value for name, value in asdict(report).items() if name != "seconds"}
+
+
+def interrupted(world: World, path: Path, after: int) -> DiscoveryReport:
+    """Discover, and press Ctrl-C after some probe states."""
+
+    def progress(done: int, _: int) -> None:
+        if done == after:
+            raise KeyboardInterrupt
+
+    return discover(world, probes=PROBES, seed=3, progress=progress, checkpoint=path)
+
+
+@pytest.mark.parametrize("backend", ["fake", "mujoco", "bullet"])
+def test_going_on_gives_the_same(backend: str, tmp_path: Path) -> None:
+    """Interrupted after two probe states and gone on with: nothing in the report differs."""
+    path = tmp_path / "progress.json"
+    with World("pushing", backend=backend) as world:
+        at_once = discover(world, probes=PROBES, seed=3)
+        part = interrupted(world, path, 2)
+        assert (part.probes, part.planned) == (2, PROBES)
+        assert json.loads(path.read_text())["done"] == 2
+    told: list[int] = []
+    with World("pushing", backend=backend) as world:
+        again = discover(
+            world, probes=PROBES, seed=3, checkpoint=path, progress=lambda n, _: told.append(n)
+        )
+    assert told == [3, 4, 5]
+    assert whole(again) == whole(at_once)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{", "Expecting property name"),
+        ('{"format": "something else"}', "expected the format"),
+        ('{"format": "scm_world/discovery-progress/1", "terms": {}}', "task"),
+    ],
+)
+def test_damaged_checkpoints_are_refused(text: str, reason: str, tmp_path: Path) -> None:
+    """The error names the file; the file stays as it was."""
+    path = tmp_path / "progress.json"
+    path.write_text(text)
+    with (
+        World("pushing", backend="fake") as world,
+        pytest.raises(UnreadableFile, match=reason) as caught,
+    ):
+        discover(world, probes=2, checkpoint=path)
+    assert caught.value.path == str(path)
+    assert path.read_text() == text
+
+
+def test_checkpoints_of_others_are_refused(tmp_path: Path) -> None:
+    """Another seed or another task does not go on from there."""
+    path = tmp_path / "progress.json"
+    with World("pushing", backend="fake") as world:
+        interrupted(world, path, 1)
+        with pytest.raises(UnreadableFile, match="seed differ"):
+            discover(world, probes=2, seed=4, checkpoint=path)
+    with (
+        World("reaching", backend="fake") as other,
+        pytest.raises(UnreadableFile, match="task differ"),
+    ):
+        discover(other, probes=2, seed=3, checkpoint=path)
+
+
+def test_a_killed_command_goes_on(tmp_path: Path) -> None:
+    """``kill -9`` loses at most the probe state in work."""
+    command = [sys.executable, "-m", "scm_world", "discover", "pushing", "--probes", "12"]
+    out = tmp_path / "out"
+    process = subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.DEVNULL)  # noqa: S603 # ours
+    deadline = time.monotonic() + 120.0
+    while not (out / "progress.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    done = json.loads((out / "progress.json").read_text())["done"]
+    assert 1 <= done < 12
+    for folder in (out, tmp_path / "plain"):
+        subprocess.run([*command, "--out", str(folder)], check=True, capture_output=True)  # noqa: S603 # ours
+    reports = [json.loads((tmp_path / f / "report.json").read_text()) for f in ("out", "plain")]
+    for report in reports:
+        del report["seconds"]
+    assert reports[0] == reports[1]
+    assert not (out / "progress.json").exists()
