@@ -9,7 +9,6 @@ import sys
 
 from scm_world.discovery import Design, Found, TaskView, collect, evaluate, learn, subject
 from scm_world.discovery.exam.families import model
-from scm_world.discovery.exam.runs import pairs_of
 from scm_world.discovery.exam.subjects import Subject
 from scm_world.variables import Normal
 
@@ -19,7 +18,7 @@ CAUSES = ("block.size", "gravity", "*friction", "tool_block.mass", "tool_block.c
 def shown(title: str, found: Found, examined: Subject) -> None:
     """Print how near a graph comes to the declared one."""
     truth = examined.truth
-    scores = evaluate(found, truth.edges, names=truth.names, pairs=pairs_of(truth))
+    scores = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
     print(f"  {title:<34} SHD {scores.shd:>3}  precision {scores.precision:.2f}", end="  ")
     print(f"recall {scores.recall:.2f}  {found.experiments} experiments, {found.seconds:.2f} s")
 

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from scm_world.cli.options import (
+    Acts,
+    Arguments,
+    Backend,
+    Format,
+    Out,
+    Policy,
+    Preset,
+    Seed,
+    Steps,
+    Task,
+)
 from scm_world.errors import ScmWorldError
 
 
@@ -46,50 +57,9 @@ app = typer.Typer(
 )
 
 
-class Format(StrEnum):
-    """How a graph is written down."""
-
-    TABLE = "table"
-    DOT = "dot"
-    JSON = "json"
-    PNG = "png"
-    HTML = "html"
-    GML = "gml"
-    GRAPHML = "graphml"
-    NODE_LINK = "node-link"
-    DAGITTY = "dagitty"
-    CSV = "csv"
-
-
-Task = Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.")]
-Backend = Annotated[str, typer.Option(help="Physics engine: mujoco, bullet or fake.")]
-Preset = Annotated[str, typer.Option(help="Numerical settings: fast or precise.")]
-Seed = Annotated[int, typer.Option(min=0, help="Of every random choice.")]
-Arguments = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--option",
-        metavar="NAME=VALUE",
-        help="Argument of the task, such as num_of_levels=2; give it once for each argument.",
-    ),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(help="Folder for the results.", show_default="under scm-world-results"),
-]
-
-
-Acts = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="NAME=VALUE...",
-        help="A number, a list 1,2,3 or [1,2,3], shift:0.1, scale:2, or draw:A.",
-    ),
-]
-Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
-Policy = Annotated[
-    str, typer.Option(help="random, sweep: the fingertips go to the middle, or still.")
-]
+def is_model(subject: str) -> bool:
+    """Tell a family with a size, or a file, from the name of a task."""
+    return ":" in subject or subject.endswith(".json")
 
 
 def _version(wanted: bool) -> None:
@@ -159,11 +129,12 @@ def discover(
 ) -> None:
     """Recover a causal graph by experiments, and score it; or examine learners.
 
-    Without --learner the one-step graph of a task is recovered by paired experiments. With it,
-    learners are run over budgets and seeds, and a table, a picture and a report are written; the
-    same command goes on after an interruption. Ctrl-C gives the result so far (exit code 130).
+    Without --learner the one-step graph of a task is recovered by paired experiments. With it, and
+    for models, learners are run over budgets and seeds, and a table, a picture and a report are
+    written. After an interruption the same command goes on. Ctrl-C gives the result so far (exit
+    code 130).
     """
-    if learner is None:
+    if learner is None and not is_model(task):
         from scm_world.cli.discovery import Options, run
 
         options = Options(task, backend, preset, probes, seed, tuple(option or ()))
@@ -172,7 +143,15 @@ def discover(
 
     chosen = exam.view(view, cause, outcome, policy, steps, sensor_noise, backend, preset)
     sitting = exam.Options(
-        task, learner, data, budget, seeds, chosen, timeout, workers, tuple(option or ())
+        task,
+        learner or "paired",
+        data,
+        budget,
+        seeds,
+        chosen,
+        timeout,
+        workers,
+        tuple(option or ()),
     )
     raise typer.Exit(exam.run(sitting, out=out))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from scm_world.cli.tasks import build, suffix
 from scm_world.discovery.exam.results import Exam
 from scm_world.discovery.exam.study import Study, examine, slug
 from scm_world.discovery.exam.subjects import VIEWS, TaskView
-from scm_world.discovery.exam.tables import COLUMNS, HEADS, best, by_subject
+from scm_world.discovery.exam.tables import COLUMNS, HEADS, STANDARDISED, best, by_subject
 from scm_world.errors import UnknownOption
 from scm_world.tasks import TASKS
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from scm_world.queries.progress import Progress
 
 INTERRUPTED = 130
-BRIEF = ("shd", "f1", "precision", "recall", "auprc", "sid", "experiments", "seconds")
+BRIEF = ("shd", STANDARDISED, "f1", "precision", "recall", "auprc", "sid", "experiments", "seconds")
 
 
 @final
@@ -55,9 +56,13 @@ class Options:
 
 def run(options: Options, *, out: Path | None) -> int:
     """Examine, print a table, write everything; return the exit code."""
+    if ":" in options.learners:  # a learner of one's own, beside where the command is called
+        sys.path.insert(0, str(Path.cwd()))
     study = study_of(options)
     names = "-".join(map(slug, (*study.subjects, *study.learners)))
-    folder = out or RESULTS / f"exam-{names}-{options.view.view}{suffix(options.arguments)}"
+    tasks = not TASKS.keys().isdisjoint(study.subjects)
+    looked = f"-{options.view.view}" if tasks else ""
+    folder = out or RESULTS / f"exam-{names}{looked}{suffix(options.arguments)}"
     check_writable(folder, folder=True)
     terminal = console()
     try:

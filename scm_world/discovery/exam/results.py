@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import SOURCES
@@ -156,6 +157,15 @@ class Truth:
         if problems:
             raise ModelError([f"subject {self.name!r}: {problem}" for problem in problems])
 
+    @property
+    def pairs(self) -> NDArray[np.bool_]:
+        """Say which pairs are scored, shape (p, p)."""
+        at = {name: i for i, name in enumerate(self.names)}
+        mask = np.ones((len(at), len(at)), dtype=bool)
+        for one, other in self.left_out:
+            mask[at[one], at[other]] = mask[at[other], at[one]] = False
+        return mask
+
     def as_dict(self) -> dict[str, Any]:
         """Write it as plain data."""
         return {"format": TRUTH, **_flat(self)}
@@ -217,8 +227,9 @@ class Exam:
         """How many cells there are and how they ended, in words."""
         ends = [cell.status for cell in self.cells]
         return (
-            f"{len(self.subjects)} subjects, {len({cell.learner for cell in self.cells})} "
-            f"learners, {len(ends)} runs: {ends.count('done')} done, "
+            f"{len(self.subjects)} subject{'s' * (len(self.subjects) != 1)}, "
+            f"{len({cell.learner for cell in self.cells})} learners, "
+            f"{len(ends)} runs: {ends.count('done')} done, "
             f"{ends.count('timeout')} timed out, {ends.count('failed')} failed"
         )
 

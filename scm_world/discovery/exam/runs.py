@@ -195,7 +195,7 @@ class Bench:
         self, job: Job, made: Subject, found: Found, table: Dataset | None
     ) -> dict[str, float | int | None]:
         truth = made.truth
-        compared = evaluate(found, truth.edges, names=truth.names, pairs=pairs_of(truth))
+        compared = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
         plain = {k: v for k, v in compared.as_dict().items() if isinstance(v, int | float | None)}
         scores: dict[str, float | int | None] = {**plain, "sid": compared.sid}
         if table is not None and not job.standardised:
@@ -207,15 +207,6 @@ class Bench:
             self._test.append(made.test(job.seed))
         test = self._test[0]
         return None if test is None else effect_rmse(found, table, test).rmse
-
-
-def pairs_of(truth: Truth) -> np.ndarray[Any, Any]:
-    """Say which pairs are scored, shape (p, p)."""
-    at = {name: i for i, name in enumerate(truth.names)}
-    mask = np.ones((len(at), len(at)), bool)
-    for one, other in truth.left_out:
-        mask[at[one], at[other]] = mask[at[other], at[one]] = False
-    return mask
 
 
 # --- processes ----------------------------------------------------------------------------------

@@ -18,11 +18,12 @@ from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write
 from scm_world.discovery.exam.runs import Job, Runner, shown_name, source_for
 from scm_world.discovery.exam.subjects import TaskView, check_subject, subject
 from scm_world.discovery.exam.tables import write_tables
-from scm_world.discovery.learners.registry import SOURCES, learner
+from scm_world.discovery.learners.registry import SOURCES, Learner, learner
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.policies import as_policy
 from scm_world.queries.progress import Progress
+from scm_world.tasks import TASKS
 from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/study/1"
@@ -71,15 +72,19 @@ class Study:
         for budget in self.budgets:
             whole_number("budget", budget, least=1)
         whole_number("seeds", self.seeds, least=1)
+        self._check_learners()
+
+    def _check_learners(self) -> None:
         for kind in self.data:
             if kind not in SOURCES:
                 raise UnknownOption("kind of data", kind, SOURCES)
-        for name in self.learners:
-            chosen = learner(name)
+        for chosen in map(learner, self.learners):
             if not chosen.is_installed:
                 raise MissingExtra(chosen.package, chosen.extra)
             for kind in self.data:
                 source_for(chosen, kind)
+            for name in self.subjects:
+                _check_fit(chosen, name)
 
     def _check_names_and_time(self) -> None:
         shown = tuple(shown_name(name, self.view) for name in self.subjects)
@@ -121,6 +126,20 @@ class Study:
     def as_dict(self) -> dict[str, Any]:
         """Write it as plain data."""
         return {"format": FORMAT, **asdict(self)}
+
+
+def _check_fit(chosen: Learner, name: str) -> None:
+    """Refuse a learner whose own experiments cannot be done on a subject.
+
+    Raises:
+        UnknownOption: With what can be done.
+    """
+    if chosen.on == "worlds":
+        bodies = ("a learner of variables; this one is of bodies: scm_world.discovery.learn(…)",)
+        raise UnknownOption("learner in an exam", chosen.name, bodies)
+    if chosen.on == "models" and name in TASKS:
+        models = ("families of models and files of models", "'paired' for a task")
+        raise UnknownOption(f"subject of {chosen.name}", name, models)
 
 
 def slug(name: str) -> str:

@@ -16,7 +16,7 @@ from scm_world.discovery.exam.families import DONE, FAMILIES, check_family, is_f
 from scm_world.discovery.exam.results import Truth
 from scm_world.discovery.learners.apparatus import Apparatus, Model
 from scm_world.discovery.learners.worlds import Outcomes, Steps
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json
 from scm_world.queries.face import World
 from scm_world.queries.identification import nature_graph
@@ -106,8 +106,8 @@ class TaskView:
     Attributes:
         view: ``"outcome"``: one row per episode: what it begins with, and what it ends with.
             ``"step"``: one row per control step.
-        causes: Patterns of what varies; the physical parameters if None, and in the view of
-            outcomes where the blocks begin.
+        causes: Patterns of what varies, as far as it has a space A; the physical parameters if
+            None, and in the view of outcomes where the blocks begin.
         outcomes: Names of variables; the states of joints and blocks, and success, if None.
         policy: Who acts, as ``rollout`` takes it.
         steps: Control steps of an episode.
@@ -155,7 +155,12 @@ class TaskSubject:
         """Choose what varies: with what is computed from it, since that can be set, too."""
         world, model = self._world, self._world.model
         if self._view.causes is not None:
-            return settable(world, self._view.causes)
+            named = settable(world, self._view.causes)
+            found = tuple(name for name in named if self._varies(name))
+            if not found:
+                varying = [name for name in settable(world, ("*",)) if self._varies(name)]
+                raise UnknownVariable(", ".join(self._view.causes), varying)
+            return found
         chosen = default_causes(world)
         starts = tuple(name for name in settable(world, ("*",)) if self._is_start(name))
         if self._view.view == "step" or len(starts) > MOST_STARTS:
@@ -170,6 +175,14 @@ class TaskSubject:
             and any(parent.name in chosen for parent in model.declared(name).all_parents)
         )
         return (*chosen, *follow, *starts)
+
+    def _varies(self, name: str) -> bool:
+        """Tell whether values can be drawn for a variable, which is no other name of one."""
+        model = self._world.model
+        if self._is_start(name):
+            return self._view.view == "outcome"
+        variable = model.declared(name)
+        return model.target(name) == name and variable.space("A") is not None
 
     @property
     def _nature(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ class Found:
             the numbers means something. 0 or 1 where it does not say.
         learner: Name of the learner.
         settings: Of the learner.
-        experiments: How many episodes or control steps it used.
+        experiments: How many episodes or control steps it used: rows of data, or experiments.
         bound: Fewest experiments that can do in theory, if one is known; see ``design``.
         seconds: How long it took.
         versions: Of the libraries that it is made of.

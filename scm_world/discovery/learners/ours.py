@@ -14,10 +14,22 @@ PAIRED = register(
     Learner("paired", paired, ("paired",), doc="one variable at a time, same noise: exact")
 )
 POOLED = register(
-    Learner("pooled", sparse_pooled, ("paired",), doc="all variables at once: few causes, exact")
+    Learner(
+        "pooled",
+        sparse_pooled,
+        ("paired",),
+        "models",
+        doc="all numbers at once: few causes each",
+    )
 )
 COLORING = register(
-    Learner("coloring", verified, ("paired",), doc="checks a declared graph, one color at a time")
+    Learner(
+        "coloring",
+        verified,
+        ("paired",),
+        "models",
+        doc="checks a graph, color by color",
+    )
 )
 DO_ORDER = register(
     Learner("do_order", do_order, ("do",), doc="order by invariance, edges by regression")
@@ -31,8 +43,20 @@ DO_ORDER_RANKS = register(
     )
 )
 LOCAL = register(
-    Learner("local", learn_local, ("paired",), doc="bodies of a world: who touched whom, and when")
+    Learner(
+        "local",
+        learn_local,
+        ("paired",),
+        "worlds",
+        doc="bodies: who acted on whom, and when",
+    )
 )
 NULL = register(
-    Learner("null", learn_null, ("paired",), doc="bodies of a world: one is taken away at a time")
+    Learner(
+        "null",
+        learn_null,
+        ("paired",),
+        "worlds",
+        doc="bodies: one is taken away at a time",
+    )
 )

@@ -33,6 +33,8 @@ class Learner:
             edge without direction. ``data`` is a ``Dataset``, or an ``Apparatus`` for ``"paired"``.
         takes: The kinds of data it can use: ``"see"`` (nothing is done), ``"do"`` (known targets),
             ``"paired"`` (it does its own experiments, with the same noise).
+        on: What its own experiments are done on: ``"any"`` apparatus, ``"models"`` whose variables
+            are numbers, or ``"worlds"`` for a graph of their bodies.
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
             steps as further columns.
         extra: The optional dependency it needs; empty if none.
@@ -43,6 +45,7 @@ class Learner:
     name: str
     learn: Callable[..., Any]
     takes: tuple[Source, ...] = ("see", "do")
+    on: Literal["any", "models", "worlds"] = "any"
     temporal: bool = False
     extra: str = ""
     package: str = ""
@@ -111,7 +114,8 @@ def _imported(name: str) -> Learner:
     try:
         found = getattr(import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        raise UnknownOption("learner", f"{name} ({error})", ("module:attribute",)) from None
+        allowed = (f"module:attribute of a module that can be imported ({error})",)
+        raise UnknownOption("learner", name, allowed) from None
     if isinstance(found, Learner):
         return found
     if not callable(found):
@@ -142,6 +146,7 @@ def learn(
     chosen = learner(given) if isinstance(given, str) else given
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
+    _refuse_other(chosen, data)
     table = data
     if isinstance(data, Dataset) and data.is_temporal and not chosen.temporal:
         table = data.lagged()
@@ -161,6 +166,22 @@ def learn(
         else found.experiments,
         versions={**found.versions, **version},
     )
+
+
+def _refuse_other(chosen: Learner, data: Any) -> None:
+    """Refuse what a learner cannot use.
+
+    Raises:
+        ModelError: It needs data, or something to experiment on, of another kind.
+    """
+    if isinstance(data, Dataset):
+        if chosen.takes == ("paired",):
+            raise ModelError([f"{chosen.name} does its own experiments: it cannot use a Dataset"])
+    elif "paired" not in chosen.takes:
+        raise ModelError([f"{chosen.name} learns from a Dataset, not from {type(data).__name__}"])
+    elif chosen.on == "models" and not hasattr(data, "answers"):
+        what = type(data).__name__
+        raise ModelError([f"{chosen.name} moves several numbers at once, on models; not on {what}"])
 
 
 def _of_columns(chosen: Learner, table: Any, matrix: Any) -> Found:

@@ -1,0 +1,55 @@
+"""Options that several commands have."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Format(StrEnum):
+    """How a graph is written down."""
+
+    TABLE = "table"
+    DOT = "dot"
+    JSON = "json"
+    PNG = "png"
+    HTML = "html"
+    GML = "gml"
+    GRAPHML = "graphml"
+    NODE_LINK = "node-link"
+    DAGITTY = "dagitty"
+    CSV = "csv"
+
+
+Task = Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.")]
+Backend = Annotated[str, typer.Option(help="Physics engine: mujoco, bullet or fake.")]
+Preset = Annotated[str, typer.Option(help="Numerical settings: fast or precise.")]
+Seed = Annotated[int, typer.Option(min=0, help="Of every random choice.")]
+Arguments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option",
+        metavar="NAME=VALUE",
+        help="Argument of the task, such as num_of_levels=2; give it once for each argument.",
+    ),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Folder for the results.", show_default="under scm-world-results"),
+]
+
+
+Acts = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="NAME=VALUE...",
+        help="A number, a list 1,2,3 or [1,2,3], shift:0.1, scale:2, or draw:A.",
+    ),
+]
+Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
+Policy = Annotated[
+    str, typer.Option(help="random, sweep: the fingertips go to the middle, or still.")
+]
