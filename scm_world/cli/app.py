@@ -119,7 +119,10 @@ def discover(
     outcome: Annotated[
         list[str] | None, typer.Option(help="Variable that is measured; repeat it for more.")
     ] = None,
-    policy: Policy = "sweep",
+    policy: Annotated[
+        str,
+        typer.Option(help="random, sweep, across, still; sweep or, by step, random if usual."),
+    ] = "usual",
     steps: Steps = 25,
     sensor_noise: Annotated[
         float, typer.Option(min=0.0, help="Standard deviation, in halves of a range.")

@@ -172,8 +172,8 @@ def view(
     """
     if name not in VIEWS:
         raise UnknownOption("view", name, VIEWS)
-    if policy not in POLICIES:
-        raise UnknownOption("policy", policy, POLICIES)
+    if policy not in (*POLICIES, "usual"):
+        raise UnknownOption("policy", policy, (*POLICIES, "usual"))
     return TaskView(
         view=name,
         causes=tuple(causes) if causes else None,

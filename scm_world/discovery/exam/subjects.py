@@ -109,7 +109,8 @@ class TaskView:
         causes: Patterns of what varies, as far as it has a space A; the physical parameters if
             None, and in the view of outcomes where the blocks begin.
         outcomes: Names of variables; the states of joints and blocks, and success, if None.
-        policy: Who acts, as ``rollout`` takes it.
+        policy: Who acts, as ``rollout`` takes it; ``"usual"`` is ``"sweep"`` in the view of
+            outcomes, and ``"random"`` by step, so that actions follow from nothing.
         steps: Control steps of an episode.
         sensor_noise: Standard deviation, as a fraction of half the range of what is measured.
         options: Of the world: backend, preset.
@@ -119,11 +120,17 @@ class TaskView:
     view: str = "outcome"
     causes: tuple[str, ...] | None = None
     outcomes: tuple[str, ...] | None = None
-    policy: str | None = "sweep"
+    policy: str | None = "usual"
     steps: int = STEPS
     sensor_noise: float = SENSED
     options: dict[str, Any] = field(default_factory=dict)
     arguments: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def acts(self) -> str | None:
+        """Who acts."""
+        usual = {"outcome": "sweep", "step": "random"}
+        return usual[self.view] if self.policy == "usual" else self.policy
 
 
 @final
@@ -227,7 +234,7 @@ class TaskSubject:
             "kind": f"task, view by {view.view}",
             "budget": "episodes" if view.view == "outcome" else "control steps",
             "engine": f"{backend.name} {backend.version}",
-            "policy": view.policy,
+            "policy": view.acts,
             "steps": view.steps,
             "sensor_noise": view.sensor_noise,
             "options": {k: str(v) for k, v in view.options.items()},
@@ -244,7 +251,7 @@ class TaskSubject:
             episodes,
             seed=seed,
             steps=self._view.steps,
-            policy=self._view.policy,
+            policy=self._view.acts,
             nature=self._nature,
             causes=self._causes,
             outcomes=self._outcomes,
@@ -273,7 +280,7 @@ class TaskSubject:
         nature = {n: act for n, act in self._nature.items() if n != "sensor_noise"}
         length = self._view.steps
         settings = (
-            Setting(self._view.policy, nature, length, seed),
+            Setting(self._view.acts, nature, length, seed),
             Setting("across", nature, length, seed),
             *(Setting(None, {**nature, **self._thrown(fast)}, length, seed) for fast in THROWN),
         )

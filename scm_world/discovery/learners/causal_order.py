@@ -77,14 +77,19 @@ class Rows:
         return replace(self, x=table[:, :-1], one=table[:, -1], targeted=np.concatenate(masks))
 
 
-def before_each(rows: Rows, causes: Bools) -> Bools:
-    """Say which column may act on which, shape (p, p): causes that come before it."""
-    p = rows.x.shape[1]
-    may = np.zeros((p, p), bool)
+def before_each(rows: Rows, effects: Bools, causes: Bools) -> Bools:
+    """Say which column may act on which, shape (p, p): causes that come before it.
+
+    Args:
+        rows: Standardised.
+        effects: The columns that are asked about, shape (p,).
+        causes: What may act on them, shape (p,).
+    """
+    may = np.zeros((len(causes), len(causes)), bool)
     always = causes & (rows.past | (_free(rows) < causes.sum() + SPARE))
-    left = np.flatnonzero(causes & ~always).tolist()
+    left = np.flatnonzero(causes & effects & ~always).tolist()
     base = np.flatnonzero(always)
-    may[np.ix_(np.flatnonzero(causes), np.flatnonzero(~causes & ~rows.past))] = True
+    may[np.ix_(np.flatnonzero(causes), np.flatnonzero(effects & ~causes))] = True
     moments = _Moments(rows)
     order: list[int] = []
     while left:

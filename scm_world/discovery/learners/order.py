@@ -8,6 +8,9 @@ Only what was intervened on somewhere can be found to be a cause: what was merel
 effect, never a cause. Nor is it found to be a cause of what was set in all the same rows. Earlier
 control steps are causes without that, because time has an order.
 
+What stands still in an episode (a mass) is an effect only of what does so too, at once, and acts on
+the rest one step later.
+
 It assumes that effects add up (``features`` gives them curves) and that no unobserved variable acts
 on two of those that were intervened on. Scales do not matter: standardised data give the same.
 """
@@ -15,7 +18,8 @@ on two of those that were intervened on. Scales do not matter: standardised data
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, final
 
 import numpy as np
 
@@ -68,7 +72,7 @@ def do_order(
         raise UnknownOption("q", q, ("a share between 0 and 1",))
     if not isinstance(features, int) or features not in POWERS:
         raise UnknownOption("features", features, map(str, POWERS))
-    rows = _rows(data, blocks)
+    rows, still = _rows(data, blocks), _still(data)
     causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
     if not causes.any():
         raise ModelError(
@@ -77,10 +81,12 @@ def do_order(
                 "no earlier control steps"
             ]
         )
-    summed = rows.summed()
-    before = before_each(summed, causes)
-    straight = features == 1 and not ranks and not spread
-    p_values = _tested(summed if straight else rows, before, features, ranks, spread)
+    form = _Form(features, ranks, spread)
+    p_values = _tested(rows, ~still & ~rows.past, causes & ~still, form)
+    if still.any():  # one row of each episode: the others say the same once more
+        _, first = np.unique(data.episode, return_index=True)
+        begins = _rows(data.rows(first), blocks)
+        p_values[:, still] = _tested(begins, still, causes & still, form)[:, still]
     told = _told(rows)
     p_values[~np.array([told[where].any(axis=0) for where in rows.blocks])] = 2.0
     tested = p_values <= 1.0
@@ -93,20 +99,51 @@ def do_order(
     return Found.of(data.names, matrix, sureness=sure, settings=settings, notes=notes)
 
 
+@final
+@dataclass(frozen=True)
+class _Form:
+    """In which form causes may act; see ``do_order``."""
+
+    features: int
+    ranks: bool
+    spread: bool
+
+    @property
+    def is_straight(self) -> bool:
+        return self.features == 1 and not self.ranks and not self.spread
+
+
 def _rows(data: Dataset, blocks: bool) -> Rows:
     n = len(data)
     if n < 3:
         raise ModelError([f"do_order needs some rows, got {n}"])
     together = tuple(data.blocks.values()) if blocks else tuple(np.arange(len(data.names))[:, None])
     past = np.array([column.lag > 0 for column in data.columns])
-    return Rows(data.standardised().values, np.ones(n), data.targeted, together, past)
+    values = data.standardised().values
+    return Rows(values, np.ones(n), data.targeted, together, past)
+
+
+def _still(data: Dataset) -> Bools:
+    """Tell which columns are the same as their own value one control step before."""
+    at = {name: i for i, name in enumerate(data.names)}
+    earlier = [at.get(f"{name}@-1") for name in data.names]
+    return np.array(
+        [
+            then is not None and np.array_equal(data.values[:, now], data.values[:, then])
+            for now, then in enumerate(earlier)
+        ]
+    )
 
 
 # --- edges --------------------------------------------------------------------------------------
 
 
-def _tested(rows: Rows, before: Bools, features: int, ranks: bool, spread: bool) -> Floats:
+def _tested(rows: Rows, effects: Bools, causes: Bools, form: _Form) -> Floats:
     """Test every block of causes on every column; 2 where there is no test, shape (blocks, p)."""
+    summed = rows.summed()
+    before = before_each(summed, effects, causes)
+    rows, features = summed if form.is_straight else rows, form.features
+    ranks, spread = form.ranks, form.spread
     terms, owner = _features(rows, features)
     found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
     for column in np.flatnonzero(before.any(axis=0) & rows.alive).tolist():
