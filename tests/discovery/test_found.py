@@ -145,8 +145,10 @@ def test_a_plain_matrix_is_a_graph() -> None:
     assert found.sureness[0, 0, 1] == 2.0
     with pytest.raises(ModelError, match="has shape"):
         learn(Learner("bad", lambda data, seed: np.zeros((2, 2))), TABLE)
+    with pytest.raises(ModelError, match="learns from a Dataset, not from object"):
+        learn(Learner("bad", lambda data, seed: np.zeros((3, 3))), object())
     with pytest.raises(ModelError, match="has to give a Found"):
-        learn(Learner("bad", lambda data, seed: np.zeros((2, 2))), object())
+        learn(Learner("bad", lambda data, seed: np.zeros((2, 2)), ("paired",)), object())
 
 
 def test_an_edge_into_the_past_is_turned() -> None:

@@ -266,7 +266,7 @@ def _begun(study: Study, folder: Path) -> None:
         if folder.exists() and not _is_free(folder):
             advice = "give an empty folder, or one of an earlier exam"
             raise UnreadableFile(str(folder), "it holds something else", advice)
-        as_policy(study.view.policy)
+        as_policy(study.view.acts)
         for name in study.subjects:
             subject(name, view=study.view).close()
         folder.mkdir(parents=True, exist_ok=True)
