@@ -16,7 +16,7 @@ from scm_world.discovery.exam.html import write_report
 from scm_world.discovery.exam.pictures import draw_budget
 from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json, write_whole
 from scm_world.discovery.exam.runs import Job, Runner, shown_name, source_for
-from scm_world.discovery.exam.subjects import TaskView, check_subject, subject
+from scm_world.discovery.exam.subjects import VIEWS, TaskView, check_subject, subject
 from scm_world.discovery.exam.tables import write_tables
 from scm_world.discovery.learners.registry import SOURCES, Learner, learner
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
@@ -266,6 +266,8 @@ def _begun(study: Study, folder: Path) -> None:
         if folder.exists() and not _is_free(folder):
             advice = "give an empty folder, or one of an earlier exam"
             raise UnreadableFile(str(folder), "it holds something else", advice)
+        if study.view.view not in VIEWS:
+            raise UnknownOption("view", study.view.view, VIEWS)
         as_policy(study.view.acts)
         for name in study.subjects:
             subject(name, view=study.view).close()
