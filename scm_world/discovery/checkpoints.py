@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, final
 
+from scm_world.discovery.data.durable import write_durably
 from scm_world.errors import UnreadableFile
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.paired import Paired
@@ -69,9 +70,7 @@ class Checkpoint:
             "memory": paired.memory(),
         }
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        part = self._path.with_suffix(".part")
-        part.write_text(json.dumps(data), encoding="utf-8")
-        part.replace(self._path)
+        write_durably(self._path, json.dumps(data).encode())
 
     def end(self) -> None:
         """Remove the file: there is a result now."""

@@ -229,9 +229,9 @@ def test_a_vector_is_one_cause() -> None:
     assert found.names == ("v", "y")
     assert found.directed == (("v", "y", 0),)
     assert not any("not told" in note for note in found.notes)
-    whole = learn("do_order", data, level="component")
+    whole = learn("do_order", data, level="component", blocks=True)
     assert {cause for cause, *_ in whole.directed} == {"v[0]", "v[1]", "v[2]"}
-    alone = learn("do_order", data, level="component", blocks=False)
+    alone = learn("do_order", data, level="component")
     assert alone.directed == (("v[1]", "y", 0),)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from scm_world.discovery.data import Dataset
+from scm_world.discovery.learners import Found
 from scm_world.errors import ModelError
 
 MARK = "SCM_WORLD_TEST_MARK"
@@ -70,3 +71,8 @@ def dies(data: Dataset, *, seed: int = 0) -> Any:
 def leaves(data: Dataset, *, seed: int = 0) -> Any:
     """Think that it is a program."""
     raise SystemExit(4)
+
+
+def unwritable(data: Dataset, *, seed: int = 0) -> Found:
+    """Find nothing, with a setting that no file can hold."""
+    return Found.of_edges(data.names, [], settings={"what": print})

@@ -89,7 +89,8 @@ class Dataset:
         about: Where the rows come from: system, seed, backend, versions and so on; plain data.
 
     Raises:
-        ModelError: The shapes do not fit together, or a number is not finite.
+        ModelError: The shapes do not fit together, a number is not finite, or the rows of an
+            episode do not stand together with rising steps.
 
     Example:
         >>> table = Dataset.of([[0.0, 1.0], [2.0, 5.0]], ["x", "y"], targets=[(), ("x",)])
@@ -128,6 +129,8 @@ class Dataset:
             and not 0 <= self.regime.min() <= self.regime.max() < len(self.regimes)
         ):
             problems.append(f"a row refers to a regime that is not among {len(self.regimes)}")
+        if not problems:
+            problems += disorder(self.episode, self.step)
         if problems:
             raise ModelError(problems)
 
@@ -279,9 +282,13 @@ class Dataset:
 
     def standardised(self) -> Dataset:
         """Give every column mean 0 and variance 1 over all rows; constant ones become 0."""
-        mean, spread = self.values.mean(axis=0), self.values.std(axis=0)
-        spread = np.where(spread > 1e-12 * (1.0 + np.abs(mean)), spread, np.inf)
-        return replace(self, values=(self.values - mean) / spread)
+        # In units of their own size, a power of two, so that no square overflows or vanishes.
+        largest = np.abs(self.values).max(axis=0, initial=0.0)
+        scaled = np.ldexp(self.values, -np.frexp(largest)[1])
+        mean, spread = scaled.mean(axis=0), scaled.std(axis=0)
+        spread = np.where(spread > 1e-12, spread, np.inf)
+        about = {**self.about, "standardised": True}
+        return replace(self, values=(scaled - mean) / spread, about=about)
 
     def lagged(self, lags: int = 1) -> Dataset:
         """Put earlier control steps beside each row, as further columns ``name@-1``.
@@ -306,20 +313,20 @@ class Dataset:
             for column in self.columns
         ]
         parts = [self.values[whole - lag] for lag in range(lags + 1)]
-        wide = replace(
+        return replace(
             self.rows(whole),
             values=np.concatenate(parts, axis=1),
             columns=(*self.columns, *earlier),
+            about={**self.about, "lags": lags},
         )
-        wide.about["lags"] = lags
-        return wide
 
     @classmethod
     def joined(cls, parts: Sequence[Dataset]) -> Dataset:
         """Put tables of one kind below one another.
 
         Raises:
-            ModelError: They differ in columns or in where they come from, or there is none.
+            ModelError: They differ in columns or in where they come from, two have the same
+                episodes, or there is none.
         """
         if not parts:
             raise ModelError(["there is no table to join"])
@@ -340,6 +347,35 @@ class Dataset:
             episode=np.concatenate([part.episode for part in parts]),
             step=np.concatenate([part.step for part in parts]),
         )
+
+
+def disorder(episode: Ints, step: Ints) -> list[str]:
+    """Say where rows of one episode do not stand together, with rising steps.
+
+    Example:
+        >>> disorder(np.array([4, 4, 7]), np.array([0, 1, 0]))
+        []
+        >>> disorder(np.array([4, 4, 7]), np.array([1, 0, 0]))[0]
+        'the rows of episode 4 do not stand together in time: sort the rows by episode and step'
+    """
+    starts = np.flatnonzero(np.diff(episode, prepend=episode[:1] - 1))
+    _, begun = np.unique(episode[starts], return_index=True)
+    again = np.delete(starts, begun)
+    back = np.flatnonzero((np.diff(episode) == 0) & (np.diff(step) <= 0)) + 1
+    if not again.size and not back.size:
+        return []
+    pairs, times = np.unique(np.stack([episode, step]), axis=1, return_counts=True)
+    if times.max() > 1:
+        number, instant = pairs[:, times.argmax()]
+        return [
+            f"two rows are step {instant} of episode {number}: if two tables have the same episode "
+            "numbers, give one of them others; if not, give each row of an episode its own step"
+        ]
+    number = episode[min([*again, *back])]
+    return [
+        f"the rows of episode {number} do not stand together in time: sort the rows by episode "
+        "and step"
+    ]
 
 
 def block(column: Column) -> str:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scm_world.discovery.data.dataset import Dataset
+from scm_world.discovery.data.dataset import Dataset, Regime
 from scm_world.discovery.data.folders import SHARD, Folder, Head, head_of, read_sidecar
-from scm_world.discovery.data.shards import check_kind
+from scm_world.discovery.data.shards import check_kind, content_of
 from scm_world.discovery.data.sources import Part
 from scm_world.errors import ModelError, UnreadableFile
 from scm_world.world.start import whole_number
@@ -43,7 +43,7 @@ def load(folder: Path | str, *, trusted: Sequence[str] = (), partial: bool = Fal
     for index, numbers in enumerate(ranges):
         part = files.read(index, numbers)
         if part is None and not partial:
-            advice = "collect again with the same settings to go on, or load it with partial=True"
+            advice = f"{files.again} to go on, or load it with partial=True"
             raise UnreadableFile(str(files.shard(index)), "it is not there yet", advice)
         if part is not None:
             parts.append(part)
@@ -83,7 +83,7 @@ def save(
         format: ``"parquet"`` or ``"csv"``.
 
     Raises:
-        UnreadableFile: Something else is in the folder.
+        UnreadableFile: Something else is in the folder, be it a dataset with other numbers only.
         UnwritableFolder: There is no room, or no permission.
         ModelError: A part of it cannot be written.
     """
@@ -93,20 +93,26 @@ def save(
         raise ModelError(
             [f"what the dataset says about itself is no plain data: {error}"]
         ) from None
-    episodes = np.unique(dataset.episode)
+    table = _trimmed(dataset)
+    starts = np.flatnonzero(np.diff(table.episode, prepend=table.episode[:1] - 1))
+    ends = [*starts, len(table)]
     size = whole_number("shard", shard, least=1)
-    head = Head(about, dataset.columns, len(episodes), size, format)
+    head = Head(about, table.columns, len(starts), size, format, content=content_of(table))
     files = Folder(folder, head)
     with files.opened():
+        files.note({})
         for index, numbers in enumerate(head.ranges()):
-            rows = dataset.rows(np.isin(dataset.episode, episodes[numbers.start : numbers.stop]))
+            rows = table.rows(slice(ends[numbers.start], ends[numbers.stop]))
             files.write(index, numbers, Part(_trimmed(rows)))
         files.note({}, complete=True)
     return files.path
 
 
 def _trimmed(table: Dataset) -> Dataset:
-    """Leave out the regimes that no row has."""
-    used, regime = np.unique(table.regime, return_inverse=True)
-    kept = tuple(table.regimes[number] for number in used)
-    return replace(table, regimes=kept, regime=regime.astype(np.int64))
+    """Number the regimes as they occur, each once, and leave out those that no row has."""
+    used, first = np.unique(table.regime, return_index=True)
+    kept: dict[Regime, int] = {}
+    number = np.zeros(len(table.regimes), dtype=np.int64)
+    for old in used[np.argsort(first)]:
+        number[old] = kept.setdefault(table.regimes[old], len(kept))
+    return replace(table, regimes=tuple(kept), regime=number[table.regime])

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
 from scm_world.discovery.data.dataset import Column
+from scm_world.discovery.data.durable import PARTIAL, draft_of, locked, write_durably
 from scm_world.discovery.data.shards import Place, check_kind, check_names, decoded, encoded
 from scm_world.discovery.data.sources import FORMAT, Part
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile, UnwritableFolder
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
 from scm_world.world.start import whole_number
 
 SIDECAR = "dataset.json"
 SHARD = 100
 """Episodes in a file by default."""
-
-_PARTIAL = ".part"
 
 
 @final
@@ -38,6 +35,8 @@ class Head:
         shard: How many of them are in a file.
         kind: Of the files: ``"parquet"`` or ``"csv"``.
         edges: The declared graph, if it may be known.
+        content: Sums up the rows of a dataset that was saved; None of one that is collected, of
+            which ``about`` decides the rows.
     """
 
     about: dict[str, Any]
@@ -46,6 +45,7 @@ class Head:
     shard: int = SHARD
     kind: str = "parquet"
     edges: tuple[Edge, ...] | None = None
+    content: str | None = None
 
     @property
     def terms(self) -> dict[str, Any]:
@@ -55,6 +55,7 @@ class Head:
             "columns": [asdict(column) for column in self.columns],
             "shard": self.shard,
             "files": self.kind,
+            "content": self.content,
         }
         plain: dict[str, Any] = json.loads(json.dumps(found))
         return plain
@@ -110,12 +111,25 @@ class Folder:
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             if isinstance(error, ModelError) and "trusted" in str(error):
                 raise
-            advice = "delete it, and collect again with the same settings: only it is made anew"
+            advice = f"delete it, and {self.again}: only it is made anew"
             raise UnreadableFile(str(path), str(error), advice) from None
-        if place.first != numbers.start or place.stop > numbers.start + head.shard:
-            reason = f"it holds the episodes from {place.first} to {place.stop - 1}"
-            raise UnreadableFile(str(path), reason, "put it back under its own name")
+        self._check_place(path, place, numbers)
         return part if place.stop >= numbers.stop else None
+
+    def _check_place(self, path: Path, place: Place, numbers: range) -> None:
+        reason = f"it holds the episodes from {place.first} to {place.stop - 1}"
+        if place.first != numbers.start or place.stop > numbers.start + self.head.shard:
+            raise UnreadableFile(str(path), reason, "put it back under its own name")
+        if place.stop > numbers.stop:
+            reason += f", and {SIDECAR} says that there are {self.head.n} in all"
+            raise UnreadableFile(str(path), reason, f"put the {SIDECAR} back that belongs to it")
+
+    @property
+    def again(self) -> str:
+        """Say how a file that is missing can be made."""
+        if self.head.content is None:
+            return "collect again with the same settings"
+        return "save the same dataset again"
 
     def write(self, index: int, numbers: range, part: Part) -> None:
         """Write a file; it is there as a whole, or not at all.
@@ -124,7 +138,7 @@ class Folder:
             UnwritableFolder: There is no room, or no permission.
         """
         place = Place(self._plan, numbers.start, numbers.stop)
-        _put(self.shard(index), encoded(part, place, self.head.kind))
+        write_durably(self.shard(index), encoded(part, place, self.head.kind))
 
     # --- the sidecar --------------------------------------------------------------------------
 
@@ -139,30 +153,16 @@ class Folder:
         """
         check_kind(self.head.kind)
         check_names(self.head.columns)
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            handle = os.open(self.path, os.O_RDONLY)
-        except OSError as error:
-            raise UnwritableFolder(str(self.path), error.strerror or str(error)) from None
-        try:
-            self._hold(handle)
+        with locked(self.path):
             self._begin()
             yield
-        finally:
-            os.close(handle)
-
-    def _hold(self, handle: int) -> None:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process
-        except OSError:
-            reason = "another process is writing to it"
-            raise UnreadableFile(str(self.path), reason, "wait, or give another folder") from None
 
     def _begin(self) -> None:
-        for stale in self.path.glob(f".*.*{_PARTIAL}"):  # of a process that was killed
-            if stale.name.startswith((".shard-", f".{SIDECAR}")):
+        sidecar = self.path / SIDECAR
+        for stale in self.path.glob(f".*.*{PARTIAL}"):  # of a process that was killed
+            if stale.name.startswith(".shard-") or stale == draft_of(sidecar):
                 stale.unlink(missing_ok=True)
-        if (self.path / SIDECAR).exists():
+        if sidecar.exists():
             self._check_same(read_sidecar(self.path))
         elif any(not path.name.startswith(".") for path in self.path.iterdir()):
             reason = f"it holds other files, and no {SIDECAR}"
@@ -193,7 +193,7 @@ class Folder:
             complete: Whether all files are there.
         """
         graph = None if self.head.edges is None else [list(e.key) for e in self.head.edges]
-        lines = {
+        lines: dict[str, Any] = {
             "format": FORMAT,
             "n": self.head.n,
             "complete": complete,
@@ -202,37 +202,18 @@ class Folder:
             **self.head.terms,
             "graph": graph,
         }
+        lines["checksum"] = _checksum(lines)
         rows = ",\n".join(f' "{key}": {json.dumps(value)}' for key, value in lines.items())
         data = f"{{\n{rows}\n}}\n".encode()
         path = self.path / SIDECAR
         if not path.exists() or path.read_bytes() != data:
-            _put(path, data)
+            write_durably(path, data)
 
 
-def _put(path: Path, data: bytes) -> None:
-    draft = path.with_name(f".{path.name}{_PARTIAL}")
-    try:
-        with draft.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        draft.replace(path)
-        _sync(path.parent)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise UnwritableFolder(str(path.parent), f"{path.name}: {reason}") from None
-    finally:
-        with suppress(OSError):
-            draft.unlink(missing_ok=True)
-
-
-def _sync(folder: Path) -> None:
-    """Make a new name in a folder outlast a loss of power."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def _checksum(lines: Mapping[str, Any]) -> str:
+    """Sum up all that a sidecar says besides."""
+    rest = {key: value for key, value in lines.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def read_sidecar(folder: Path) -> dict[str, Any]:
@@ -245,7 +226,11 @@ def read_sidecar(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         head = head_of(found)
-        is_right = found["format"] == FORMAT and found["plan"] == head.plan
+        is_right = (
+            found["format"] == FORMAT
+            and found["plan"] == head.plan
+            and found["checksum"] == _checksum(found)
+        )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnreadableFile(str(path), f"it describes no dataset ({error})", advice) from None
     if not is_right:
@@ -263,4 +248,4 @@ def head_of(found: Mapping[str, Any]) -> Head:
     )
     graph = found["graph"]
     edges = None if graph is None else tuple(Edge(*key) for key in graph)
-    return Head(found["about"], columns, n, shard, found["files"], edges)
+    return Head(found["about"], columns, n, shard, found["files"], edges, found["content"])

@@ -74,11 +74,23 @@ def encoded(part: Part, place: Place, kind: str) -> bytes:
         "refused": [list(pair) for pair in part.refused],
         **_regimes(part.table.regimes),
     }
-    table = part.table
-    numbers = {name: getattr(table, name) for name in NUMBERS}
-    raw = Raw(header, numbers, target_texts(table), table.values)
+    raw = _raw(header, part.table)
     header["checksum"] = _checksum(raw)
-    return CODECS[kind][0](raw, table.names)
+    return CODECS[kind][0](raw, part.table.names)
+
+
+def content_of(table: Dataset) -> str:
+    """Sum up the rows of a table and what was done in them.
+
+    Raises:
+        ModelError: A plan has a function without a name.
+    """
+    return _checksum(_raw(_regimes(table.regimes), table))
+
+
+def _raw(header: dict[str, Any], table: Dataset) -> Raw:
+    numbers = {name: getattr(table, name) for name in NUMBERS}
+    return Raw(header, numbers, target_texts(table), table.values)
 
 
 def decoded(
@@ -222,9 +234,15 @@ def _to_csv(raw: Raw, names: Sequence[str]) -> bytes:
 
 def _from_csv(data: bytes, names: Sequence[str]) -> Raw:
     first, _, rest = data.decode().partition("\n")
-    rows = list(csv.reader(io.StringIO(rest, newline="")))
+    try:
+        rows = list(csv.reader(io.StringIO(rest, newline="")))
+    except csv.Error as error:
+        raise ValueError(f"it is no whole CSV file ({error})") from None
     if not rows or rows[0] != [*RESERVED, *names]:
         raise ValueError("it has other columns")
+    for number, row in enumerate(rows[1:], start=1):
+        if len(row) != len(rows[0]):
+            raise ValueError(f"row {number} has {len(row)} cells, not {len(rows[0])}")
     k = len(NUMBERS)
     numbers = np.array([row[:k] for row in rows[1:]], dtype=np.int64).reshape(-1, k)
     values = np.array([row[k + 1 :] for row in rows[1:]], dtype=np.float64)

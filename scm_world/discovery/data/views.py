@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import json
+from collections.abc import Container, Iterable
+from contextlib import suppress
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
@@ -81,22 +84,28 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     """Read a frame that ``as_frame`` wrote, or any with a column ``intervention_targets``.
 
     Args:
-        frame: Rows and columns may have been taken away or reordered.
+        frame: Rows of whole instants and columns may have been taken away, columns reordered. Of a
+            frame without ``attrs`` (read from a CSV file, say) the targets may be a text: names
+            with semicolons, or a tuple as Python writes it.
         trusted: Packages whose functions may be mechanisms of its plans.
 
     Raises:
-        ModelError: It has no column ``intervention_targets``, or other columns than numbers.
+        ModelError: It has no column ``intervention_targets``, or other columns than numbers; a
+            target is no column any more; or rows of an episode do not stand together.
+        UnknownVariable: The frame has no ``attrs``, and a target is no column.
     """
     if TARGETS not in frame:
         raise ModelError([f"the frame has no column {TARGETS!r}: None, or a tuple of names, each"])
     names = [name for name in frame.columns if name not in (*NUMBERS, TARGETS)]
-    values = frame[names].to_numpy(dtype=np.float64)
+    values = _values(frame, names)
+    empty = frame[TARGETS].isna()
+    given = [() if none else _names_in(c) for c, none in zip(frame[TARGETS], empty, strict=True)]
     if KEY not in frame.attrs:
-        given = [_names_in(cell) for cell in frame[TARGETS]]
         rows = {n: frame[n].to_numpy() for n in ("episode", "step") if n in frame}
         return Dataset.of(values, names, targets=given, **rows)
     about = json.loads(frame.attrs[KEY])
     columns = {column["name"]: Column(**column) for column in about["columns"]}
+    _check_targets(names, columns, {name for cell in given for name in cell})
     numbers = {name: frame[name].to_numpy(dtype=np.int64) for name in NUMBERS}
     return Dataset(
         values=values,
@@ -107,13 +116,48 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     )
 
 
+def _values(frame: Any, names: list[Any]) -> Floats:
+    missing = [name for name in NUMBERS if name not in frame and KEY in frame.attrs]
+    problems = [f"the frame has no column {name!r} any more" for name in missing]
+    if any(str(name).startswith("Unnamed: ") for name in names):
+        problems.append("a column holds the numbers of the rows: write CSV with index=False")
+    if problems:
+        raise ModelError(problems)
+    try:
+        return np.asarray(frame[names].to_numpy(dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise ModelError([f"the columns of a frame have to be numbers: {error}"]) from None
+
+
+def _check_targets(names: list[Any], known: Container[str], targets: set[str]) -> None:
+    """Refuse columns that were renamed while the targets were not, or the other way round."""
+    new = [name for name in names if name not in known]
+    lost = sorted(targets - set(names)) if new else sorted(t for t in targets if t not in known)
+    if lost or targets & set(new):
+        raise ModelError(
+            [
+                f"the columns were renamed or added to ({', '.join(map(str, new)) or 'no new ones'}"
+                f"), and the targets are {', '.join(sorted(targets))}: rename both, and then "
+                f"`del frame.attrs[{KEY!r}]`, or neither"
+            ]
+        )
+
+
 def _names_in(cell: Any) -> tuple[str, ...]:
-    """Read a cell: a name, several with semicolons or in a sequence, or none."""
-    if cell is None or (isinstance(cell, float) and np.isnan(cell)):
-        return ()
+    """Read a cell: names with semicolons, or in a sequence or the text of one.
+
+    Example:
+        >>> [_names_in(cell) for cell in ("a; b", "('a', 'b')", ["a", "b"])]
+        [('a', 'b'), ('a', 'b'), ('a', 'b')]
+    """
+    if isinstance(cell, str) and cell.startswith(("(", "[")):
+        with suppress(ValueError, SyntaxError):  # else it is a name like that
+            cell = ast.literal_eval(cell)
     if isinstance(cell, str):
         return tuple(name.strip() for name in cell.split(";") if name.strip())
-    return tuple(cell)
+    if isinstance(cell, Iterable):
+        return tuple(map(str, cell))
+    raise ModelError([f"{TARGETS} has {cell!r}: it can be None, names with ';', or a tuple"])
 
 
 # --- tigramite --------------------------------------------------------------------------------

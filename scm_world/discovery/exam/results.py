@@ -13,6 +13,7 @@ from typing import Any, TypeVar, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world.discovery.data.durable import write_durably
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import SOURCES
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
@@ -275,16 +276,26 @@ def read_truth(path: Path | str) -> Truth:
 
 def write_json(thing: Cell | Truth | Exam, path: Path | str) -> None:
     """Write a cell, a subject or an exam as JSON, whole or not at all."""
-    text = json.dumps(thing.as_dict(), indent=1, allow_nan=False, default=_plain)
-    write_whole(text + "\n", path)
+    write_whole(as_text(thing), path)
+
+
+def as_text(thing: Cell | Truth | Exam) -> str:
+    """Write a cell, a subject or an exam as JSON.
+
+    Raises:
+        TypeError: A setting or a note is something that JSON cannot hold.
+        ValueError: A number is not finite.
+    """
+    return json.dumps(thing.as_dict(), indent=1, allow_nan=False, default=_plain) + "\n"
 
 
 def write_whole(text: str, path: Path | str) -> None:
-    """Write a text as UTF-8, whole or not at all."""
-    target = Path(path)
-    part = target.with_name(target.name + ".part")
-    part.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
-    part.replace(target)
+    """Write a text as UTF-8, whole or not at all.
+
+    Raises:
+        UnwritableFolder: There is no room, or no permission.
+    """
+    write_durably(path, text.encode("utf-8", errors="backslashreplace"))
 
 
 def _read(path: Path | str, make: Callable[[Mapping[str, Any]], _T], advice: str) -> _T:

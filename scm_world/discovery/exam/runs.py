@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import multiprocessing
 import os
@@ -20,7 +19,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.exam.results import Cell, Truth
+from scm_world.discovery.exam.results import Cell, Truth, as_text
 from scm_world.discovery.exam.subjects import Subject, TaskView, subject
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import Learner, learn, learner
@@ -29,6 +28,9 @@ from scm_world.errors import EngineFailure, MissingExtra, ScmWorldError, Unknown
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 """One thread each: seconds are those of one core, and sums do not depend on the machine."""
+
+
+LONGEST = 1e6  # [s] that can be waited for at once
 
 
 @final
@@ -131,29 +133,33 @@ class Bench:
     def run(self, job: Job) -> Cell:
         """Run a job; what goes wrong in a learner is written down in the cell."""
         made = self._of(job)
-        chosen = learner(job.learner)
+        table = None if job.data == "paired" else self._rows(job, made)
         started = time.perf_counter()
         try:
-            if job.data == "paired":
-                table, found = None, self._experimented(job, chosen, made)
-            else:
-                table = self._rows(job, made)
-                started = time.perf_counter()
-                found = learn(chosen, table, seed=job.seed)
+            return self._ran(job, made, table)
         except MissingExtra:
             raise
         except Exception as error:  # of whatever kind: learners are not all ours
             seconds = time.perf_counter() - started
             return job.cell(status="failed", message=_said(error), seconds=seconds)
+
+    def _ran(self, job: Job, made: Subject, table: Dataset | None) -> Cell:
+        chosen = learner(job.learner)
+        if table is None:
+            found = learn(chosen, made.apparatus(job.seed), seed=job.seed, budget=job.budget)
+        else:
+            found = learn(chosen, table, seed=job.seed)
         own = made.truth.edges if job.seed else None
-        return job.cell(
+        cell = job.cell(
             found=found.restricted(made.truth.names),
-            scores=self._scores(job, made, found, table),
+            scores=self._scores(made, found, table, even=job.standardised, seed=job.seed),
             seconds=found.seconds,
             experiments=found.experiments,
             bound=found.bound,
             declared=own if own != self._shown(job) else None,
         )
+        as_text(cell)  # what cannot be written has failed
+        return cell
 
     def _of(self, job: Job) -> Subject:
         key = (job.subject, job.seed, repr(job.view))
@@ -184,27 +190,20 @@ class Bench:
         part = whole.first(math.ceil(job.budget / each))
         return part.standardised() if job.standardised else part
 
-    def _experimented(self, job: Job, chosen: Learner, made: Subject) -> Found:
-        settings: dict[str, Any] = {"budget": job.budget}
-        if "declared" in inspect.signature(chosen.learn).parameters:
-            settings["declared"] = made.truth.edges
-        found = learn(chosen, made.apparatus(job.seed), seed=job.seed, **settings)
-        return found.told(settings={"budget": job.budget})
-
     def _scores(
-        self, job: Job, made: Subject, found: Found, table: Dataset | None
+        self, made: Subject, found: Found, table: Dataset | None, *, even: bool, seed: int
     ) -> dict[str, float | int | None]:
         truth = made.truth
         compared = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
         plain = {k: v for k, v in compared.as_dict().items() if isinstance(v, int | float | None)}
         scores: dict[str, float | int | None] = {**plain, "sid": compared.sid}
-        if table is not None and not job.standardised:
-            scores["effect_rmse"] = self._predicted(job, made, found, table)
+        if table is not None and not even:
+            scores["effect_rmse"] = self._predicted(made, found, table, seed)
         return scores
 
-    def _predicted(self, job: Job, made: Subject, found: Found, table: Dataset) -> float | None:
+    def _predicted(self, made: Subject, found: Found, table: Dataset, seed: int) -> float | None:
         if not self._test:
-            self._test.append(made.test(job.seed))
+            self._test.append(made.test(seed))
         test = self._test[0]
         return None if test is None else effect_rmse(found, table, test).rmse
 
@@ -252,7 +251,7 @@ class Runner:
     """
 
     def __init__(self, timeout: float | None = None) -> None:
-        self._timeout = timeout
+        self._timeout = None if timeout is None else min(timeout, LONGEST)
         self._process: Any = None
         self._pipe: Any = None
         self._ready: set[tuple[str, int, str]] = set()

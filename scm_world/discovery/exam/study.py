@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +18,7 @@ from scm_world.discovery.exam.html import write_report
 from scm_world.discovery.exam.pictures import draw_budget
 from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json, write_whole
 from scm_world.discovery.exam.runs import Job, Runner, shown_name, source_for
-from scm_world.discovery.exam.subjects import VIEWS, TaskView, check_subject, subject
+from scm_world.discovery.exam.subjects import VIEWS, TaskView, check_subject, subject, subject_mark
 from scm_world.discovery.exam.tables import write_tables
 from scm_world.discovery.learners.registry import SOURCES, Learner, learner
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
@@ -27,6 +29,7 @@ from scm_world.tasks import TASKS
 from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/study/1"
+PACKAGE = "scm_world"
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 
@@ -91,7 +94,7 @@ class Study:
         for what, names in (("subjects", shown), ("learners", self.learners), ("data", self.data)):
             if len(set(names)) < len(names):
                 raise UnknownOption(what, ", ".join(names), ("names, each of them once",))
-        if self.timeout is not None and not self.timeout > 0.0:
+        if self.timeout is not None and not 0.0 < self.timeout < math.inf:
             raise UnknownOption("timeout", self.timeout, ("seconds, more than 0", "None"))
 
     @property
@@ -134,6 +137,9 @@ def _check_fit(chosen: Learner, name: str) -> None:
     Raises:
         UnknownOption: With what can be done.
     """
+    if chosen.claims:
+        claims = ("a learner that is not handed the graph; 'coloring' checks one",)
+        raise UnknownOption("learner in an exam", chosen.name, claims)
     if chosen.on == "worlds":
         bodies = ("a learner of variables; this one is of bodies: scm_world.discovery.learn(…)",)
         raise UnknownOption("learner in an exam", chosen.name, bodies)
@@ -251,7 +257,11 @@ def _ran(runner: Runner, folder: Path, job: Job) -> Cell:
     """Read the result of a run, or run it and write it."""
     path = cell_path(folder, job)
     if path.exists():
-        return read_cell(path)
+        cell = read_cell(path)
+        if cell.key != job.cell(status="failed").key:
+            reason, advice = "it is of another run", "delete it, and this run is done again"
+            raise UnreadableFile(str(path), reason, advice)
+        return cell
     cell = runner.run(job)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(cell, path)
@@ -260,7 +270,9 @@ def _ran(runner: Runner, folder: Path, job: Job) -> Cell:
 
 def _begun(study: Study, folder: Path) -> None:
     """Begin a folder, or check that it is one of the same study."""
-    head = json.loads(json.dumps({**study.as_dict(), "versions": versions()}))
+    marks = {name: subject_mark(name) for name in study.subjects}
+    marks |= {name: _source_mark(learner(name)) for name in study.learners}
+    head = json.loads(json.dumps({**study.as_dict(), "versions": versions(), "marks": marks}))
     path = folder / "study.json"
     if not path.exists():
         if folder.exists() and not _is_free(folder):
@@ -283,6 +295,18 @@ def _begun(study: Study, folder: Path) -> None:
     if different:
         reason = f"it is one of another exam: {', '.join(different)} differ"
         raise UnreadableFile(str(folder), reason, "give another folder")
+
+
+def _source_mark(chosen: Learner) -> str:
+    """Give something that changes with the code of a learner that is not of this package."""
+    function = getattr(chosen.learn, "func", chosen.learn)
+    try:
+        file = inspect.getsourcefile(inspect.unwrap(function))
+    except TypeError:
+        file = None
+    if file is None or function.__module__.partition(".")[0] == PACKAGE:
+        return ""  # versions say it
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
 
 
 def _is_free(folder: Path) -> bool:

@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, final
 
-import networkx as nx
+import numpy as np
 
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_label, settable
 from scm_world.discovery.exam.families import DONE, FAMILIES, check_family, is_family, model
 from scm_world.discovery.exam.results import Truth
+from scm_world.discovery.exam.views import VIEWS, TaskView, place, projected
 from scm_world.discovery.learners.apparatus import Apparatus, Model
 from scm_world.discovery.learners.worlds import Outcomes, Steps
 from scm_world.errors import UnknownOption, UnknownVariable, UnreadableFile
-from scm_world.graph import SCM, from_json
+from scm_world.graph import SCM, from_json, to_json
 from scm_world.queries.face import World
 from scm_world.queries.identification import nature_graph
 from scm_world.queries.outcomes import as_outcome
-from scm_world.queries.samples import STEPS, Setting
+from scm_world.queries.samples import Setting
 from scm_world.tasks import TASKS, make_task
-from scm_world.variables import Box, Derived, Draw, Exogenous
+from scm_world.variables import Box, Derived, Exogenous
 
-VIEWS = ("outcome", "step")
 FEW = 10  # control steps of an episode of a model through time
-SENSED = 0.005  # noise of the sensors, as a fraction of half a range
 START, HEIGHT = ".cartesian_position", ".cylindrical_position"
-HALF = 0.045  # [m] half the side of the square in which a block begins
 THROWN = ((1.5, 1.8, 0.0), (2.6, -1.5, 0.0))
 """How fast blocks are thrown [m/s]: between two fingers to the wall, and so that they come back."""
 MOST_STARTS = 3  # blocks that find room, each in a sector of its own
@@ -70,22 +67,25 @@ class ModelSubject:
         edges = tuple(edge.key for edge in scm.edges)
         about = {"kind": "model", "budget": "rows"}
         self.truth = Truth(name=name, names=tuple(scm), edges=edges, about=about)
-        self._targets = tuple(v.name for v in scm.variables if v.settable)
+        values = {v.name: _values_of(v) for v in scm.variables if v.settable}
+        self._values = {name: act for name, act in values.items() if act is not None}
+        self._targets = tuple(self._values)
 
     def data(self, source: str, budget: int, seed: int, **options: Any) -> Dataset:
-        """Collect rows; under ``"do"``, a sixth as many again are watched only as one target has.
+        """Collect rows; under ``"do"``, twice as many are watched as are set for one target.
 
         The shares are those of 1,000 watched rows beside 500 for each variable.
         """
         seen = 2.0 / (len(self._targets) + 2.0)
-        design = Design() if source == "see" else Design("single", self._targets, DONE, seen)
+        done = source != "see" and self._targets
+        design = Design("single", self._targets, self._values, seen) if done else Design()
         episodes = budget if self._steps is None else -(-budget // self._steps)
         circumstances: Any = {} if self._steps is None else {"steps": self._steps}
         return collect(self._scm, design, episodes, seed=seed, **circumstances, **options)
 
     def test(self, seed: int) -> Dataset | None:
-        """Set each variable in turn to 2, where no one has seen it."""
-        if self._steps is not None:
+        """Set each variable in turn to 2, where no one has seen it; None if one cannot be 2."""
+        if self._steps is not None or any(act != DONE for act in self._values.values()):
             return None
         design = Design("single", self._targets, 2.0, seen=0.0)
         return collect(self._scm, design, 200 * len(self._targets), seed=seed + 1_000_000)
@@ -96,41 +96,6 @@ class ModelSubject:
 
     def close(self) -> None:
         """There is nothing to give back."""
-
-
-@final
-@dataclass(frozen=True)
-class TaskView:
-    """How a task is looked at.
-
-    Attributes:
-        view: ``"outcome"``: one row per episode: what it begins with, and what it ends with.
-            ``"step"``: one row per control step.
-        causes: Patterns of what varies, as far as it has a space A; the physical parameters if
-            None, and in the view of outcomes where the blocks begin.
-        outcomes: Names of variables; the states of joints and blocks, and success, if None.
-        policy: Who acts, as ``rollout`` takes it; ``"usual"`` is ``"sweep"`` in the view of
-            outcomes, and ``"random"`` by step, so that actions follow from nothing.
-        steps: Control steps of an episode.
-        sensor_noise: Standard deviation, as a fraction of half the range of what is measured.
-        options: Of the world: backend, preset.
-        arguments: Of the task.
-    """
-
-    view: str = "outcome"
-    causes: tuple[str, ...] | None = None
-    outcomes: tuple[str, ...] | None = None
-    policy: str | None = "usual"
-    steps: int = STEPS
-    sensor_noise: float = SENSED
-    options: dict[str, Any] = field(default_factory=dict)
-    arguments: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def acts(self) -> str | None:
-        """Who acts."""
-        usual = {"outcome": "sweep", "step": "random"}
-        return usual[self.view] if self.policy == "usual" else self.policy
 
 
 @final
@@ -205,7 +170,7 @@ class TaskSubject:
         }
         for number, name in enumerate(starts):
             standing: Any = model.declared(name.removesuffix(START) + HEIGHT).a
-            drawn[name] = _place(standing.low[2], number, len(starts))
+            drawn[name] = place(standing.low[2], number, len(starts))
         noise = {"sensor_noise": self._view.sensor_noise} if self._view.sensor_noise else {}
         return {**drawn, **noise}
 
@@ -216,7 +181,7 @@ class TaskSubject:
         named = {n: f"{first_label(model, n)} {n}".strip() for n in self._causes}
         node = {f"{model.target(n)}@0" if first_label(model, n) else n: f for n, f in named.items()}
         node |= {outcome: outcome for outcome in outcomes}
-        edges = tuple((node[c], node[e], 0) for c, e in _projected(graph, node))
+        edges = tuple((node[c], node[e], 0) for c, e in projected(graph, node))
         ends = tuple(dict.fromkeys(outcomes))
         pairs = tuple((a, b) for i, a in enumerate(ends) for b in ends[i + 1 :])
         names = (*named.values(), *ends)
@@ -298,33 +263,20 @@ class TaskSubject:
         self._world.close()
 
 
-def _projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
-    """Leave out nodes that follow from others without noise: their causes act in their place."""
-    found = set()
-    for cause in kept:
-        ahead = [cause] if cause in graph else []
-        while ahead:
-            for effect in graph.successors(ahead.pop()):
-                if effect in kept:
-                    found.add((cause, effect))
-                else:
-                    ahead.append(effect)
-    return sorted(found)
+def _values_of(variable: Any) -> Any:
+    """Say what a variable of a model is set to: its space A, its bounds, or N(2, 1).
 
-
-def _place(height: Any, number: int, count: int) -> Draw:
-    """Draw where one of several blocks begins: near the middle, at least as high as it has to be.
-
-    Args:
-        height: Of its center, as its space A says.
-        number: Of the block.
-        count: Of the blocks.
+    None if it is a whole number or bounded on one side, and says nothing of what it can be.
     """
-    far = 0.0 if count == 1 else 0.075
-    angle = 2.0 * math.pi * number / count
-    x, y = far * math.cos(angle), far * math.sin(angle)
-    half = HALF if count == 1 else 0.2 * HALF
-    return Draw(Box((x - half, y - half, height), (x + half, y + half, height)))
+    if variable.space("A") is not None:
+        return "A"
+    if variable.bounds is None:
+        return DONE if variable.dtype == "real" else None
+    if isinstance(variable.bounds, Box):
+        low, high = variable.bounds.low, variable.bounds.high
+        ends = np.ravel([low, high]) if not variable.bounds.parents() else np.zeros(2)
+        return variable.bounds if np.isfinite(ends.astype(float)).all() else None
+    return variable.bounds
 
 
 def subject(name: str, *, seed: int = 0, view: TaskView | None = None) -> Subject:
@@ -361,6 +313,13 @@ def check_subject(name: str) -> None:
     elif name not in TASKS:
         families = (f"{family}:N" for family in FAMILIES)
         raise UnknownOption("subject", name, (*TASKS, *families, "FILE.json"))
+
+
+def subject_mark(name: str) -> str:
+    """Give something that changes with what is in the file of a model; else it is empty."""
+    if not name.endswith(".json") or name in TASKS:
+        return ""
+    return hashlib.sha256(to_json(_read(Path(name))).encode()).hexdigest()[:16]
 
 
 def _read(path: Path) -> SCM:

@@ -57,6 +57,10 @@ class Movable(Apparatus, Protocol):
         """What answers; each is one number."""
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What one should know of what it does not show."""
+
+    @property
     def used(self) -> int:
         """How many experiments there were."""
 
@@ -96,6 +100,8 @@ class Model:
         self._model, self._seed = model, seed
         lags = {edge.lag for edge in model.edges}
         self.lag = max(lags, default=0) if lag is None else lag
+        others = lags - {self.lag}
+        self.notes = (f"edges of lag {self.lag} only, and there are others",) if others else ()
         self.names = tuple(model)
         self.causes = self.watched = self.names
         self.used = 0

@@ -71,12 +71,12 @@ class Found:
             names: Of the p variables.
             matrix: Shape (p, p) for lag 0, or (lags + 1, p, p); not zero at [i, j] where i acts on
                 j. An edge in both directions within an instant has none.
-            sureness: Same shape; that of the matrix if None.
+            sureness: Same shape, not negative; the absolute values of the matrix if None.
             lags: Which lags a matrix of shape (k, p, p) speaks of; 0 to k - 1 if None.
             others: Further attributes.
 
         Raises:
-            ModelError: The shapes do not fit together.
+            ModelError: The shapes do not fit together, or a number is not finite, or negative.
 
         Example:
             >>> found = Found.of(["x", "y", "z"], [[0, 1, 0], [0, 0, 1], [0, 1, 0]])
@@ -88,7 +88,11 @@ class Found:
         if given.ndim != 3 or given.shape[1:] != (len(names), len(names)):
             what = f"a graph of {len(names)} variables has shape {given.shape}"
             raise ModelError([what + f", not ({len(names)}, {len(names)})"])
-        weight = given if sureness is None else np.array(sureness).reshape(given.shape)
+        weight = np.abs(given) if sureness is None else np.array(sureness).reshape(given.shape)
+        if not np.isfinite(given).all() or not np.isfinite(weight).all():
+            raise ModelError(["a graph has numbers that are not finite; put 0 where is no edge"])
+        if (weight < 0).any():
+            raise ModelError(["sureness is negative; of a log-probability give the negative one"])
         if lags is not None:
             at = list(lags)
             wide = np.zeros((max(at) + 1, *given.shape[1:]))
@@ -97,7 +101,7 @@ class Found:
             given, weight = wide, heavy
         edges = given != 0
         np.fill_diagonal(edges[0], False)
-        return cls(tuple(names), edges, np.abs(weight.astype(np.float64)), **others)
+        return cls(tuple(names), edges, weight.astype(np.float64), **others)
 
     @classmethod
     def of_edges(cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: Any) -> Found:

@@ -140,7 +140,9 @@ def _pooled_found(apparatus: Movable, weights: Floats, open_: Bools) -> Found:
     matrix[apparatus.lag][np.ix_(cause, effect)] = weights
     degree = max(1, int((weights != 0).sum(axis=0).max(initial=0)))
     left = [name for name, is_open in zip(apparatus.watched, open_, strict=True) if is_open]
-    notes = (f"not explained within the budget: {', '.join(left)}",) if left else ()
+    notes = apparatus.notes
+    if left:
+        notes += (f"not explained within the budget: {', '.join(left)}",)
     return Found.of(
         names,
         matrix,

@@ -2,7 +2,8 @@
 
 First the order (see ``causal_order``), then the edges: each variable is regressed on those before
 it, over the rows in which it was not intervened on itself. A cause is kept if it explains more
-than chance would; over all tests the share of false edges is bounded.
+than chance would; over all tests the share of false edges is bounded, as long as effects are what
+their causes add up to. Where they are not, a note says so.
 
 Only what was intervened on somewhere can be found to be a cause: what was merely watched is an
 effect, never a cause. Nor is it found to be a cause of what was set in all the same rows. Earlier
@@ -25,7 +26,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools, Dataset
-from scm_world.discovery.learners.causal_order import EXACT, RIDGE, Ints, Rows, before_each
+from scm_world.discovery.learners.causal_order import EXACT, RIDGE, SPARE, Ints, Rows, before_each
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.statistics import (
     SMALLEST,
@@ -36,6 +37,8 @@ from scm_world.discovery.learners.statistics import (
 from scm_world.errors import ModelError, UnknownOption
 
 POWERS = (1, 2, 3, 4)
+SOME = 2000  # rows on which it is looked whether effects add up
+CURVED = 1e-4  # how improbable it has to be that they do
 
 
 def do_order(
@@ -94,7 +97,7 @@ def do_order(
     chosen[tested] = discoveries(p_values[tested], q)
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = _columns(rows, chosen), _columns(rows, weight)
-    notes = _notes(data, rows, causes, told)
+    notes = (*_notes(data, rows, causes, told), *_bent(rows, matrix, form))
     settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}
     return Found.of(data.names, matrix, sureness=sure, settings=settings, notes=notes)
 
@@ -201,6 +204,43 @@ def _tails(design: Floats, answers: list[Floats], blocks: dict[int, Ints]) -> di
             p = regression_tail(explained, left, len(where), free)
             found[b] = min(found[b], len(answers) * p)
     return found
+
+
+def _bent(rows: Rows, matrix: Bools, form: _Form) -> tuple[str, ...]:
+    """Tell how many effects are not what their causes add up to.
+
+    Source:
+        Ramsey, *Tests for specification errors in classical linear least-squares regression
+        analysis*, JRSS B 1969: powers of what is foretold explain nothing that is left.
+    """
+    terms, owner = _features(rows, form.features)
+    some = np.linspace(0, len(terms) - 1, min(len(terms), SOME)).astype(np.int64)
+    effects = np.flatnonzero(matrix.any(axis=0)).tolist()
+    bent = 0
+    for column in effects:
+        free = some[~rows.targeted[some, column]]
+        design = terms[free][:, matrix[owner, column]]
+        y = _answers(rows.x[free, column], form.ranks, spread=False)[0]
+        known = np.concatenate([design, np.ones((len(free), 1))], axis=1)
+        if len(free) < 2 * known.shape[1] + SPARE:
+            continue
+        foretold = known @ np.linalg.lstsq(known, y, rcond=None)[0]
+        wide = np.concatenate([known, foretold[:, None] ** 2, foretold[:, None] ** 3], axis=1)
+        before, after = (
+            float(np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2))
+            for part in (known, wide)
+        )
+        rest = len(free) - wide.shape[1]
+        exact = before <= EXACT * len(free)
+        bent += not exact and regression_tail(before - after, after, 2, rest) < CURVED / len(
+            effects
+        )
+    if not bent:
+        return ()
+    return (
+        f"{bent} of {len(effects)} effects are not what their causes add up to: the share of false "
+        "edges is not bounded by q",
+    )
 
 
 def _is_poor(sums: Floats) -> bool:

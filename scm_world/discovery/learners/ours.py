@@ -28,6 +28,7 @@ COLORING = register(
         verified,
         ("paired",),
         "models",
+        claims=True,
         doc="checks a graph, color by color",
     )
 )

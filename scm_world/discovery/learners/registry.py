@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
+import inspect
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -33,6 +33,7 @@ class Learner:
             edge without direction. ``data`` is a ``Dataset``, or an ``Apparatus`` for ``"paired"``.
         takes: The kinds of data it can use: ``"see"`` (nothing is done), ``"do"`` (known targets),
             ``"paired"`` (it does its own experiments, with the same noise).
+        claims: Whether it is handed the declared graph, to check it: no exam for learners.
         on: What its own experiments are done on: ``"any"`` apparatus, ``"models"`` whose variables
             are numbers, or ``"worlds"`` for a graph of their bodies.
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
@@ -46,6 +47,7 @@ class Learner:
     learn: Callable[..., Any]
     takes: tuple[Source, ...] = ("see", "do")
     on: Literal["any", "models", "worlds"] = "any"
+    claims: bool = False
     temporal: bool = False
     extra: str = ""
     package: str = ""
@@ -150,6 +152,8 @@ def learn(
     table = data
     if isinstance(data, Dataset) and data.is_temporal and not chosen.temporal:
         table = data.lagged()
+    if "blocks" in _settings_of(chosen):  # what is told apart has to be tested apart
+        settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
     result = chosen.learn(table, seed=seed, **settings)
     seconds = time.perf_counter() - started
@@ -161,9 +165,7 @@ def learn(
         learner=chosen.name,
         settings={**found.settings, **settings},
         seconds=seconds,
-        experiments=len(np.unique(data.episode))
-        if isinstance(data, Dataset)
-        else found.experiments,
+        experiments=len(data) if isinstance(data, Dataset) else found.experiments,
         versions={**found.versions, **version},
     )
 
@@ -184,6 +186,13 @@ def _refuse_other(chosen: Learner, data: Any) -> None:
         raise ModelError([f"{chosen.name} moves several numbers at once, on models; not on {what}"])
 
 
+def _settings_of(chosen: Learner) -> tuple[str, ...]:
+    try:
+        return tuple(inspect.signature(chosen.learn).parameters)
+    except (TypeError, ValueError):  # a function that is not of Python
+        return ()
+
+
 def _of_columns(chosen: Learner, table: Any, matrix: Any) -> Found:
     if not isinstance(table, Dataset):
         raise ModelError([f"the learner {chosen.name!r} has to give a Found"])
@@ -194,8 +203,11 @@ def _folded(found: Found, table: Dataset, level: Level) -> Found:
     """Take the columns of a variable together, and earlier columns as lags."""
     columns = {column.name: column for column in table.columns}
     unknown = [name for name in found.names if name not in columns]
-    if unknown:
+    if unknown and set(found.names) <= set(table.blocks):
         return found  # it speaks of variables already
+    if unknown:
+        what = f"a learner found a graph of {unknown[0]!r}, which is not in the data"
+        raise ModelError([f"{what}; there are: {', '.join(table.names)}"])
     base = [columns[n].variable if level == "variable" else n.split("@-")[0] for n in found.names]
     lag_of = np.array([columns[n].lag for n in found.names])
     names = tuple(dict.fromkeys(base))
