@@ -1,5 +1,6 @@
 """Discovery that is interrupted, or killed, goes on where it was."""
 
+import errno
 import json
 import os
 import signal
@@ -14,7 +15,9 @@ import pytest
 
 from scm_world import World, discover
 from scm_world.discovery import DiscoveryReport
-from scm_world.errors import UnreadableFile
+from scm_world.discovery.data import durable
+from scm_world.discovery.exam.results import write_whole
+from scm_world.errors import UnreadableFile, UnwritableFolder
 
 PROBES = 5
 
@@ -86,6 +89,40 @@ def test_checkpoints_of_others_are_refused(tmp_path: Path) -> None:
         pytest.raises(UnreadableFile, match="task differ"),
     ):
         discover(other, probes=2, seed=3, checkpoint=path)
+
+
+def test_files_are_on_the_disk_before_they_have_their_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the disk fails, the last checkpoint and the last text are as they were."""
+    path, text = tmp_path / "progress.json", tmp_path / "study.json"
+    write_whole("first\n", text)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left")
+
+    with World("pushing", backend="fake") as world:
+        interrupted(world, path, 1)
+        before = path.read_bytes()
+        monkeypatch.setattr(durable.os, "fsync", full)
+        with pytest.raises(UnwritableFolder, match=r"progress\.json: No space left"):
+            discover(world, probes=PROBES, seed=3, checkpoint=path)
+    with pytest.raises(UnwritableFolder, match=r"study\.json: No space left"):
+        write_whole("second\n", text)
+    assert (path.read_bytes(), text.read_text()) == (before, "first\n")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["progress.json", "study.json"]
+
+
+def test_a_folder_has_one_writer(tmp_path: Path) -> None:
+    """While it is locked a second one is refused, and then no more."""
+    with (
+        durable.locked(tmp_path / "new"),
+        pytest.raises(UnreadableFile, match="another process"),
+        durable.locked(tmp_path / "new"),
+    ):
+        pass
+    with durable.locked(tmp_path / "new"):
+        assert (tmp_path / "new").is_dir()
 
 
 def test_a_killed_command_goes_on(tmp_path: Path) -> None:

@@ -10,16 +10,24 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from scm_world import SCM, Box, Exogenous
-from scm_world.cli.app import app
-from scm_world.discovery.data import Dataset, Design, UnwritableFolder, collect, folders, load, save
+from scm_world.discovery.data import (
+    Dataset,
+    Design,
+    UnwritableFolder,
+    collect,
+    durable,
+    folders,
+    load,
+    save,
+)
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.queries import World
 from scm_world.variables import Mechanism
@@ -286,12 +294,28 @@ def test_a_sidecar_is_checked(copied: Path, tmp_path: Path) -> None:
     """Missing, cut or changed, it is named."""
     path = copied / "dataset.json"
     text = path.read_text()
-    for spoiled in (text[:-10], text.replace('"seed": 5', '"seed": 6'), "[]", "{}"):
+    changes = [
+        ('"seed": 5', '"seed": 6'),
+        ('"n": 10', '"n": 9'),
+        ('"complete": true', '"complete": false'),
+        ('"graph": [[', '"graph": [["gravity", "reward", 0], ['),
+    ]
+    changed = [text.replace(*change) for change in changes]
+    assert text not in changed
+    for spoiled in (text[:-10], *changed, "[]", "{}"):
         path.write_text(spoiled)
         with pytest.raises(UnreadableFile, match=r"dataset\.json"):
             load(copied)
     with pytest.raises(UnreadableFile, match=r"dataset\.json"):
         load(tmp_path / "nowhere")
+
+
+def test_a_sidecar_that_says_fewer_is_refused(copied: Path) -> None:
+    """Files with more episodes than the sidecar says are not cut silently."""
+    head = folders.head_of(folders.read_sidecar(copied))
+    folders.Folder(copied, replace(head, n=9)).note({}, complete=True)
+    with pytest.raises(UnreadableFile, match=r"shard-00002.*8 to 9.*there are 9 in all"):
+        load(copied)
 
 
 def test_a_folder_with_other_things_is_left_alone(world: World, tmp_path: Path) -> None:
@@ -326,7 +350,7 @@ def test_a_full_disk_loses_nothing(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:
-        patched.setattr(folders.os, "fsync", full)
+        patched.setattr(durable.os, "fsync", full)
         with pytest.raises(UnwritableFolder, match=r"shard-00001.*No space left"):
             collect(world, DESIGN, 10, out=tmp_path, format=kind, **HOW)
     assert sorted(contents(tmp_path)) == ["dataset.json", f"shard-00000.{kind}"]
@@ -349,46 +373,3 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     path = Path(__file__).parents[2] / "examples" / "collect.py"
     runpy.run_path(str(path))["main"](episodes=20)
     assert "rows with do(nothing)" in capsys.readouterr().out
-
-
-# --- the command ------------------------------------------------------------------------------
-
-
-COMMAND = ["collect", "pushing", "--backend", "fake", "--steps", "2", "--shard", "5"]
-
-
-def test_the_command_collects(tmp_path: Path) -> None:
-    """It says how often each target was one, and where the files are."""
-    arguments = ["--n", "12", "--target", "tool_block.*ss", "--outcome", "max:reward"]
-    more = ["--cause", "gravity", "--nature", "sensor_noise=0.01", "--out", str(tmp_path)]
-    done = CliRunner().invoke(app, [*COMMAND, *arguments, *more])
-    assert done.exit_code == 0, done.output
-    assert "do(tool_block.mass)" in done.output
-    found = load(tmp_path)
-    assert found.variables == ("gravity", "tool_block.mass", "max reward")
-    assert len(found) == 12
-    assert CliRunner().invoke(app, [*COMMAND, *arguments, *more]).exit_code == 0
-
-
-def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
-    """A typo gives exit code 2 and no folder."""
-    for wrong in (["--values", "C"], ["--design", "sigle"], ["--target", "tool_blok.*"]):
-        done = CliRunner().invoke(app, [*COMMAND, *wrong, "--out", str(tmp_path / "new")])
-        assert done.exit_code == 2, done.output
-    assert not (tmp_path / "new").exists()
-
-
-def test_ctrl_c_on_the_command_line(tmp_path: Path) -> None:
-    """It exits 130, says how many files are safe, and the same command goes on."""
-    command = [sys.executable, "-m", "scm_world", *COMMAND, "--n", "3000", "--out"]
-    with subprocess.Popen(  # noqa: S603 # our own text
-        [*command, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    ) as process:
-        while process.poll() is None and len(list(tmp_path.glob("shard-*"))) < 2:
-            time.sleep(0.001)
-        process.send_signal(signal.SIGINT)
-        text = process.communicate()[0]
-    assert process.returncode == 130
-    there = len(list(tmp_path.glob("shard-*")))
-    assert f"interrupted: {there} of 600 files are safe" in text
-    assert len(load(tmp_path, partial=True)) == 5 * there

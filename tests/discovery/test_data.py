@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 
@@ -87,6 +89,51 @@ def test_tables_from_elsewhere_are_not_joined(table: Dataset, series: Dataset) -
         Dataset.joined([table, series])
 
 
+@pytest.mark.parametrize(
+    ("episode", "step", "message"),
+    [
+        ([3, 5, 3], [0, 0, 1], "rows of episode 3 do not stand together.*sort"),
+        ([5, 3, 3], [0, 1, 0], "rows of episode 3 do not stand together.*sort"),
+        ([3, 5, 3], [0, 0, 0], "step 0 of episode 3: if two tables have the same episode numbers"),
+    ],
+)
+def test_rows_of_an_episode_stand_together(
+    episode: list[int], step: list[int], message: str
+) -> None:
+    """With rising steps; else the episode is named, and what to do."""
+    pandas = pytest.importorskip("pandas")
+    with pytest.raises(ModelError, match=message):
+        Dataset.of([[0.0]] * 3, ["x"], episode=episode, step=step)
+    frame = pandas.DataFrame({"episode": episode, "step": step, "x": 0.0})
+    frame["intervention_targets"] = None
+    with pytest.raises(ModelError, match=message):
+        from_frame(frame)
+
+
+def test_tables_with_the_same_episodes_are_not_joined(series: Dataset) -> None:
+    """Which rows follow which would be lost."""
+    with pytest.raises(ModelError, match="two tables have the same episode numbers"):
+        Dataset.joined([series, series])
+
+
+@pytest.mark.parametrize("size", [1e-310, 1e-15, 1.0, 1e200, 1e308])
+def test_standardising_does_not_depend_on_units(size: float) -> None:
+    """Columns of any size have variance 1; one is constant in relation to its own size."""
+    rows = np.array([[0.25, 1.0], [-0.5, 1.0], [1.0, 1.0 + 4e-16]])
+    even = Dataset.of(rows * size, ["x", "still"]).standardised()
+    np.testing.assert_allclose(even.values.std(axis=0), [1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(even.values.mean(axis=0), 0.0, atol=1e-12)
+    assert not even["still"].any()
+
+
+def test_changed_tables_say_so(series: Dataset) -> None:
+    """Standardised or lagged, it is told; the original is told nothing."""
+    before = dict(series.about)
+    assert series.standardised().about == {**before, "standardised": True}
+    assert series.lagged(2).about == {**before, "lags": 2}
+    assert series.about == before
+
+
 def test_gies_gets_each_row_once_with_its_targets(table: Dataset) -> None:
     """The groups hold all rows, and all components of a vector are targets."""
     data, targets = as_gies(table)
@@ -144,6 +191,42 @@ def test_frames_of_others_are_read() -> None:
         from_frame(frame.drop(columns="b"))
     with pytest.raises(ModelError, match="intervention_targets"):
         from_frame(frame[["a"]])
+
+
+def test_targets_do_not_vanish_when_columns_are_renamed(table: Dataset) -> None:
+    """Renamed columns are refused while the targets have the old names."""
+    pytest.importorskip("pandas")
+    frame = as_frame(table)
+    with pytest.raises(ModelError, match=r"renamed .*\(why\).*the targets are .*y"):
+        from_frame(frame.rename(columns={"y": "why"}))
+    again = {("y",): ("why",)}
+    frame["intervention_targets"] = [again.get(c, c) for c in frame["intervention_targets"]]
+    renamed = frame.rename(columns={"y": "why"})
+    with pytest.raises(ModelError, match=r"del frame\.attrs"):
+        from_frame(renamed)
+    del renamed.attrs["scm_world"]
+    np.testing.assert_array_equal(from_frame(renamed).targeted, table.targeted)
+    with pytest.raises(ModelError, match="no column 'step' any more"):
+        from_frame(as_frame(table).drop(columns="step"))
+
+
+def test_a_frame_survives_csv(table: Dataset) -> None:
+    """Targets are read from the text of a tuple; the numbers of the rows are no variable."""
+    pandas = pytest.importorskip("pandas")
+    frame = as_frame(table)
+    back = from_frame(
+        pandas.read_csv(io.StringIO(frame.to_csv(index=False))).drop(columns="regime")
+    )
+    np.testing.assert_array_equal(back.targeted, table.targeted)
+    with pytest.raises(ModelError, match="index=False"):
+        from_frame(pandas.read_csv(io.StringIO(frame.to_csv())))
+    for cell, message in ((1, r"intervention_targets has 1"), ("q", "'q'")):
+        frame = pandas.DataFrame({"x": [0.0], "intervention_targets": [cell]})
+        with pytest.raises((ModelError, UnknownVariable), match=message):
+            from_frame(frame)
+    words = pandas.DataFrame({"x": ["red"], "intervention_targets": [None]})
+    with pytest.raises(ModelError, match="have to be numbers"):
+        from_frame(words)
 
 
 def test_a_frame_has_room_for_its_own_columns() -> None:

@@ -253,11 +253,12 @@ def chain_data(seed: int = 0, n: int = 2_000) -> Dataset:
     """Sample x → y → z with noise, seen and under do(x = 3), do(y = 3), do(y = -2), do(z = 3)."""
     rng = np.random.default_rng(seed)
     tables = []
-    for plan in ({}, {"x": 3.0}, {"y": 3.0}, {"y": -2.0}, {"z": 3.0}):
+    for k, plan in enumerate(({}, {"x": 3.0}, {"y": 3.0}, {"y": -2.0}, {"z": 3.0})):
         x = np.full(n, plan["x"]) if "x" in plan else rng.normal(size=n)
         y = np.full(n, plan["y"]) if "y" in plan else 2.0 * x + 1.0 + rng.normal(size=n)
         z = np.full(n, plan["z"]) if "z" in plan else -y + rng.normal(size=n)
-        table = Dataset.of(np.stack([x, y, z], axis=1), ["x", "y", "z"])
+        numbers = np.arange(n) + k * n
+        table = Dataset.of(np.stack([x, y, z], axis=1), ["x", "y", "z"], episode=numbers)
         tables.append(replace(table, regimes=(Regime(Plan(plan), tuple(plan)),)))
     return Dataset.joined(tables)
 

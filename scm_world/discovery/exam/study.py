@@ -14,6 +14,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any, final
 
+from scm_world.discovery.data.durable import draft_of, locked
 from scm_world.discovery.exam.html import write_report
 from scm_world.discovery.exam.pictures import draw_budget
 from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json, write_whole
@@ -187,12 +188,18 @@ def examine(
         ``report.html``.
 
     Raises:
-        UnreadableFile: The folder is one of another study, or a file in it is damaged.
+        UnreadableFile: The folder is one of another study, a file in it is damaged, or another
+            process is writing to it.
         ScmWorldError: A subject cannot be made, or data cannot be collected or written.
     """
     folder = Path(out)
     whole_number("workers", workers, least=1)
     _begun(study, folder)
+    with locked(folder):
+        return _examined(study, folder, workers, progress)
+
+
+def _examined(study: Study, folder: Path, workers: int, progress: Progress | None) -> Exam:
     groups = list(study.jobs(folder))
     sitting = _Sitting(study, folder, sum(map(len, groups)), progress)
     with ThreadPoolExecutor(workers) as pool:
@@ -311,7 +318,8 @@ def _source_mark(chosen: Learner) -> str:
 
 def _is_free(folder: Path) -> bool:
     """Tell whether a folder holds nothing, but for a beginning that was interrupted."""
-    return folder.is_dir() and {path.name for path in folder.iterdir()} <= {"study.json.part"}
+    drafts = {draft_of(folder / "study.json").name}
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= drafts
 
 
 def written(exam: Exam, folder: Path) -> Exam:

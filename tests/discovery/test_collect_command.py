@@ -1,0 +1,56 @@
+"""``scm-world collect``: what it writes, says and refuses."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from scm_world.cli.app import app
+from scm_world.discovery.data import load
+
+pytest.importorskip("pyarrow")
+
+COMMAND = ["collect", "pushing", "--backend", "fake", "--steps", "2", "--shard", "5"]
+
+
+def test_the_command_collects(tmp_path: Path) -> None:
+    """It says how often each target was one, and where the files are."""
+    arguments = ["--n", "12", "--target", "tool_block.*ss", "--outcome", "max:reward"]
+    more = ["--cause", "gravity", "--nature", "sensor_noise=0.01", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, [*COMMAND, *arguments, *more])
+    assert done.exit_code == 0, done.output
+    assert "do(tool_block.mass)" in done.output
+    found = load(tmp_path)
+    assert found.variables == ("gravity", "tool_block.mass", "max reward")
+    assert len(found) == 12
+    assert CliRunner().invoke(app, [*COMMAND, *arguments, *more]).exit_code == 0
+
+
+def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
+    """A typo gives exit code 2 and no folder."""
+    for wrong in (["--values", "C"], ["--design", "sigle"], ["--target", "tool_blok.*"]):
+        done = CliRunner().invoke(app, [*COMMAND, *wrong, "--out", str(tmp_path / "new")])
+        assert done.exit_code == 2, done.output
+    assert not (tmp_path / "new").exists()
+
+
+def test_ctrl_c_on_the_command_line(tmp_path: Path) -> None:
+    """It exits 130, says how many files are safe, and the same command goes on."""
+    command = [sys.executable, "-m", "scm_world", *COMMAND, "--n", "3000", "--out"]
+    with subprocess.Popen(  # noqa: S603 # our own text
+        [*command, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        while process.poll() is None and len(list(tmp_path.glob("shard-*"))) < 2:
+            time.sleep(0.001)
+        process.send_signal(signal.SIGINT)
+        text = process.communicate()[0]
+    assert process.returncode == 130
+    there = len(list(tmp_path.glob("shard-*")))
+    assert f"interrupted: {there} of 600 files are safe" in text
+    assert len(load(tmp_path, partial=True)) == 5 * there
