@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -65,6 +66,9 @@ def run(options: Options, *, out: Path | None) -> int:
     """Collect, print a summary; return the exit code."""
     if options.values not in SPACES:
         raise UnknownOption("values", options.values, SPACES)
+    if options.files == "parquet" and find_spec("pyarrow") is None:
+        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
+        raise UnknownOption("format", "parquet", allowed)
     where = options.where
     folder = out or where.folder(f"collect-{options.design}")
     world = where.world()
