@@ -175,8 +175,7 @@ def _line(ax: Axes, rows: Sequence[Row], key: str, looks: _Looks, budgets: Seque
     if not known:
         return
     way = _way(known[0][0])
-    gap = min((math.log(b / a) for a, b in pairwise(map(_x, budgets))), default=1.0)
-    factor = math.exp(2 * DODGE * gap * looks.aside(way))
+    factor = math.exp(2 * DODGE * _gap(budgets) * looks.aside(way))
     means = [spread.mean for _, spread in known]
     ends = [
         [mean - spread.low for mean, (_, spread) in zip(means, known, strict=True)],
@@ -185,6 +184,11 @@ def _line(ax: Axes, rows: Sequence[Row], key: str, looks: _Looks, budgets: Seque
     at = [_x(row.budget) * factor for row, _ in known]
     ends = [[max(end, 0.0) for end in side] for side in ends]
     ax.errorbar(at, means, yerr=ends, elinewidth=1.0, capsize=2.5, **looks.style(way))
+
+
+def _gap(budgets: Sequence[int]) -> float:
+    """Give the smallest way from a budget to the next one, as a logarithm."""
+    return min((math.log(b / a) for a, b in pairwise(map(_x, budgets))), default=1.0)
 
 
 def _x(budget: int) -> float:
@@ -202,7 +206,8 @@ def _axes(upper: Axes, lower: Axes, budgets: Sequence[int]) -> None:
     lower.set_xlabel("budget", fontsize=10, color=INK)
     if budgets:
         first, last = _x(budgets[0]), _x(budgets[-1])
-        room = (last / first) ** 0.12 if last > first else 2.0
+        room = max((last / first) ** 0.12, math.exp(1.4 * DODGE * _gap(budgets)))
+        room = room if last > first else 2.0
         lower.set_xlim(first / room, last * room)
     top = max([1.0, upper.get_ylim()[1]] if upper.lines else [1.0])
     upper.set_ylim(-0.04 * top, top)
