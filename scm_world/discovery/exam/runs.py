@@ -25,6 +25,7 @@ from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import Learner, learn, learner
 from scm_world.discovery.metrics import effect_rmse, evaluate
 from scm_world.errors import EngineFailure, MissingExtra, ScmWorldError, UnknownOption
+from scm_world.tasks import TASKS
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 """One thread each: seconds are those of one core, and sums do not depend on the machine."""
@@ -85,8 +86,6 @@ def shown_name(name: str, view: TaskView) -> str:
         >>> shown_name("pushing", TaskView("step")), shown_name("er2:20", TaskView())
         ('pushing/step', 'er2:20')
     """
-    from scm_world.tasks import TASKS
-
     if name in TASKS:
         return f"{name}/step" if view.view == "step" else name
     return Path(name).stem if name.endswith(".json") else name

@@ -91,7 +91,8 @@ class Outcomes:
         self._drawn = tuple(n for n in self._causes if isinstance(declared(n), Exogenous))
         self._read = tuple(dict.fromkeys((*self._causes, *self._target.values())))
         self._named = {n: f"{first_label(world.model, n)} {n}".strip() for n in self._causes}
-        self.names = (*self._named.values(), *(str(o).removeprefix("final ") for o in outcomes))
+        ends = (str(outcome).removeprefix("final ") for outcome in self._outcomes)
+        self.names = (*self._named.values(), *ends)
 
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time; see ``Apparatus``."""
