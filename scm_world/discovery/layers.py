@@ -98,7 +98,7 @@ def _forward(graph: nx.DiGraph) -> nx.DiGraph:
     return ahead
 
 
-def _levels(ahead: nx.DiGraph) -> dict[str, int]:
+def levels_of(ahead: nx.DiGraph) -> dict[str, int]:
     """Put effects right of their causes, and causes without causes right before an effect."""
     level: dict[str, int] = {}
     order = list(nx.topological_sort(ahead))
@@ -124,7 +124,7 @@ Step = tuple[str, str, int]
 Item = str | Step
 
 
-def _chains(ahead: nx.DiGraph, level: dict[str, int]) -> dict[tuple[str, str], list[Item]]:
+def chains_of(ahead: nx.DiGraph, level: dict[str, int]) -> dict[tuple[str, str], list[Item]]:
     """Give every arrow a place in each layer that it passes."""
     return {
         (cause, effect): [
@@ -136,7 +136,8 @@ def _chains(ahead: nx.DiGraph, level: dict[str, int]) -> dict[tuple[str, str], l
     }
 
 
-def _neighbours(chains: Iterable[list[Item]]) -> dict[Item, list[Item]]:
+def neighbors_of(chains: Iterable[list[Item]]) -> dict[Item, list[Item]]:
+    """List what stands beside each item in a chain."""
     found: dict[Item, list[Item]] = {}
     for chain in chains:
         for one, other in pairwise(chain):
@@ -145,7 +146,7 @@ def _neighbours(chains: Iterable[list[Item]]) -> dict[Item, list[Item]]:
     return found
 
 
-def _order(
+def in_order(
     level: dict[str, int], chains: Iterable[list[Item]], near: dict[Item, list[Item]]
 ) -> list[list[Item]]:
     """Order every layer so that few arrows cross: each item at the mean of its neighbors.
@@ -173,11 +174,11 @@ def _mean(items: Sequence[Item], at: Mapping[Item, float], default: float) -> fl
     return sum(at[item] for item in items) / len(items) if items else default
 
 
-def _heights(
+def heights_of(
     layers: list[list[Item]], near: dict[Item, list[Item]], top: float, bottom: float
 ) -> dict[Item, float]:
     """Give every item a height near those of its neighbors, and room above and below."""
-    most = max(sum(_room(item) for item in layer) for layer in layers)
+    most = max(sum(room_of(item) for item in layer) for layer in layers)
     scale = min(1.35, (bottom - top) / most)
     y: dict[Item, float] = {}
     for layer in layers:
@@ -186,13 +187,14 @@ def _heights(
     for sweep in range(16):
         for layer in layers if sweep % 2 == 0 else reversed(layers):
             wanted = [_mean(near.get(item, ()), y, y[item]) for item in layer]
-            rooms = [scale * _room(item) for item in layer]
+            rooms = [scale * room_of(item) for item in layer]
             y.update(zip(layer, _apart(wanted, rooms, top, bottom), strict=True))
     middle = (min(y.values()) + max(y.values())) / 2
     return {item: height + (top + bottom) / 2 - middle for item, height in y.items()}
 
 
-def _room(item: Item) -> float:
+def room_of(item: Item) -> float:
+    """Say how much height an item takes [pixels]: an arrow less than a node."""
     return 46.0 if isinstance(item, str) else 22.0
 
 
@@ -227,11 +229,11 @@ def lay_out(
     """
     graph, families = _drawn(model)
     ahead = _forward(graph)
-    level = _levels(ahead)
-    chains = _chains(ahead, level)
-    near = _neighbours(chains.values())
-    layers = _order(level, chains.values(), near)
-    y = _heights(layers, near, top, bottom) if layers else {}
+    level = levels_of(ahead)
+    chains = chains_of(ahead, level)
+    near = neighbors_of(chains.values())
+    layers = in_order(level, chains.values(), near)
+    y = heights_of(layers, near, top, bottom) if layers else {}
     gap = width / max(len(layers), 1)
     box = (min(170.0, 0.72 * gap), 30.0)
     places = {item: (gap * (n + 0.5), y[item]) for n, layer in enumerate(layers) for item in layer}

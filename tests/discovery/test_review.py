@@ -10,7 +10,7 @@ import pytest
 
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.exam.study import Study, cell_path, examine
-from scm_world.discovery.exam.subjects import ModelSubject, subject
+from scm_world.discovery.exam.subjects import ModelSubject, TaskView, subject, subject_mark
 from scm_world.discovery.learners import Found, Learner, learn
 from scm_world.discovery.learners.apparatus import Model
 from scm_world.discovery.learners.moving import sparse_pooled
@@ -52,6 +52,19 @@ def test_a_model_that_was_changed_is_another_exam(tmp_path: Path) -> None:
     file.write_text(to_json(pair(forward=False)))
     with pytest.raises(UnreadableFile, match="marks differ"):
         examine(study(str(file)), tmp_path / "out")
+
+
+def test_another_engine_or_library_is_another_exam(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Results of different versions are never shown beside one another."""
+    sitting = study("er2:5", learners=("gies",))
+    examine(sitting, tmp_path)
+    monkeypatch.setattr("scm_world.discovery.learners.registry._version", lambda _: "99")
+    with pytest.raises(UnreadableFile, match="marks differ"):
+        examine(sitting, tmp_path)
+    fake = TaskView(options={"backend": "fake"})
+    assert subject_mark("pushing", fake) != subject_mark("pushing", TaskView())
 
 
 def test_no_learner_of_an_exam_is_handed_the_graph() -> None:

@@ -12,12 +12,12 @@ from scm_world.discovery.exam.results import Truth
 from scm_world.discovery.layers import (
     Item,
     Point,
-    _chains,
-    _heights,
-    _levels,
-    _neighbours,
-    _order,
-    _room,
+    chains_of,
+    heights_of,
+    in_order,
+    levels_of,
+    neighbors_of,
+    room_of,
 )
 from scm_world.queries.experiments.effects import EdgeKey
 
@@ -45,13 +45,13 @@ class Places:
 
     def __init__(self, truth: Truth) -> None:
         ahead = _ahead(truth)
-        level = _from(0, _levels(ahead))
-        chains = _chains(ahead, level)
-        near = _neighbours(chains.values())
-        layers = _order(level, chains.values(), near)
-        room = max((sum(map(_room, layer)) for layer in layers), default=0.0)
+        level = _from(0, levels_of(ahead))
+        chains = chains_of(ahead, level)
+        near = neighbors_of(chains.values())
+        layers = in_order(level, chains.values(), near)
+        room = max((sum(map(room_of, layer)) for layer in layers), default=0.0)
         y = _from(
-            EDGE + BOX, _heights(layers, near, 0.0, max(room * CLOSE, 60.0)) if layers else {}
+            EDGE + BOX, heights_of(layers, near, 0.0, max(room * CLOSE, 60.0)) if layers else {}
         )
         widest = max((len(line) for name in truth.names for line in label(name)), default=1)
         self.box = (CHAR * widest + 12.0, BOX)

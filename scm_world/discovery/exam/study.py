@@ -277,7 +277,7 @@ def _ran(runner: Runner, folder: Path, job: Job) -> Cell:
 
 def _begun(study: Study, folder: Path) -> None:
     """Begin a folder, or check that it is one of the same study."""
-    marks = {name: subject_mark(name) for name in study.subjects}
+    marks = {name: subject_mark(name, study.view) for name in study.subjects}
     marks |= {name: _source_mark(learner(name)) for name in study.learners}
     head = json.loads(json.dumps({**study.as_dict(), "versions": versions(), "marks": marks}))
     path = folder / "study.json"
@@ -305,14 +305,14 @@ def _begun(study: Study, folder: Path) -> None:
 
 
 def _source_mark(chosen: Learner) -> str:
-    """Give something that changes with the code of a learner that is not of this package."""
+    """Give something that changes with a learner: its code, or the version of its library."""
     function = getattr(chosen.learn, "func", chosen.learn)
     try:
         file = inspect.getsourcefile(inspect.unwrap(function))
     except TypeError:
         file = None
     if file is None or function.__module__.partition(".")[0] == PACKAGE:
-        return ""  # versions say it
+        return chosen.version or ""
     return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
 
 

@@ -9,6 +9,7 @@ from typing import Any, Protocol, final
 
 import numpy as np
 
+from scm_world.backends import make_backend
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_label, settable
 from scm_world.discovery.exam.families import DONE, FAMILIES, check_family, is_family, model
@@ -315,10 +316,16 @@ def check_subject(name: str) -> None:
         raise UnknownOption("subject", name, (*TASKS, *families, "FILE.json"))
 
 
-def subject_mark(name: str) -> str:
-    """Give something that changes with what is in the file of a model; else it is empty."""
-    if not name.endswith(".json") or name in TASKS:
-        return ""
+def subject_mark(name: str, view: TaskView) -> str:
+    """Give something that changes with a subject: the file of a model, the engine of a task."""
+    if name in TASKS:
+        backend = make_backend(view.options.get("backend", "mujoco"))
+        try:
+            return f"{backend.name} {backend.version}"
+        finally:
+            backend.close()
+    if not name.endswith(".json"):
+        return ""  # of a family, which follows from its name
     return hashlib.sha256(to_json(_read(Path(name))).encode()).hexdigest()[:16]
 
 

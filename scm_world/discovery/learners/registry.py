@@ -6,7 +6,7 @@ import importlib.metadata
 import inspect
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Literal, final
 
@@ -54,20 +54,17 @@ class Learner:
     doc: str = ""
 
     @property
+    def version(self) -> str | None:
+        """Of the package that it needs; None if that is not installed, or if it needs none."""
+        return _version(self.package) if self.package else None
+
+    @property
     def is_installed(self) -> bool:
         """Whether what it needs is there."""
-        return not self.package or _version(self.package) is not None
+        return not self.package or self.version is not None
 
 
-@final
-@dataclass
-class _Book:
-    """All learners by name."""
-
-    learners: dict[str, Learner] = field(default_factory=dict)
-
-
-_BOOK = _Book()
+_KNOWN: dict[str, Learner] = {}
 
 HOMES = ("ours", "others")
 """Modules of this package that register learners when they are imported."""
@@ -79,10 +76,10 @@ def register(learner: Learner) -> Learner:
     Raises:
         UnknownOption: Another one has this name.
     """
-    old = _BOOK.learners.get(learner.name)
+    old = _KNOWN.get(learner.name)
     if old is not None and old.learn is not learner.learn:
         raise UnknownOption("name of a learner", learner.name, ("a name that is not taken",))
-    _BOOK.learners[learner.name] = learner
+    _KNOWN[learner.name] = learner
     return learner
 
 
@@ -90,7 +87,7 @@ def learners() -> Mapping[str, Learner]:
     """Give all learners that are known, by name."""
     for home in HOMES:
         import_module(f"{__package__}.{home}")
-    return dict(_BOOK.learners)
+    return dict(_KNOWN)
 
 
 def learner(name: str) -> Learner:
@@ -160,7 +157,7 @@ def learn(
     found = result if isinstance(result, Found) else _of_columns(chosen, table, result)
     if isinstance(table, Dataset):
         found = _folded(found, table, level)
-    version = {chosen.package: _version(chosen.package) or ""} if chosen.package else {}
+    version = {chosen.package: chosen.version or ""} if chosen.package else {}
     return found.told(
         learner=chosen.name,
         settings={**found.settings, **settings},
