@@ -18,6 +18,7 @@ class Copied(EzPickle):
     """
 
     world: World
+    _done: list[tuple[int, dict[str, Any]]]
 
     def __getstate__(self) -> dict[str, Any]:
         """Give the arguments, a snapshot of the world, and Gymnasium's generator."""
@@ -26,7 +27,9 @@ class Copied(EzPickle):
         except NotReset:
             snapshot = None
         generator = {name: self.__dict__[name] for name in _GENERATOR if name in self.__dict__}
-        return {**super().__getstate__(), "snapshot": snapshot, "generator": generator}
+        done = list(self._done)
+        state = {"snapshot": snapshot, "generator": generator, "done": done}
+        return {**super().__getstate__(), **state}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Begin where the other environment is; a closed one, or one without episode, is new."""
@@ -34,6 +37,7 @@ class Copied(EzPickle):
         self.__dict__.update(state["generator"])
         if state["snapshot"] is not None:
             self.world.restore(state["snapshot"])
+            self._done = state["done"]
 
 
 _GENERATOR = ("_np_random", "_np_random_seed", "spec")

@@ -14,6 +14,7 @@ from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.copies import Copied
 from scm_world.env.delta import MODES, PREFIX, Delta
+from scm_world.env.given import doubles, made_task, names_of
 from scm_world.env.goals import GoalReward, Goals, reader, reward_scale
 from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
@@ -23,9 +24,10 @@ from scm_world.env.window import Window
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.scene.camera import OVERVIEW, Camera
 from scm_world.scene.kinematics import scaled_clip_kernel
-from scm_world.tasks import Task, make_task
+from scm_world.tasks import Task
 from scm_world.tasks.rewards import one_number
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, World
 from scm_world.world.declaration import Declaration
 from scm_world.world.requests import merged
@@ -37,6 +39,7 @@ RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
 
 _NOT_GIVEN = ("self", "__class__")
+_RESETS = ("do", "episode")
 
 
 class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -77,7 +80,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         random_goal: Draw a new goal at every reset, from ``"A"``, ``"B"`` or ``"A|B"``.
         attempts: How often a reset is tried if it draws bodies into one place; every attempt is
             the beginning of the next episode.
-        variables_space: The space in which every target of an intervention must lie.
+        variables_space: The space in which every target of an intervention must lie: ``"A"``,
+            ``"B"``, ``"A|B"``, a ``Subset``, or the patterns and regions of one.
         info_contacts: Whether ``info["contacts"]`` lists what touches.
         info_state: Whether ``info["state"]`` has the values of all variables.
         max_episode_length: In control steps; the task's own if None.
@@ -124,7 +128,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         start: Mapping[str, Any] | None = None,
         random_goal: SpaceName | None = None,
         attempts: int = 1,
-        variables_space: SpaceName | None = None,
+        variables_space: AnyRegion | Mapping[str, Any] | None = None,
         info_contacts: bool = False,
         info_state: bool = False,
         max_episode_length: int | None = None,
@@ -135,8 +139,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Copied.__init__(self, **made_with)
         self._how = Observing(
             mode=observation_mode,
-            names=_names("observe", observe),
-            include=_names("include", include),
+            names=names_of("observe", observe),
+            include=names_of("include", include),
             context=context,
             keypoints=keypoints,
             cameras=cameras,
@@ -147,14 +151,14 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if action_mode not in MODES:
             raise UnknownOption("action_mode", action_mode, MODES)
         self.world = World(
-            _made(task, task_options),
+            made_task(task, task_options),
             backend=backend,
             preset=preset,
             action_mode=action_mode.removeprefix(PREFIX),
             frame_skip=frame_skip,
             max_episode_length=max_episode_length,
             conventions=conventions,
-            variables_space=variables_space,
+            variables_space=as_region("variables_space", variables_space),
         )
         self._modes = (observation_mode, action_mode)
         self._rich = (info_contacts, info_state)
@@ -167,6 +171,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._terms = tuple(self.world.task.weights)
         self._read_terms = reader(self._terms)
         self._version = -1
+        self._done: list[tuple[int, dict[str, Any]]] = []
         self._observers: WeakKeyDictionary[Declaration, tuple[Observer, Goals, tuple[str, ...]]]
         self._observers = WeakKeyDictionary()
         if goal_env:
@@ -241,18 +246,23 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Args:
             seed: Of the noise.
             options: ``{"do": {…}}``: an intervention that holds for the whole episode. Where it
-                sets what ``start`` or a random goal sets too, it counts.
+                sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
+                number of the episode within the noise; the next one if not given, 0 with a seed.
 
         Raises:
-            UnknownOption: Another key than ``"do"``.
+            UnknownOption: Another key.
             InterventionError: The intervention was refused.
             ModelError: A reward term of one's own is no number.
         """
         super().reset(seed=seed)
-        unknown = set(options or {}) - {"do"}
+        asked_for = options or {}
+        unknown = asked_for.keys() - _RESETS
         if unknown:
-            raise UnknownOption("reset option", min(unknown), ("do",))
-        begin(self.world, seed, self._acts((options or {}).get("do")), self._attempts)
+            raise UnknownOption("reset option", min(unknown), _RESETS)
+        request = self._acts(asked_for.get("do"))
+        number = asked_for.get("episode")
+        begin(self.world, seed, request, self._attempts, number)
+        self._done = [(0, request)] if request else []
         now = self._look()
         for own in self.world.task.terms:
             one_number(now, own.name, (own.name,))
@@ -290,7 +300,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """Turn an action into what the world takes, shape (9,)."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
-            given = _doubles(action)
+            given = doubles(action)
         if given.shape != (9,):
             raise ActionError(f"an action has shape (9,), got {given.shape}", action)
         if self._delta is not None:
@@ -301,7 +311,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             raise ActionError(f"an action is nine finite numbers, got {action!r}", action)
         return command
 
-    def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
+    def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now; see ``World.do``. ``observe`` gives the observation afterwards.
 
         Args:
@@ -311,15 +321,25 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             InterventionError: The intervention was refused; nothing has changed.
         """
-        audit = self.world.do(asked(request), space=space)
+        wanted = asked(request)
+        audit = self.world.do(wanted, space=space)
+        self._done.append((self.world.index, wanted))
         self._look()
         return audit
 
+    @property
+    def interventions(self) -> tuple[tuple[int, dict[str, Any]], ...]:
+        """What was done in this episode: the control step, and the intervention."""
+        return tuple(self._done)
+
     def observe(self) -> Observation:
         """Give the observation of the present."""
+        return self.present()[0]
+
+    def present(self) -> tuple[Observation, dict[str, Any]]:
+        """Give the observation and the info of the present, as after an intervention."""
         now = self._look()
-        found: Observation = self._observer.observe(now)
-        return found
+        return self._observer.observe(now), self._info(now)
 
     def _info(self, now: Values) -> dict[str, Any]:
         achieved, desired = self._goals.read(self.world, now)
@@ -368,24 +388,3 @@ def _touches(backend: Backend) -> tuple[dict[str, Any], ...]:
         {name: np.copy(value) if isinstance(value, np.ndarray) else value for name, value in fields}
         for fields in (vars(touch).items() for touch in backend.contacts())
     )
-
-
-def _doubles(action: Any) -> Floats:
-    try:
-        return np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ActionError(f"an action is nine finite numbers, got {action!r}", action) from None
-
-
-def _names(option: str, given: Sequence[str]) -> tuple[str, ...]:
-    if isinstance(given, str):
-        raise UnknownOption(option, given, (f"a list of names, such as [{given!r}]",))
-    return tuple(given)
-
-
-def _made(task: Task | str, options: Mapping[str, Any] | None) -> Task:
-    if isinstance(task, str):
-        return make_task(task, **(options or {}))
-    if options:
-        raise UnknownOption("task_options", dict(options), ("none, with a task that is made",))
-    return task

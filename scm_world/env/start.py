@@ -35,7 +35,13 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
     }
 
 
-def begin(world: World, seed: int | None, acts: Mapping[str, Any], attempts: int) -> None:
+def begin(
+    world: World,
+    seed: int | None,
+    acts: Mapping[str, Any],
+    attempts: int,
+    episode: int | None = None,
+) -> None:
     """Reset a world, with an intervention that may draw something impossible.
 
     Args:
@@ -44,17 +50,20 @@ def begin(world: World, seed: int | None, acts: Mapping[str, Any], attempts: int
         acts: What is done at the reset.
         attempts: How often bodies may be drawn into one place until that is an error. Every
             attempt is the beginning of the next episode, so it draws anew.
+        episode: Number of the first one within the noise.
 
     Raises:
         InterventionError: The intervention was refused, at the last attempt.
     """
+    if episode is not None and seed is None:
+        seed = world.noise.seed
     for left in reversed(range(attempts)):
         try:
-            world.reset(seed=seed, do=acts)
+            world.reset(seed=seed, episode=episode or 0, do=acts)
         except Infeasible:
             if not left:
                 raise
-            seed = None
+            seed = episode = None
         else:
             return
 

@@ -41,6 +41,7 @@ class Moment:
         origin: The control step at which variables got their own noise, if that was another one:
             what nature drew at the start of an episode stays, however late one intervenes.
         attempt: How many draws were rejected before, because the world could not be like that.
+        kept: Variables that are not drawn anew at another attempt.
     """
 
     noise: Noise
@@ -49,6 +50,7 @@ class Moment:
     count: int | None = None
     origin: int | None = None
     attempt: int = 0
+    kept: frozenset[str] = frozenset()
 
     def nature(
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
@@ -60,12 +62,18 @@ class Moment:
         return moment.draw(source, name, shape, values)
 
     def draw(
-        self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
+        self,
+        source: Distribution,
+        name: str,
+        shape: tuple[int, ...],
+        values: Values,
+        stream: str | None = None,
     ) -> Value:
         """Draw a value of a variable, shape ``(count, *shape)`` or ``shape``."""
+        own = name if stream is None else f"{stream}/{name}"
         drawn = self.noise.draw(
             source,
-            f"{name}#{self.attempt}" if self.attempt else name,
+            f"{own}#{self.attempt}" if self.attempt and name not in self.kept else own,
             shape,
             values,
             episode=self.episode,
@@ -119,7 +127,8 @@ class Evaluator:
         elif moment is None:
             raise ModelError([f"{requested.name!r} is drawn: solve needs a moment to draw at"])
         else:
-            value = moment.draw(source_of(act), requested.name, requested.shape, values)
+            source, stream = source_of(act), getattr(act.intervention, "stream", None)
+            value = moment.draw(source, requested.name, requested.shape, values, stream)
         if requested.name == name:
             return value
         return np.asarray(self._bound(requested, inverse=True)(value))

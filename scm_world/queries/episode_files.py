@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import zipfile
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
+from scm_world.output.durable import write_durably
 from scm_world.queries.courses import Course
 from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
@@ -20,6 +22,7 @@ from scm_world.queries.policies import Sequence as Given
 from scm_world.queries.stages import Stage, stage_of
 from scm_world.queries.traces import Trace, begin, run
 from scm_world.tasks import TASKS, make_task
+from scm_world.variables import Subset
 from scm_world.world import World
 
 FORMAT = "scm_world/episode/1"
@@ -49,26 +52,28 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
     Raises:
         ModelError: A plan has a function without a name, or the task arguments that are no
             numbers and texts.
+        UnwritableFolder: There is no such folder, no room, or no permission.
     """
     trace = episode.trace
     target = Path(path)
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
-    part = target.with_name(target.name + ".part")
-    with part.open("wb") as stream:
-        np.savez_compressed(
-            stream,
-            about=np.array(json.dumps(_about(episode))),
-            actions=episode.actions,
-            states=np.concatenate(trace.vectors),
-            lengths=np.array([len(vector) for vector in trace.vectors]),
-        )
-    part.replace(target)
+    made = io.BytesIO()
+    np.savez_compressed(
+        made,
+        about=np.array(json.dumps(_about(episode))),
+        actions=episode.actions,
+        states=np.concatenate(trace.vectors),
+        lengths=np.array([len(vector) for vector in trace.vectors]),
+    )
+    write_durably(target, made.getvalue())
     return target
 
 
 def _about(episode: Episode) -> dict[str, Any]:
     task, options = episode.stage.task, dict(episode.stage.options)
+    if isinstance(options.get("variables_space"), Subset):
+        options["variables_space"] = options["variables_space"].model_dump(mode="json")
     if not task.is_named:
         raise ModelError(
             [f"give the arguments of {task.name!r} by name, so that they can be saved"]

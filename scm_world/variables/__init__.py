@@ -35,12 +35,16 @@ from scm_world.variables.spaces import (
     Space,
     Switch,
 )
+from scm_world.variables.subsets import AB, A, B, Subset
 
 __all__ = [
+    "AB",
     "SOFT",
+    "A",
     "Action",
     "Affine",
     "AnyVariable",
+    "B",
     "Box",
     "Categories",
     "Cylinder",
@@ -67,6 +71,7 @@ __all__ = [
     "Scale",
     "Shift",
     "Space",
+    "Subset",
     "Switch",
     "Variable",
     "names",

@@ -18,6 +18,8 @@ from scm_world.errors import (
 from scm_world.variables.interventions import Draw
 from scm_world.variables.kinds import SPACES, SpaceName, Variable
 from scm_world.variables.noise import Noise
+from scm_world.variables.spaces import Space
+from scm_world.variables.subsets import Subset
 
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 
@@ -113,12 +115,56 @@ def check_draw(variable: Variable, act: Draw) -> None:
         )
 
 
-def check_space(variable: Variable, value: Value, space: SpaceName, values: Values) -> None:
+def check_region(variable: Variable, region: SpaceName | Space) -> None:
+    """Refuse a region that a variable does not have, or that reaches beyond its bounds.
+
+    Raises:
+        InterventionError: There is no such space, or it is of another shape.
+        OutOfBounds: A corner of it is physically impossible.
+    """
+    check_draw(variable, Draw(region))
+    if isinstance(region, str) or region.parents() or variable.bounds is None:
+        return
+    if variable.bounds.parents():
+        return  # known only when it is set
+    n = region.n_uniforms(variable.shape)
+    for corner in (0.0, np.nextafter(1.0, 0.0)):
+        check_bounds(variable, region.transform(np.full(n, corner), variable.shape, {}), {})
+
+
+def check_space(
+    variable: Variable, value: Value, space: SpaceName | Subset, values: Values
+) -> None:
     """Refuse what lies outside the space that was asked for.
 
     Raises:
         OutOfSpace: With the nearest value of the space.
     """
+    if isinstance(space, Subset):
+        _check_subset(variable, value, space, values)
+    else:
+        _check_named(variable, value, space, values)
+
+
+def _check_subset(variable: Variable, value: Value, subset: Subset, values: Values) -> None:
+    region = subset.region(variable.name)
+    if isinstance(region, str):
+        _check_named(variable, value, region, values)
+    elif region is None or not region.contains(value, values):
+        allowed = "∅ (it is not to be set)"
+        if region is not None:
+            allowed = region.describe(variable.shape, values)
+        raise OutOfSpace(
+            variable.name,
+            _plain(value),
+            space=str(subset),
+            allowed=allowed,
+            nearest=None if region is None else _plain(region.nearest(value, values)),
+            unit=variable.unit,
+        )
+
+
+def _check_named(variable: Variable, value: Value, space: SpaceName, values: Values) -> None:
     declared = variable.space(space)
     if declared is None:
         raise OutOfSpace(

@@ -73,6 +73,11 @@ class Scale(Frozen):
 class Draw(Frozen):
     """Draw a variable from its space ``"A"``, ``"B"`` or ``"A|B"``, or from a distribution.
 
+    Attributes:
+        source: Where from.
+        stream: Name of a noise of its own, so that it has nothing in common with other draws of
+            the variable; None for the variable's own noise.
+
     Example:
         >>> Draw("A").source
         'A'
@@ -80,6 +85,7 @@ class Draw(Frozen):
 
     kind: Literal["draw"] = "draw"
     source: SpaceName | Distribution
+    stream: str | None = None
 
     def __init__(self, source: Any, **fields: Any) -> None:
         if not isinstance(source, Frozen | dict) and source not in SPACES:

@@ -16,7 +16,7 @@ from scm_world.scene import Difference, PhysicalState, Structure
 from scm_world.scene.feasibility import TOLERANCE, Overlap, buried_goals, overlaps
 from scm_world.variables import Draw, Hard
 from scm_world.variables.checks import coerce
-from scm_world.variables.kinds import SpaceName
+from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.compare import same
 from scm_world.world.declaration import Declaration
@@ -80,12 +80,13 @@ def _new_overlaps(
 
 
 def feasible(
-    world: World, instant: Instant, request: Mapping[str, Any], space: SpaceName | None
+    world: World, instant: Instant, request: Mapping[str, Any], space: AnyRegion | None
 ) -> tuple[Proposal, Difference]:
     """Work out an intervention that does not put two bodies in one place.
 
     Bodies that intersect already (a block that is being squeezed) may go on doing so. What is
     drawn is drawn again until the world can be like that: from the feasible part of its space.
+    What takes no part in where bodies are is drawn once.
 
     Raises:
         InterventionError: See ``propose``.
@@ -93,16 +94,41 @@ def feasible(
             draw was.
     """
     draws = any(isinstance(act, Draw) for act in flatten(request).values())
+    kept: frozenset[str] = frozenset()
     for attempt in range(ATTEMPTS if draws else 1):
-        proposal = propose(world, instant, request, space, attempt=attempt)
+        proposal = propose(world, instant, request, space, attempt=attempt, kept=kept)
         change = difference(world, proposal)
         problems = _new_overlaps(world, instant, proposal, change)
         if draws and not problems:
             problems = _buried(proposal, flatten(request))
         if not problems:
             return proposal, change
+        if draws and not attempt:
+            kept = _immaterial(world, proposal.declaration, flatten(request))
     tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
     raise _refusal(world, instant, proposal, problems, request, tried)
+
+
+def _immaterial(
+    world: World, declaration: Declaration, request: Mapping[str, Any]
+) -> frozenset[str]:
+    """Name the draws that move no body and change the size of none.
+
+    Goals count as bodies where there are obstacles, in which they must not be.
+    """
+    buries = bool(declaration.composition.obstacles)
+    found = set()
+    for name, act in request.items():
+        if isinstance(act, Draw) and name not in world.family.head:
+            target = declaration.model.target(name)
+            followers = (target, *declaration.static_order((target,)))
+            is_state = declaration.model.declared(target).role == "state"
+            keys = (world.parameter_keys.get(follower) for follower in followers)
+            moves = any(key and key[1] in _MOVES for key in keys)
+            hides = buries and any(follower.endswith(_MOVES) for follower in followers)
+            if not (is_state or moves or hides):
+                found.add(name)
+    return frozenset(found)
 
 
 def _buried(proposal: Proposal, request: Mapping[str, Any]) -> list[Overlap]:

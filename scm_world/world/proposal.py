@@ -14,7 +14,6 @@ from scm_world.errors import (
     ConflictingTargets,
     InterventionError,
     OutOfBounds,
-    UnknownOption,
     WrongShape,
     raise_all,
 )
@@ -33,7 +32,7 @@ from scm_world.variables import (
     Shift,
 )
 from scm_world.variables.checks import check_bounds, check_space
-from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.compare import same
 from scm_world.world.following import followed, refuse_continuous, what_follows
 from scm_world.world.restructure import restructured
@@ -129,9 +128,10 @@ def propose(
     world: World,
     instant: Instant,
     request: Mapping[str, Any],
-    space: SpaceName | None,
+    space: AnyRegion | None,
     *,
     attempt: int = 0,
+    kept: frozenset[str] = frozenset(),
 ) -> Proposal:
     """Work out an intervention without touching the world.
 
@@ -141,14 +141,14 @@ def propose(
         request: The intervention.
         space: Every target has to lie in, if any.
         attempt: How many draws were rejected before.
+        kept: Variables that are not drawn anew for that.
 
     Raises:
         InterventionError: With every problem of the request.
         UnknownOption: There is no such space.
     """
-    if space not in (None, *SPACES):
-        raise UnknownOption("space", space, SPACES)
-    moment = replace(world.moment(instant.index), attempt=attempt)
+    space = as_region("space", space)
+    moment = replace(world.moment(instant.index), attempt=attempt, kept=kept)
     instant = restructured(world.family, instant, request, moment)
     accepted, problems = accept(instant, request)
     requests: Requests = {**instant.requests, **accepted}
@@ -305,7 +305,7 @@ class _Draft:
         elif isinstance(act, Draw):
             source = requested.space(act.source) if isinstance(act.source, str) else act.source
             values = {**self.static, **self._world.states(self.state)}
-            value = self._moment.draw(source, name, requested.shape, values)
+            value = self._moment.draw(source, name, requested.shape, values, act.stream)
         else:
             present = self._coordinates(target, name)
             by = np.asarray(act.by)
@@ -341,7 +341,7 @@ class _Draft:
         where = self._world.slices.get(name)
         return self._instant.static[name] if where is None else self._instant.state.vector[where]
 
-    def check(self, accepted: Requests, space: SpaceName | None) -> list[InterventionError]:
+    def check(self, accepted: Requests, space: AnyRegion | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
         problems = self._problems
         if space is None or problems:

@@ -12,7 +12,7 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX, cameras
-from scm_world.errors import NotReset, SnapshotMismatch, UnknownOption
+from scm_world.errors import NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
 from scm_world.scene import PhysicalState, Scene
 from scm_world.scene.camera import Camera
@@ -20,7 +20,7 @@ from scm_world.scene.kinematics import inverse_kernel
 from scm_world.tasks import Task
 from scm_world.variables import Noise
 from scm_world.variables.catalogue import PRESET
-from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit
 from scm_world.world.commands import clipped, disturbed
 from scm_world.world.commit import commit, difference, feasible, refuse_overlaps
@@ -46,7 +46,7 @@ class World(Declared):
         max_episode_length: In control steps; the task's own length if None.
         conventions: ``"scm_world"``, or ``"causal_world"`` for the predecessor's.
         variables_space: The space that every target of an intervention must lie in, unless ``do``
-            is told another one: ``"A"``, ``"B"`` or ``"A|B"``.
+            is told another one: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``.
 
     Raises:
         UnknownOption: One of the names does not exist.
@@ -73,11 +73,9 @@ class World(Declared):
         frame_skip: int = 10,
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
-        variables_space: SpaceName | None = None,
+        variables_space: AnyRegion | None = None,
     ) -> None:
-        if variables_space not in (None, *SPACES):
-            raise UnknownOption("variables_space", variables_space, SPACES)
-        self.variables_space = variables_space
+        self.variables_space = as_region("variables_space", variables_space)
         self.options = Options.checked(
             preset_name=preset,
             action_mode=action_mode,
@@ -265,7 +263,7 @@ class World(Declared):
         self._readouts.stale()
         self._instant = None
 
-    def do(self, request: Mapping[str, Any], *, space: SpaceName | None = None) -> Audit:
+    def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.
 
         A parameter holds until the reset; a state is set at this instant and physics carries it
@@ -273,8 +271,8 @@ class World(Declared):
 
         Args:
             request: Values, ``Shift``, ``Scale`` or ``Draw`` by name, dotted or nested.
-            space: If given, every target must lie in this space: ``"A"``, ``"B"`` or ``"A|B"``;
-                ``variables_space`` of the world if None.
+            space: If given, every target must lie in this space: ``"A"``, ``"B"``, ``"A|B"`` or
+                a ``Subset``; ``variables_space`` of the world if None.
 
         Returns:
             What was requested, applied and read back, and what followed.

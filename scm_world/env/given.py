@@ -1,0 +1,48 @@
+"""Arguments of an environment, read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.errors import ActionError, UnknownOption
+from scm_world.tasks import Task, make_task
+
+
+def doubles(action: Any) -> Floats:
+    """Read an action.
+
+    Raises:
+        ActionError: It is no numbers.
+    """
+    try:
+        return np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ActionError(f"an action is nine finite numbers, got {action!r}", action) from None
+
+
+def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
+    """Read a list of names.
+
+    Raises:
+        UnknownOption: It is one text.
+    """
+    if isinstance(given, str):
+        raise UnknownOption(option, given, (f"a list of names, such as [{given!r}]",))
+    return tuple(given)
+
+
+def made_task(task: Task | str, options: Mapping[str, Any] | None) -> Task:
+    """Make a task of a name, with its options; or take one.
+
+    Raises:
+        UnknownOption: There are options for a task that is made.
+    """
+    if isinstance(task, str):
+        return make_task(task, **(options or {}))
+    if options:
+        raise UnknownOption("task_options", dict(options), ("none, with a task that is made",))
+    return task
