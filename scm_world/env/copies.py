@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, final
 
 from gymnasium.utils import EzPickle
 
 from scm_world.errors import NotReset
-from scm_world.world import World
+from scm_world.world import World, WorldSnapshot
+
+
+@final
+@dataclass(frozen=True)
+class EnvSnapshot:
+    """An instant of an episode of an environment. It can be pickled.
+
+    Attributes:
+        world: Of its world.
+        interventions: What was done so far.
+    """
+
+    world: WorldSnapshot
+    interventions: tuple[tuple[int, dict[str, Any]], ...]
 
 
 class Copied(EzPickle):
@@ -19,6 +34,23 @@ class Copied(EzPickle):
 
     world: World
     _done: list[tuple[int, dict[str, Any]]]
+
+    def snapshot(self) -> EnvSnapshot:
+        """Save everything that decides how the episode goes on.
+
+        Raises:
+            NotReset: There is no episode yet.
+        """
+        return EnvSnapshot(self.world.snapshot(), tuple(self._done))
+
+    def restore(self, snapshot: EnvSnapshot) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Raises:
+            SnapshotMismatch: It is one of another task or engine.
+        """
+        self.world.restore(snapshot.world)
+        self._done = list(snapshot.interventions)
 
     def __getstate__(self) -> dict[str, Any]:
         """Give the arguments, a snapshot of the world, and Gymnasium's generator."""

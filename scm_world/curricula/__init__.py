@@ -1,0 +1,78 @@
+"""Who intervenes, and when: curricula as values, for environments and for protocols.
+
+A curriculum is a sentence::
+
+    curriculum = Curriculum(
+        together(
+            goals("A"),
+            during(range(1_000, 5_000), physics("B")),
+            at_step(100, resample("floor_friction")),
+        )
+    )
+    env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0"), curriculum)
+"""
+
+from scm_world.curricula.agents import InterveningAgent
+from scm_world.curricula.choices import in_turn, stages, together, weighted
+from scm_world.curricula.curriculum import Curriculum, Turn, as_curriculum
+from scm_world.curricula.parts import Do, Follow, Goal, Interpolate, Part, Resample
+from scm_world.curricula.phrases import (
+    everything,
+    follow,
+    goals,
+    interpolate,
+    joints,
+    looks,
+    physics,
+    poses,
+    resample,
+)
+from scm_world.curricula.published import ACTORS, active, published_actor, published_curriculum
+from scm_world.curricula.situations import Memory, Situation
+from scm_world.curricula.times import at_reset, at_step, during, every
+from scm_world.curricula.vector import CurriculumVectorEnv, make_vec
+from scm_world.curricula.wrapper import CurriculumEnv
+from scm_world.variables import AB, A, B, Subset
+
+__all__ = [
+    "AB",
+    "ACTORS",
+    "A",
+    "B",
+    "Curriculum",
+    "CurriculumEnv",
+    "CurriculumVectorEnv",
+    "Do",
+    "Follow",
+    "Goal",
+    "Interpolate",
+    "InterveningAgent",
+    "Memory",
+    "Part",
+    "Resample",
+    "Situation",
+    "Subset",
+    "Turn",
+    "active",
+    "as_curriculum",
+    "at_reset",
+    "at_step",
+    "during",
+    "every",
+    "everything",
+    "follow",
+    "goals",
+    "in_turn",
+    "interpolate",
+    "joints",
+    "looks",
+    "make_vec",
+    "physics",
+    "poses",
+    "published_actor",
+    "published_curriculum",
+    "resample",
+    "stages",
+    "together",
+    "weighted",
+]

@@ -1,0 +1,171 @@
+"""Agents that intervene themselves: an intervention is a part of the action."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.curricula.targets import matching
+from scm_world.curricula.wrapper import environment
+from scm_world.errors import ActionError, InterventionError, UnknownOption
+from scm_world.variables import Box, Subset
+from scm_world.variables.kinds import SpaceName, Variable
+from scm_world.variables.subsets import as_region
+from scm_world.world.start import whole_number
+
+
+@final
+class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Lets an agent set variables of the world, besides moving the robot.
+
+    An action is a dictionary: ``"action"``, as without this wrapper; ``"which"``, for each
+    variable 1 if it is to be set and 0 if not; ``"values"``, all their numbers in [-1, 1], which
+    stand for the region that each may lie in. The intervention is made before the control step,
+    all of it or nothing. ``info["refused"]`` says why it was not made, and is empty otherwise;
+    ``info["interventions_left"]`` is how many more there may be, -1 for any number.
+
+    With ``flat=True`` an action is one vector: the action, then one number for each variable, of
+    which those above 0 are set, then the values; for learners that know boxes only.
+
+    Args:
+        env: Of this package, with actions in a box.
+        what: Names, patterns or groups of what may be set, as in ``resample``.
+        space: Where values may lie: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``.
+        most: How often it may intervene in an episode; any number if None.
+        flat: Whether an action is one vector.
+
+    Raises:
+        UnknownOption: A variable has no region with two ends, or an option is none.
+        UnknownVariable: A pattern names nothing.
+
+    Example:
+        >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
+        >>> env = InterveningAgent(env, ["tool_block.mass"])
+        >>> _ = env.reset(seed=0)
+        >>> still = np.zeros(9, np.float32)
+        >>> do = {"action": still, "which": np.array([1]), "values": np.ones(1, np.float32)}
+        >>> _, _, _, _, info = env.step(do)
+        >>> float(env.unwrapped.world["tool_block.mass"]), info["refused"]
+        (0.045, '')
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        what: str | Iterable[str],
+        *,
+        space: SpaceName | Subset = "A",
+        most: int | None = None,
+        flat: bool = False,
+    ) -> None:
+        patterns = (what,) if isinstance(what, str) else tuple(what)
+        RecordConstructorArgs.__init__(self, what=patterns, space=space, most=most, flat=flat)
+        super().__init__(env)
+        self._inner = environment(env, "InterveningAgent")
+        self._space: Any = as_region("space", space)
+        self._most = None if most is None else whole_number("most", most, least=0)
+        self._flat, self._left = flat, -1
+        declaration = self._inner.world.declaration
+        self._names = matching(declaration, patterns)
+        self._variables = [declaration.model.declared(name) for name in self._names]
+        for variable in self._variables:
+            self._box(variable)
+        self._sizes = [int(np.prod(variable.shape)) for variable in self._variables]
+        self.action_space = self._actions(env.action_space)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The variables that may be set, in their order."""
+        return self._names
+
+    def _box(self, variable: Variable) -> Box:
+        """Give the region of a variable.
+
+        Raises:
+            UnknownOption: It has none, or one that is no box.
+        """
+        space = self._space
+        region = space.space_of(variable) if isinstance(space, Subset) else variable.space(space)
+        if not isinstance(region, Box):
+            allowed = (f"variables whose region is a box, unlike that of {variable.name}",)
+            raise UnknownOption("space", str(space), allowed)
+        return region
+
+    def _actions(self, inner: Any) -> gymnasium.Space[Any]:
+        n, numbers = len(self._names), sum(self._sizes)
+        ones = np.ones(numbers, np.float32)
+        if not self._flat:
+            return gymnasium.spaces.Dict(
+                {
+                    "action": inner,
+                    "which": gymnasium.spaces.MultiBinary(n),
+                    "values": gymnasium.spaces.Box(-ones, ones, dtype=np.float32),
+                }
+            )
+        gates = np.ones(n, np.float32)
+        low = np.concatenate([inner.low, -gates, -ones])
+        return gymnasium.spaces.Box(low, np.concatenate([inner.high, gates, ones]))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._left = -1 if self._most is None else self._most
+        return observation, {**info, "refused": "", "interventions_left": self._left}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Intervene, then advance one control step.
+
+        Raises:
+            ActionError: It is none of the space.
+        """
+        inner, which, values = self._parts(action)
+        refused = self._intervene(which, values) if which.any() else ""
+        observation, reward, terminated, truncated, info = self.env.step(inner)
+        told = {"refused": refused, "interventions_left": self._left}
+        return observation, reward, terminated, truncated, {**info, **told}
+
+    def _parts(self, action: Any) -> tuple[Any, NDArray[np.bool_], Floats]:
+        n, numbers = len(self._names), sum(self._sizes)
+        try:
+            if self._flat:
+                given = np.asarray(action)
+                inner, gates, values = np.split(given, [given.size - n - numbers, -numbers])
+                which = gates > 0.0
+            else:
+                inner = action["action"]
+                which, values = np.asarray(action["which"]) > 0, action["values"]
+            values = np.asarray(values, dtype=np.float64)
+        except (TypeError, KeyError, ValueError, IndexError):
+            which, values, inner = np.zeros(0, bool), np.zeros(0), None
+        if which.shape != (n,) or values.shape != (numbers,) or not np.isfinite(values).all():
+            raise ActionError(f"an action is one of {self.action_space}, got {action!r}", action)
+        return inner, which, np.clip(values, -1.0, 1.0)
+
+    def _intervene(self, which: NDArray[np.bool_], values: Floats) -> str:
+        """Set what is to be set; give the reason if that is refused."""
+        if self._left == 0:
+            return f"all {self._most} interventions of this episode were made"
+        present = self._inner.world.values()
+        request: dict[str, Any] = {}
+        ends = np.cumsum(self._sizes)
+        for chosen, variable, end, size in zip(
+            which, self._variables, ends, self._sizes, strict=True
+        ):
+            if chosen:
+                low, high = self._box(variable).bounds(variable.shape, present)
+                share = (values[end - size : end].reshape(variable.shape) + 1.0) / 2.0
+                request[variable.name] = low + (high - low) * share
+        try:
+            self._inner.do(request, space=self._space)
+        except InterventionError as error:
+            return str(error)
+        self._left -= self._left > 0
+        return ""
