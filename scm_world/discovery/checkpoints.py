@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, final
 
-from scm_world.discovery.data.durable import write_durably
 from scm_world.errors import UnreadableFile
+from scm_world.output.durable import write_durably
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.paired import Paired
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scm_world.discovery.canvas import FAINT, INK, blank, save
+from scm_world.output.canvas import FAINT, INK, blank, save
 from scm_world.queries.agreement import FACTORS, Agreement
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.verification import Verification, arrow

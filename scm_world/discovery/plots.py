@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, final
 
 import networkx as nx
 
-from scm_world.discovery.canvas import FAINT, HEIGHT, INK, WIDTH, blank, save
 from scm_world.discovery.layers import Arrow, Drawing, lay_out
 from scm_world.discovery.names import Families
 from scm_world.discovery.report import DiscoveryReport
 from scm_world.graph import SCM
+from scm_world.output.canvas import FAINT, HEIGHT, INK, WIDTH, blank, save
 from scm_world.queries.experiments.effects import EdgeKey
 
 if TYPE_CHECKING:

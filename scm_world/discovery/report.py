@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.discovery.scores import Score
+from scm_world.output.durable import write_whole
 from scm_world.queries.experiments.effects import EdgeKey
 
 FORMAT = "scm_world/discovery/1"
@@ -90,10 +91,12 @@ class DiscoveryReport:
         }
 
     def save(self, path: Path) -> None:
-        """Write the report as JSON, whole or not at all."""
-        part = path.with_suffix(".part")
-        part.write_text(json.dumps(self.as_dict(), indent=1) + "\n")
-        part.replace(path)
+        """Write the report as JSON, whole or not at all.
+
+        Raises:
+            UnwritableFolder: There is no such folder, no room, or no permission.
+        """
+        write_whole(json.dumps(self.as_dict(), indent=1) + "\n", path)
 
     def __str__(self) -> str:
         s = self.score

@@ -15,9 +15,9 @@ import pytest
 
 from scm_world import World, discover
 from scm_world.discovery import DiscoveryReport
-from scm_world.discovery.data import durable
-from scm_world.discovery.exam.results import write_whole
 from scm_world.errors import UnreadableFile, UnwritableFolder
+from scm_world.output import durable
+from scm_world.output.durable import write_whole
 
 PROBES = 5
 
@@ -111,18 +111,6 @@ def test_files_are_on_the_disk_before_they_have_their_name(
         write_whole("second\n", text)
     assert (path.read_bytes(), text.read_text()) == (before, "first\n")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["progress.json", "study.json"]
-
-
-def test_a_folder_has_one_writer(tmp_path: Path) -> None:
-    """While it is locked a second one is refused, and then no more."""
-    with (
-        durable.locked(tmp_path / "new"),
-        pytest.raises(UnreadableFile, match="another process"),
-        durable.locked(tmp_path / "new"),
-    ):
-        pass
-    with durable.locked(tmp_path / "new"):
-        assert (tmp_path / "new").is_dir()
 
 
 def test_a_killed_command_goes_on(tmp_path: Path) -> None:

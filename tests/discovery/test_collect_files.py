@@ -23,12 +23,12 @@ from scm_world.discovery.data import (
     Design,
     UnwritableFolder,
     collect,
-    durable,
     folders,
     load,
     save,
 )
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.output import durable
 from scm_world.queries import World
 from scm_world.variables import Mechanism
 

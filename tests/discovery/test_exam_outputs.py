@@ -11,7 +11,7 @@ import pytest
 from exam_samples import CHAIN, TRUTHS, cell, sample_exam
 from matplotlib.image import imread
 
-from scm_world.discovery.exam.pictures import PALETTE, draw_budget
+from scm_world.discovery.exam.pictures import draw_budget
 from scm_world.discovery.exam.results import (
     Exam,
     read_cell,
@@ -27,6 +27,7 @@ from scm_world.discovery.exam.tables import (
     write_tables,
 )
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.output.canvas import PALETTE
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.discovery.data.dataset import Column
-from scm_world.discovery.data.durable import PARTIAL, draft_of, locked, write_durably
 from scm_world.discovery.data.shards import Place, check_kind, check_names, decoded, encoded
 from scm_world.discovery.data.sources import FORMAT, Part
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
+from scm_world.output.durable import PARTIAL, draft_of, locked, write_durably
 from scm_world.world.start import whole_number
 
 SIDECAR = "dataset.json"

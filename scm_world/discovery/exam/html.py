@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
-from scm_world.discovery.exam.html_style import SCRIPT, style
+from scm_world.discovery.exam.html_style import SCRIPT, STYLE, verdicts
 from scm_world.discovery.exam.pictures import budget_png
-from scm_world.discovery.exam.results import Cell, Exam, Truth, write_whole
+from scm_world.discovery.exam.results import Cell, Exam, Truth
 from scm_world.discovery.exam.side_by_side import WRONG, Link, compare
 from scm_world.discovery.exam.side_by_side_drawing import Board, legend, signs
 from scm_world.discovery.exam.tables import (
@@ -23,8 +21,11 @@ from scm_world.discovery.exam.tables import (
     best,
     by_subject,
 )
+from scm_world.output.durable import write_whole
+from scm_world.output.pages import Entry, facts, folded, page, picture, section, table
 
 PICTURES = 150  # runs: of an exam with more of them, only one per learner and subject is drawn
+TEXTS = 3  # of the first columns of the summary; the others are numbers
 NAMED = 25  # wrong edges of a kind that are named in words
 SHORT = ("shd", "f1", "precision", "recall")  # scores beside a single run
 
@@ -40,69 +41,51 @@ def write_report(exam: Exam, path: Path | str) -> None:
         exam: Any exam; it may have no finished run.
         path: Of the HTML file.
     """
-    title = "Exam of learners"
     parts = [
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">',
-        f"<title>{title}</title><style>{style()}</style></head><body>",
-        f"<header><h1>{title}</h1><p>{escape(exam.counted)}.</p></header>",
-        f"<nav aria-label='Contents'><ul>{''.join(_contents(exam))}</ul></nav><main>",
         _summary(exam),
         _budget(exam),
         signs(),
         *(_subject(exam, name, number) for number, name in enumerate(exam.subjects)),
-        _about(exam),
-        f"</main><script>{SCRIPT}</script></body></html>\n",
+        section("about", "About this exam", facts(exam.about)),
     ]
-    write_whole("\n".join(parts), path)
-
-
-def _contents(exam: Exam) -> Iterable[str]:
-    yield '<li><a href="#summary">Summary</a></li><li><a href="#budget">Budget</a></li>'
-    for number, name in enumerate(exam.subjects):
-        yield f'<li><a href="#s{number}">{escape(name)}</a></li>'
+    subjects = [(f"s{number}", name) for number, name in enumerate(exam.subjects)]
+    whole = page(
+        "Exam of learners",
+        parts,
+        lead=f"{exam.counted}.",
+        contents=[("summary", "Summary"), ("budget", "Budget"), *subjects],
+        early_style=verdicts(),
+        extra_style=STYLE,
+        extra_script=SCRIPT,
+    )
+    write_whole(whole, path)
 
 
 # --- all subjects ---------------------------------------------------------------------------------
 
 
 def _summary(exam: Exam) -> str:
-    left = 3  # of the first columns are text
     titles = [*HEADS, *(column.title for column in COLUMNS)]
-    heads = "".join(
-        f'<th scope="col"{_left(i < left)}>{title}</th>' for i, title in enumerate(titles)
-    )
-    lines: list[str] = []
+    lines: list[list[Entry]] = []
     for rows in by_subject(exam).values():
         bold = best(rows)
         for number, row in enumerate(rows):
-            facts = "".join(
-                f"<td{_left(i < left)}{_value(row, i)}>{escape(text)}</td>"
-                for i, text in enumerate(row.heads)
-            )
-            numbers = "".join(_number(row, c, (number, c.key) in bold) for c in COLUMNS)
-            lines.append(f"<tr>{facts}{numbers}</tr>")
-    return (
-        f'<section id="summary"><h2>Summary</h2><p>{escape(NOTE)}</p><div class="wide">'
-        f'<table class="sort"><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{''.join(lines)}</tbody></table></div></section>"
-    )
+            numbers = (_number(row, c, (number, c.key) in bold) for c in COLUMNS)
+            lines.append([*_heads(row), *numbers])
+    whole = table(titles, lines, left=TEXTS, sortable=True)
+    return section("summary", "Summary", f"<p>{escape(NOTE)}</p>{whole}")
 
 
-def _left(is_text: bool) -> str:
-    return ' class="l"' if is_text else ""
+def _heads(row: Row) -> Iterable[Entry]:
+    """Give the first entries of a row."""
+    for head, text in zip(HEADS, row.heads, strict=True):
+        yield Entry(text, by=str(row.done) if head == "done" else None)
 
 
-def _value(row: Row, column: int) -> str:
-    """Give what a column is sorted by, where it is not its text."""
-    return f' data-v="{row.done}"' if HEADS[column] == "done" else ""
-
-
-def _number(row: Row, column: Column, is_best: bool) -> str:
+def _number(row: Row, column: Column, is_best: bool) -> Entry:
     spread = row.spreads.get(column.key)
     value = "" if spread is None else f"{spread.mean:.6g}"
-    mark = ' class="best"' if is_best else ""
-    return f'<td{mark} data-v="{value}">{escape(row.text(column))}</td>'
+    return Entry(row.text(column), by=value, looks="best" if is_best else "")
 
 
 def _budget(exam: Exam) -> str:
@@ -110,29 +93,12 @@ def _budget(exam: Exam) -> str:
         "Line charts: SHD and F1 against the budget, two panels per subject, a line per learner. "
         "The numbers are those of the summary."
     )
-    data = b64encode(budget_png(exam)).decode()
-    return (
-        f'<section id="budget"><h2>Scores against the budget</h2><figure><img alt="{alt}" '
-        f'src="data:image/png;base64,{data}"><figcaption>Means; bars from the lowest to the '
-        "highest seed. Lines are moved a little aside, so that they do not hide one another."
-        "</figcaption></figure></section>"
+    caption = (
+        "Means; bars from the lowest to the highest seed. Lines are moved a little aside, so that "
+        "they do not hide one another."
     )
-
-
-def _about(exam: Exam) -> str:
-    return f'<section id="about"><h2>About this exam</h2>{_facts(exam.about)}</section>'
-
-
-def _facts(about: dict[str, object]) -> str:
-    lines = "".join(
-        f"<dt>{escape(str(key))}</dt><dd>{escape(_words(value))}</dd>"
-        for key, value in about.items()
-    )
-    return f"<dl>{lines}</dl>" if lines else ""
-
-
-def _words(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    inside = picture(budget_png(exam), alt, caption)
+    return section("budget", "Scores against the budget", inside)
 
 
 # --- one subject ----------------------------------------------------------------------------------
@@ -151,10 +117,8 @@ def _subject(exam: Exam, name: str, number: int) -> str:
     if truth.left_out:
         size += f", {len(truth.left_out)} pairs not scored"
     hint = "Point at an edge to read its names; in a graph that has the focus, use ← and →."
-    return (
-        f'<section id="s{number}"><h2>{escape(name)}</h2><p>{size}. {hint}</p>'
-        f"{_facts(truth.about)}{legend()}{board.shared()}{''.join(parts)}</section>"
-    )
+    inside = f"<p>{size}. {hint}</p>{facts(truth.about)}{legend()}{board.shared()}{''.join(parts)}"
+    return section(f"s{number}", name, inside)
 
 
 Links = dict[tuple[str, str, str, bool, int, int], tuple[Link, ...]]
@@ -175,10 +139,9 @@ def _learner(truth: Truth, board: Board, cells: Sequence[Cell], links: Links, dr
             if drawn
             else _list(others, links)
         )
-        more = f"<details><summary>{len(others)} other runs</summary>{inside}</details>"
+        more = folded(f"{len(others)} other runs", inside)
     if own:
-        inside = _list(own, links)
-        more += f"<details><summary>{len(own)} runs on other graphs</summary>{inside}</details>"
+        more += folded(f"{len(own)} runs on other graphs", _list(own, links))
     return (
         f"<h3>{escape(kind)}</h3><p>{_run(first)}</p>{_pair(truth, board, first, links)}"
         f"{_wrong(links.get(first.key, ()))}{more}"
@@ -229,10 +192,8 @@ def _counted(links: Sequence[Link]) -> str:
 
 def _wrong(links: Sequence[Link]) -> str:
     """Name the wrong edges, for those who cannot see or point."""
-    named = "".join(f"<dt>{kind}</dt><dd>{escape(text)}</dd>" for kind, text in _named(links))
-    if not named:
-        return ""
-    return f"<details><summary>Wrong edges in words</summary><dl>{named}</dl></details>"
+    named = facts(dict(_named(links)))
+    return folded("Wrong edges in words", named) if named else ""
 
 
 def _named(links: Sequence[Link]) -> Iterable[tuple[str, str]]:
@@ -245,13 +206,11 @@ def _named(links: Sequence[Link]) -> Iterable[tuple[str, str]]:
 
 def _list(cells: Iterable[Cell], links: Links) -> str:
     """Write runs in words: their scores and their edges, counted."""
-    titles = ["budget", "seed", "status", *(column.title for column in _short())]
-    heads = "".join(f'<th scope="col">{title}</th>' for title in [*titles, "edges"])
-    lines = []
+    titles = ["budget", "seed", "status", *(column.title for column in _short()), "edges"]
+    lines: list[list[str | Entry]] = []
     for cell in cells:
-        facts = [str(cell.budget), str(cell.seed), cell.status]
-        facts += [_score(cell, column) for column in _short()]
+        scores = [_score(cell, column) for column in _short()]
         said = _counted(links[cell.key]) if cell.key in links else cell.message
-        texts = "".join(f"<td>{escape(fact)}</td>" for fact in facts)
-        lines.append(f'<tr>{texts}<td class="w">{escape(said)}</td></tr>')
-    return f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+        last = Entry(said, looks="w")
+        lines.append([str(cell.budget), str(cell.seed), cell.status, *scores, last])
+    return table(titles, lines)

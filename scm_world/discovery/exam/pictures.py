@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from scm_world.discovery.canvas import FAINT, INK, blank, save
 from scm_world.discovery.exam.results import Exam
 from scm_world.discovery.exam.tables import Row, by_subject, table_rows
+from scm_world.output.canvas import FAINT, INK, PALETTE, blank, save, small_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Colors that differ for everyone; the yellow of the eight is left out, it is too pale on white.
-
-Source:
-    Okabe and Ito, *Color universal design*, 2008.
-"""
 MARKERS = "osD^vPX*<>ph"
 DASHES: Mapping[str, Any] = {"see": (0, (1.5, 1.5)), "do": "solid", "paired": (0, (5, 2))}
 ACROSS = 4  # subjects side by side
@@ -31,7 +24,6 @@ BAND, PANEL = 4.3, 4.0  # [inches]: height and width of the panels of a subject
 TOP, KEY, LEFT = 0.55, 0.26, 0.75  # [inches]: above all, a line of the legend, left of all
 DODGE = 0.16  # of the way to the next budget, that lines are moved apart
 TICKS = 6  # budgets that are written below an axis
-COLORS = 64  # of the picture in a page: a third of the bytes
 LONGEST = 34  # letters of a title above a panel
 
 Way = tuple[str, str, bool]
@@ -95,13 +87,7 @@ def draw_budget(exam: Exam, path: Path | str) -> None:
 
 def budget_png(exam: Exam) -> bytes:
     """Draw the same with few colors, for a page that holds its pictures in itself."""
-    from PIL import Image  # matplotlib brings it
-
-    whole, small = io.BytesIO(), io.BytesIO()
-    _figure(exam).savefig(whole, format="png")
-    with Image.open(whole) as image:
-        image.convert("RGB").quantize(COLORS).save(small, format="png", optimize=True)
-    return small.getvalue()
+    return small_png(_figure(exam))
 
 
 def _figure(exam: Exam) -> Figure:

@@ -13,10 +13,10 @@ from typing import Any, TypeVar, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.discovery.data.durable import write_durably
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import SOURCES
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.output.durable import write_whole
 from scm_world.queries.experiments.effects import EdgeKey
 
 CELL, TRUTH, EXAM = "scm_world/exam-cell/1", "scm_world/exam-truth/1", "scm_world/exam/1"
@@ -287,15 +287,6 @@ def as_text(thing: Cell | Truth | Exam) -> str:
         ValueError: A number is not finite.
     """
     return json.dumps(thing.as_dict(), indent=1, allow_nan=False, default=_plain) + "\n"
-
-
-def write_whole(text: str, path: Path | str) -> None:
-    """Write a text as UTF-8, whole or not at all.
-
-    Raises:
-        UnwritableFolder: There is no room, or no permission.
-    """
-    write_durably(path, text.encode("utf-8", errors="backslashreplace"))
 
 
 def _read(path: Path | str, make: Callable[[Mapping[str, Any]], _T], advice: str) -> _T:

@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, final
 
@@ -26,10 +19,7 @@ from scm_world.discovery.learners.registry import Learner, learn, learner
 from scm_world.discovery.metrics import effect_rmse, evaluate
 from scm_world.errors import EngineFailure, MissingExtra, ScmWorldError, UnknownOption
 from scm_world.tasks import TASKS
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-"""One thread each: seconds are those of one core, and sums do not depend on the machine."""
-
+from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
 
 LONGEST = 1e6  # [s] that can be waited for at once
 
@@ -207,38 +197,14 @@ class Bench:
         return None if test is None else effect_rmse(found, table, test).rmse
 
 
-# --- processes ----------------------------------------------------------------------------------
-
-
-def _serve(pipe: Connection) -> None:
-    """Run jobs until there are no more, or until the process that asks has ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks ends this one
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    bench = Bench()
-    while True:
-        try:
-            what, job = pipe.recv()
-        except EOFError:
-            return
-        try:
-            pipe.send(getattr(bench, what)(job))
-        except Exception as error:  # told to the process that asked
-            pipe.send(error)
-
-
-def _end_with_parent() -> None:
-    """End this process, whatever it is doing, when the one that started it is no more."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
 def _said(error: Exception) -> str:
     """Write an error in one line; with its name, unless it is one of ours."""
     text = " ".join(str(error).split())
     name = type(error).__name__
     return text if text and isinstance(error, ScmWorldError) else f"{name}: {text}".rstrip(": ")
+
+
+# --- processes ----------------------------------------------------------------------------------
 
 
 @final
@@ -251,10 +217,8 @@ class Runner:
 
     def __init__(self, timeout: float | None = None) -> None:
         self._timeout = None if timeout is None else min(timeout, LONGEST)
-        self._process: Any = None
-        self._pipe: Any = None
+        self._worker = Worker(Bench)
         self._ready: set[tuple[str, int, str]] = set()
-        self._interrupted = False
 
     def run(self, job: Job) -> Cell:
         """Run a job; a learner that takes its process with it has failed.
@@ -265,15 +229,16 @@ class Runner:
         if (job.subject, job.seed, job.data) not in self._ready:
             self.truth(job)  # what is collected is not part of the time of a learner
         try:
-            answer = self._ask("run", job, self._timeout)
-        except EOFError as died:
-            if self._interrupted:
-                raise EngineFailure(str(died), "process") from None
-            return job.cell(status="failed", message=str(died))
-        if answer is None:
+            cell: Cell = self._worker.ask("run", job, timeout=self._timeout)
+        except TookTooLong:
+            self._ready.clear()
             said = f"stopped after {self._timeout:g} s"
             return job.cell(status="timeout", message=said, seconds=float(self._timeout or 0.0))
-        cell: Cell = answer
+        except Ended as ended:
+            self._ready.clear()
+            if ended.was_interrupted:
+                raise EngineFailure(str(ended), PROCESS) from None
+            return job.cell(status="failed", message=str(ended))
         return cell
 
     def truth(self, job: Job) -> Truth:
@@ -283,82 +248,18 @@ class Runner:
             ScmWorldError: The subject cannot be made, or its data cannot be collected or written.
         """
         try:
-            truth: Truth = self._ask("truth", job, None)
-        except EOFError as died:
-            raise EngineFailure(f"{job.subject}: {died}", "process") from None
+            truth: Truth = self._worker.ask("truth", job)
+        except Ended as ended:
+            self._ready.clear()
+            raise EngineFailure(f"{job.subject}: {ended}", PROCESS) from None
         self._ready.add((job.subject, job.seed, job.data))
         return truth
 
-    def _ask(self, what: str, job: Job, timeout: float | None) -> Any:
-        """Ask the process for something; None if that took too long."""
-        if self._process is None:
-            self._start()
-        if self._interrupted:
-            self.stop()
-            raise EOFError("interrupted")
-        try:
-            self._pipe.send((what, job))
-            if not self._pipe.poll(timeout):
-                self.stop()
-                return None
-            answer = self._pipe.recv()
-        except (EOFError, OSError):
-            self._process.join(1.0)
-            code = self._process.exitcode
-            self.stop()
-            raise EOFError(f"its process ended with exit code {code}") from None
-        if isinstance(answer, BaseException):
-            raise answer
-        return answer
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        with _single_threaded(), _uninterrupted():
-            self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-            self._process.start()
-        theirs.close()
-
     def interrupt(self) -> None:
         """End the process from another thread; who waits for an answer gets an error."""
-        self._interrupted = True
-        process = self._process
-        if process is not None:
-            process.kill()
+        self._worker.interrupt()
 
     def stop(self) -> None:
         """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.join()
-            self._pipe.close()
-            self._process = self._pipe = None
-            self._ready = set()
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach, where a system has such."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Start processes whose libraries use one thread."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        self._worker.stop()
+        self._ready.clear()

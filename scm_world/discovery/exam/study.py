@@ -14,15 +14,15 @@ from pathlib import Path
 from threading import Event
 from typing import Any, final
 
-from scm_world.discovery.data.durable import draft_of, locked
 from scm_world.discovery.exam.html import write_report
 from scm_world.discovery.exam.pictures import draw_budget
-from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json, write_whole
+from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json
 from scm_world.discovery.exam.runs import Job, Runner, shown_name, source_for
 from scm_world.discovery.exam.subjects import VIEWS, TaskView, check_subject, subject, subject_mark
 from scm_world.discovery.exam.tables import write_tables
 from scm_world.discovery.learners.registry import SOURCES, Learner, learner
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
+from scm_world.output.durable import draft_of, locked, write_whole
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.policies import as_policy
 from scm_world.queries.progress import Progress

@@ -11,7 +11,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Literal, final
 
-from scm_world.discovery.exam.results import Cell, Exam, Number, write_whole
+from scm_world.discovery.exam.results import Cell, Exam, Number
+from scm_world.output.durable import write_whole
 
 NONE = "–"
 

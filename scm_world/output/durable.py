@@ -46,6 +46,15 @@ def write_durably(path: Path | str, data: bytes) -> None:
             draft.unlink(missing_ok=True)
 
 
+def write_whole(text: str, path: Path | str) -> None:
+    """Write a text as UTF-8, whole or not at all.
+
+    Raises:
+        UnwritableFolder: There is no room, or no permission.
+    """
+    write_durably(path, text.encode("utf-8", errors="backslashreplace"))
+
+
 def _sync(folder: Path) -> None:
     """Make a new name in a folder outlast a loss of power."""
     handle = os.open(folder, os.O_RDONLY)

@@ -1,0 +1,1 @@
+"""What a result is written as: files that are whole, pictures, and pages that need nothing else."""

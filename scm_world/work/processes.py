@@ -1,0 +1,268 @@
+"""A process of its own for work that may take too long, crash, or be interrupted."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
+from types import TracebackType
+from typing import Any, final
+
+from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption
+from scm_world.work.threads import children_single_threaded
+
+PROCESS = "process"  # the engine of an EngineFailure
+PICKLED = ("a function or class of a module, functools.partial of one, or plain data",)
+
+
+@final
+class Ended(Exception):
+    """A process ended before it answered.
+
+    Attributes:
+        code: Its exit code; that of a signal is negative. None if it never began.
+        was_interrupted: Whether another thread ended it.
+    """
+
+    def __init__(self, code: int | None, *, was_interrupted: bool = False) -> None:
+        self.code, self.was_interrupted = code, was_interrupted
+        ended = f"its process ended with exit code {code}"
+        super().__init__("interrupted" if was_interrupted else ended)
+
+
+@final
+class TookTooLong(Exception):
+    """A process was ended because it did not answer in time."""
+
+
+def pickled(what: str, thing: object) -> bytes:
+    """Write something for another process.
+
+    Args:
+        what: Said in the error.
+        thing: Anything.
+
+    Raises:
+        UnknownOption: It cannot be pickled.
+
+    Example:
+        >>> pickled("job", lambda: 0)
+        Traceback (most recent call last):
+        scm_world.errors.UnknownOption: job cannot be <function ... it can be: a function or ...
+    """
+    try:
+        return bytes(ForkingPickler.dumps(thing))
+    except Exception as error:
+        raise UnknownOption(what, thing, PICKLED) from error
+
+
+@final
+class Worker:
+    """A process that makes one thing, and calls its methods when it is asked to.
+
+    The process is started when it is first needed. It has one thread for each numerical library,
+    does not hear Ctrl-C, and ends when the process that started it does, however that ends.
+
+    Args:
+        make: Makes the thing, in the process: a function or class that can be pickled.
+
+    Raises:
+        UnknownOption: ``make`` cannot be pickled.
+
+    Example:
+        >>> with Worker(dict) as worker:
+        ...     worker.ask("update", {"a": 1})
+        ...     worker.ask("__getitem__", "a")
+        1
+    """
+
+    def __init__(self, make: Callable[[], object]) -> None:
+        self._make = pickled("make", make)
+        self._process: Any = None
+        self._pipe: Any = None
+        self._interrupted = False
+
+    def ask(self, method: str, *given: Any, timeout: float | None = None) -> Any:
+        """Call a method of the thing, and wait for what it gives.
+
+        Args:
+            method: Its name; ``"__call__"`` calls the thing itself.
+            *given: Arguments.
+            timeout: After which the process is ended [s]; None waits however long it takes.
+
+        Raises:
+            UnknownOption: An argument cannot be pickled.
+            TookTooLong: There was no answer in time.
+            Ended: The process ended, or was interrupted. Asked again, a new one is started, unless
+                it was interrupted.
+            Exception: What the method, or ``make``, raised.
+        """
+        self.begin(method, *given)
+        try:
+            is_late = not self._pipe.poll(timeout)
+        except OSError:
+            is_late = False  # ``answer`` tells why there is none
+        except BaseException:
+            self.stop()  # nobody waits for the answer any more
+            raise
+        if is_late:
+            self.stop()
+            raise TookTooLong
+        return self.answer()
+
+    def begin(self, method: str, *given: Any) -> Connection:
+        """Begin to ask; ``answer`` ends it.
+
+        Returns:
+            What can be waited for with ``multiprocessing.connection.wait``.
+
+        Raises:
+            UnknownOption: An argument cannot be pickled.
+            Ended: The process ended, or was interrupted.
+        """
+        asked = pickled(f"argument of {method}", given)
+        parts = [method.encode(), asked]
+        if self._process is None:
+            self._start()
+            parts.insert(0, self._make)
+        if self._interrupted:
+            self.stop()
+            raise Ended(None, was_interrupted=True)
+        try:
+            for part in parts:
+                self._pipe.send_bytes(part)
+        except OSError:
+            raise self._ended() from None
+        pipe: Connection = self._pipe
+        return pipe
+
+    def answer(self) -> Any:
+        """Wait for what was begun; it raises what ``ask`` does."""
+        try:
+            said = self._pipe.recv_bytes()
+        except (EOFError, OSError):
+            raise self._ended() from None
+        except BaseException:
+            self.stop()  # the rest of the answer would be taken for the next one
+            raise
+        is_error, given = pickle.loads(said)  # noqa: S301 # written by our own process
+        if is_error:
+            raise given
+        return given
+
+    def _ended(self) -> Ended:
+        self._process.join(1.0)
+        code = self._process.exitcode
+        self.stop()
+        return Ended(code, was_interrupted=self._interrupted)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the process ended by itself."""
+        return self._process is not None and not self._process.is_alive()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        with children_single_threaded(), _uninterrupted():
+            process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            process.start()
+        self._process = process
+        theirs.close()
+
+    def interrupt(self) -> None:
+        """End the process from another thread, for good; who waits for an answer gets an error."""
+        self._interrupted = True
+        process = self._process
+        if process is not None:
+            process.kill()
+
+    def stop(self) -> None:
+        """End the process. Asked again, a new one is started."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+        if self._pipe is not None:
+            self._pipe.close()  # one that has just begun ends by this
+        self._process = self._pipe = None
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, where a system has such."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+# --- in the process -------------------------------------------------------------------------------
+
+
+def _serve(pipe: Connection) -> None:
+    """Answer until nobody asks any more, or until the process that asks has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks ends this one
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    things: list[object] = []
+    try:
+        make = pipe.recv_bytes()
+        while True:
+            method, given = pipe.recv_bytes().decode(), pipe.recv_bytes()
+            pipe.send_bytes(_answered(make, things, method, given))
+    except (EOFError, OSError):
+        return
+
+
+def _answered(make: bytes, things: list[object], method: str, given: bytes) -> bytes:
+    """Do what was asked. The thing is made before the first time, and kept."""
+    try:
+        if not things:
+            things.append(pickle.loads(make)())  # noqa: S301 # written by our own process
+        result = getattr(things[0], method)(*pickle.loads(given))  # noqa: S301 # as above
+        return bytes(ForkingPickler.dumps((False, result)))
+    except Exception as error:  # told to the process that asked
+        return bytes(ForkingPickler.dumps((True, _portable(error))))
+
+
+def _portable(error: Exception) -> Exception:
+    """Give an error that survives the way: the same one if it can be pickled."""
+    if not isinstance(error, ScmWorldError):
+        error.add_note("".join(traceback.format_exception(error)).rstrip())
+    try:
+        again = pickle.loads(pickle.dumps(error))  # noqa: S301 # written in the line itself
+    except Exception:
+        again = None
+    if type(again) is type(error):
+        return error
+    said = "".join(traceback.format_exception_only(error)).rstrip()
+    return EngineFailure(said, PROCESS)
+
+
+def _end_with_parent() -> None:
+    """End this process, whatever it is doing, when the one that started it is no more."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

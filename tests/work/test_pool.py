@@ -1,0 +1,256 @@
+"""A bag of jobs: every result once, whatever happens to the processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from work_samples import Task, make, no_bench
+
+from scm_world.errors import ActionError, EngineFailure, UnknownOption
+from scm_world.work.pool import TRIES, Pool
+
+
+def wait_for(what: Callable[[], Any], seconds: float = 60.0) -> None:
+    """Wait until something is so."""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it did not come about"
+        time.sleep(0.01)
+
+
+def tries(folder: Path) -> dict[int, int]:
+    """Count how often each job was begun, by its number."""
+    numbers = [int(path.name.split("-")[1]) for path in folder.glob("try-*")]
+    return {number: numbers.count(number) for number in numbers}
+
+
+def pids(folder: Path) -> set[int]:
+    """List the processes that began a job."""
+    return {int(path.name.split("-")[3]) for path in folder.glob("try-*")}
+
+
+def is_alive(pid: int) -> bool:
+    """Tell whether a process runs."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[Pool[Task, Any]]:
+    """Two processes for all that does not end them."""
+    with Pool(make, 2) as made:
+        yield made
+
+
+# --- results --------------------------------------------------------------------------------------
+
+
+def test_results_do_not_depend_on_the_number_of_workers(pool: Pool[Task, Any]) -> None:
+    """To the last bit: in this process, in one other, and in two."""
+    jobs = [Task(number, "product") for number in range(5)]
+    with Pool(make, 1, inline=True) as here, Pool(make, 1) as one:
+        ways = [dict(way.run(jobs)) for way in (here, one, pool)]
+    assert ways[0] == ways[1] == ways[2]
+    assert sorted(ways[0]) == list(range(5))
+
+
+def test_the_order_of_jobs_does_not_matter(pool: Pool[Task, Any]) -> None:
+    """Each result belongs to its job, each comes once, and there may be more jobs than workers."""
+    jobs = [Task(number) for number in range(40)]
+    for given in (jobs, jobs[::-1]):
+        found = sorted(pool.run(given))
+        assert found == [(place, job.number**2) for place, job in enumerate(given)]
+
+
+def test_no_job_is_no_result(pool: Pool[Task, Any]) -> None:
+    """And no process."""
+    assert list(pool.run([])) == []
+
+
+def test_each_worker_is_made_once(tmp_path: Path) -> None:
+    """However many jobs and runs there are; and in this process, too."""
+    for name, workers, inline in (("there", 2, False), ("here", 1, True)):
+        folder = tmp_path / name
+        folder.mkdir()
+        with Pool(partial(make, folder), workers, inline=inline) as pool:
+            for _ in range(2):
+                assert len(list(pool.run([Task(number) for number in range(12)]))) == 12
+        made = [int(path.name.split("-")[1]) for path in folder.iterdir()]
+        assert len(made) == len(set(made)) == workers
+        assert (os.getpid() in made) is inline
+
+
+# --- killed ---------------------------------------------------------------------------------------
+
+
+def test_a_killed_worker_is_replaced(tmp_path: Path) -> None:
+    """Its job is done by another one, and is in the results once; no other is done twice."""
+    jobs = [Task(number, folder=tmp_path) for number in range(8)]
+    jobs[3] = Task(3, "sleep once", tmp_path)
+    with Pool(make, 2) as pool:
+
+        def kill() -> None:
+            wait_for(lambda: tries(tmp_path).get(3))
+            (path,) = tmp_path.glob("try-3-*")
+            os.kill(int(path.name.split("-")[3]), signal.SIGKILL)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        found = sorted(pool.run(jobs))
+        killer.join()
+    assert found == [(number, number**2) for number in range(8)]
+    assert tries(tmp_path) == {number: 1 + (number == 3) for number in range(8)}
+
+
+def test_a_worker_that_was_killed_at_rest_is_replaced(tmp_path: Path) -> None:
+    """The next jobs are done at the first try."""
+    with Pool(make, 1) as pool:
+        list(pool.run([Task(0, folder=tmp_path)]))
+        (pid,) = pids(tmp_path)
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda: pool._workers[0].has_ended)
+        assert list(pool.run([Task(1, folder=tmp_path)])) == [(0, 1)]
+    assert tries(tmp_path) == {0: 1, 1: 1}
+
+
+def test_a_job_that_always_kills_is_given_up(tmp_path: Path) -> None:
+    """After three tries, with its number and what it is."""
+    jobs = [Task(0), Task(1, "die", tmp_path)]
+    with Pool(make, 2) as pool, pytest.raises(EngineFailure) as caught:
+        list(pool.run(jobs))
+    said = str(caught.value)
+    assert said.startswith("job 1, Task(")
+    assert said.endswith("was tried 3 times, and then its process ended with exit code -9")
+    assert tries(tmp_path) == {1: TRIES}
+
+
+# --- errors ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("inline", [False, True])
+def test_an_error_of_a_job_is_raised(inline: bool, tmp_path: Path) -> None:
+    """With class and attributes and the name of the job; the others are given up."""
+    jobs = [Task(7, "refuse"), *(Task(number, "sleep", tmp_path) for number in range(3))]
+    with Pool(make, 1 if inline else 2, inline=inline) as pool:
+        with pytest.raises(ActionError, match="no 7") as caught:
+            list(pool.run(jobs))
+        assert not any(map(is_alive, pids(tmp_path)))
+        assert caught.value.action == 7
+        assert caught.value.__notes__[-1].startswith("in job 0, Task(")
+        assert list(pool.run([Task(3)])) == [(0, 9)]
+
+
+@pytest.mark.parametrize("inline", [False, True])
+def test_an_error_of_make_is_raised(inline: bool) -> None:
+    """As it is."""
+    with (
+        Pool(no_bench, 1, inline=inline) as pool,  # type: ignore[arg-type] # it gives nothing
+        pytest.raises(ActionError, match="there is no room"),
+    ):
+        list(pool.run([Task(0)]))
+
+
+def test_what_cannot_be_sent_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    """What makes workers at once, a job before any is begun; in this process all is allowed."""
+    with pytest.raises(UnknownOption, match="make cannot be <function"):
+        Pool(lambda: len, 2)
+    with Pool(make, 2) as pool:
+        jobs: list[Any] = [Task(0, folder=tmp_path), lambda: 0]
+        with pytest.raises(UnknownOption, match=r"job 1 cannot be .* a function or class of"):
+            pool.run(jobs)
+        assert not any(worker._process for worker in pool._workers)
+    with Pool(lambda: lambda job: job(), 1, inline=True) as here:
+        assert list(here.run([lambda: "done"])) == [(0, "done")]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("workers", "inline"), [(0, False), (1.5, False), (True, False), (2, True)]
+)
+def test_workers_are_counted(workers: Any, inline: bool) -> None:
+    """None are too few; in this process there is one."""
+    with pytest.raises(UnknownOption, match="workers"):
+        Pool(make, workers, inline=inline)
+
+
+# --- ended ----------------------------------------------------------------------------------------
+
+
+def test_results_are_read_one_run_after_another(tmp_path: Path) -> None:
+    """A second run is refused while the first goes on; one that was closed does not just end."""
+    jobs = [Task(number, folder=tmp_path) for number in range(4)]
+    with Pool(make, 1) as pool:
+        first = pool.run(jobs)
+        assert next(first) == (0, 0)
+        with pytest.raises(EngineFailure, match="at work"):
+            next(pool.run(jobs))
+        pool.close()
+        with pytest.raises(EngineFailure, match="was closed"):
+            next(first)
+        assert len(list(pool.run(jobs))) == 4
+
+
+@needs_proc
+def test_who_stops_reading_ends_the_processes(tmp_path: Path) -> None:
+    """Those that are at work as well; so does the end of the block."""
+    with Pool(make, 2) as pool:
+        for found in pool.run([Task(0), Task(1, "sleep", tmp_path)]):
+            assert found == (0, 0)
+            wait_for(lambda: pids(tmp_path))
+            break
+        wait_for(lambda: not any(map(is_alive, pids(tmp_path))))
+        list(pool.run([Task(2, folder=tmp_path)]))
+    assert len(pids(tmp_path)) == 2
+    assert not any(map(is_alive, pids(tmp_path)))
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from scm_world.work.pool import Pool
+from work_samples import Task, make
+if __name__ == "__main__":
+    with Pool(make, 2) as pool:
+        list(pool.run([Task(number, "sleep", Path(sys.argv[1])) for number in range(4)]))
+"""
+
+
+@needs_proc
+@pytest.mark.parametrize("signal_", [signal.SIGINT, signal.SIGKILL])
+def test_no_process_outlives_the_one_that_reads(tmp_path: Path, signal_: signal.Signals) -> None:
+    """Neither Ctrl-C nor ``kill -9`` leaves workers behind, and they say nothing."""
+    script, marks = tmp_path / "run_pool.py", tmp_path / "marks"
+    script.write_text(SCRIPT)
+    marks.mkdir()
+    paths = os.pathsep.join((str(Path(__file__).parent), os.getcwd()))
+    process = subprocess.Popen(  # noqa: S603 # our own script
+        [sys.executable, str(script), str(marks)],
+        env={**os.environ, "PYTHONPATH": paths},
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    wait_for(lambda: len(pids(marks)) == 2)
+    if signal_ == signal.SIGINT:
+        os.killpg(process.pid, signal_)  # as a terminal does: all of them
+    else:
+        process.kill()
+    _, said = process.communicate(timeout=30)
+    wait_for(lambda: not any(map(is_alive, pids(marks))), 10.0)
+    assert said.decode().count("Traceback") == (signal_ == signal.SIGINT)
+    assert tries(marks) == {0: 1, 1: 1}
