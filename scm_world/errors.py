@@ -28,13 +28,14 @@ allowed and what to do::
     ├── UnwritableFolder         a folder without room or permission
     ├── Forbidden                a question that a laboratory does not allow
     ├── BudgetExhausted          an experiment that costs more than is left
+    ├── EvaluationError          an episode that could not be played, with its place
     └── MissingExtra             an optional package that is not installed
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 
@@ -387,6 +388,21 @@ class BudgetExhausted(ScmWorldError, RuntimeError):
             f"the experiment takes {asked} episodes, but {left} are left of the budget; ask for "
             "fewer, or open a laboratory with a larger budget on the same log"
         )
+
+
+class EvaluationError(ScmWorldError, RuntimeError):
+    """An episode of an evaluation that could not be played.
+
+    Attributes:
+        place: Agent, engine, protocol, seed, episode and control step, by name.
+        reason: What went wrong.
+    """
+
+    def __init__(self, place: Mapping[str, Any], reason: str) -> None:
+        self.place = dict(place)
+        self.reason = reason
+        where = ", ".join(f"{name} {value}" for name, value in self.place.items())
+        super().__init__(f"{where}: {reason}")
 
 
 class MissingExtra(ScmWorldError, ImportError):

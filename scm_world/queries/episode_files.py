@@ -79,7 +79,7 @@ def _about(episode: Episode) -> dict[str, Any]:
             [f"give the arguments of {task.name!r} by name, so that they can be saved"]
         )
     with episode.stage.twin() as world:
-        engine = world.backend.name
+        engine = world.engine
     try:
         arguments = json.loads(json.dumps(_plain(task.given), allow_nan=False))
     except (TypeError, ValueError) as error:

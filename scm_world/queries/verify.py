@@ -193,7 +193,7 @@ def _verified(
         colors=tuple(sorted(colors)),
         local=local,
         seconds=time.perf_counter() - started,
-        versions=versions(f"{world.backend.name} {world.backend.version}"),
+        versions=versions(world.engine),
     )
 
 

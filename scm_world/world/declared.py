@@ -54,6 +54,12 @@ class Declared:
         return _copied, (type(self), self.family.task, options, snapshot)
 
     @property
+    def engine(self) -> str:
+        """Name and version of the physics engine."""
+        world: Any = self
+        return f"{world.backend.name} {world.backend.version}"
+
+    @property
     def task(self) -> Task:
         """The task, with its present plan."""
         return self.declaration.task

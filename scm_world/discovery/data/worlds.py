@@ -96,7 +96,7 @@ class Episodes:
             "nature": Plan(setting.nature).as_dict()["do"],
             "design": self._design.as_dict(),
             "engine": self._world.backend.name,
-            "versions": versions(self._world.backend.name),
+            "versions": versions(self._world.engine),
         }
 
     def part(self, numbers: range, tell: Tell) -> Part:

@@ -1,0 +1,1 @@
+"""Measuring policies: where an agent generalises, and how sure that is."""

@@ -1,0 +1,263 @@
+"""One episode of an evaluation: an environment, a player, a protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import Any, final
+
+import numpy as np
+
+from scm_world.curricula import Memory, Turn
+from scm_world.curricula.choices import Stages
+from scm_world.env import ScmWorldEnv
+from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption
+from scm_world.evaluation.policies import Player
+from scm_world.evaluation.protocols import Protocol
+from scm_world.variables import Null
+
+LAST = 20
+"""Control steps over which the end of an episode is averaged."""
+
+FRACTIONS = (
+    "last_fractional_success",
+    "last_integrated_fractional_success",
+    "full_integrated_fractional_success",
+)
+"""The published scores: at the end, over the last steps, over all steps."""
+
+METRICS = (*FRACTIONS, "success", "return")
+"""What is measured of every episode."""
+
+Watch = Callable[[ScmWorldEnv], Any]
+
+
+@final
+@dataclass(frozen=True)
+class Row:
+    """What is kept of an episode.
+
+    Attributes:
+        agent: Who acted.
+        run: Number of the training run of this agent.
+        engine: Name of the physics engine.
+        protocol: Name of the protocol.
+        seed: Of the noise.
+        episode: Its number within the noise.
+        steps: How many control steps it had.
+        scores: By the names of ``METRICS``.
+        drawn: The values of what was intervened on, by variable.
+        hash: Sums up all states, parameters and actions, bit for bit.
+    """
+
+    agent: str
+    run: int
+    engine: str
+    protocol: str
+    seed: int
+    episode: int
+    steps: int
+    scores: dict[str, float]
+    drawn: dict[str, list[float]] = field(default_factory=dict)
+    hash: str = ""
+
+
+@final
+class Fingerprint:
+    """Sums up an episode, bit for bit.
+
+    Args:
+        env: At the beginning of the episode.
+    """
+
+    def __init__(self, env: ScmWorldEnv) -> None:
+        self._world = env.world
+        self._sum = blake2b(digest_size=16)
+        self._version = -1
+        self.look()
+
+    def look(self) -> None:
+        """Take in the state, and the parameters if somebody has intervened."""
+        world = self._world
+        now, state = world.current()
+        if world.version != self._version:
+            self._version = world.version
+            for name in world.static_names:
+                self._sum.update(name.encode())
+                self._sum.update(np.asarray(now[name]).tobytes())
+        self._sum.update(state.vector.tobytes())
+
+    def act(self, action: Any) -> None:
+        """Take in an action."""
+        self._sum.update(np.ascontiguousarray(action).tobytes())
+
+    def __str__(self) -> str:
+        return self._sum.hexdigest()
+
+
+def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
+    """Prepare a protocol for an environment.
+
+    Raises:
+        UnknownOption: It depends on what happened in other episodes.
+        EvaluationError: It names something that does not exist, or a region that is impossible.
+    """
+    if any(isinstance(part, Stages) for part in protocol.part.walk()):
+        allowed = ("parts without stages: an episode must not depend on others",)
+        raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
+    turn = Turn(protocol.curriculum())
+    try:
+        turn.curriculum.check(env.world)
+    except ScmWorldError as error:
+        place = {"protocol": protocol.name, "task": env.world.task.name}
+        raise EvaluationError(place, str(error)) from error
+    return turn
+
+
+@final
+class Arena:
+    """Where episodes of one engine are played.
+
+    Args:
+        env: It is reset again and again.
+    """
+
+    def __init__(self, env: ScmWorldEnv) -> None:
+        self.env = env
+        self._turns: dict[str, tuple[Protocol, Turn]] = {}
+
+    def play(
+        self,
+        player: Player,
+        protocol: Protocol,
+        *,
+        seed: int,
+        episode: int,
+        who: tuple[str, int] = ("", 0),
+        watch: Watch | None = None,
+    ) -> Row:
+        """Play an episode.
+
+        Args:
+            player: Who acts.
+            protocol: What is done.
+            seed: Of the noise.
+            episode: Its number within the noise.
+            who: Name and number of the run, for the row.
+            watch: Called at every instant.
+
+        Raises:
+            EvaluationError: The policy gave no action, or an intervention was refused; with the
+                place.
+        """
+        env, engine = self.env, self.env.world.backend.name
+        place: dict[str, Any] = {
+            "agent": who[0],
+            "engine": engine,
+            "protocol": protocol.name,
+            "seed": seed,
+            "episode": episode,
+        }
+        with _placed(place, env):
+            turn = self._turn(protocol)
+            observation, info = env.reset(seed=seed, options={"episode": episode})
+            if turn.begin(env, episode):
+                observation, info = env.present()
+            drawn = _drawn(env, 0)
+            player.begin(env)
+            mark = Fingerprint(env)
+            fractions: list[float] = []
+            total, truncated = 0.0, False
+            while not truncated:
+                if watch is not None:
+                    watch(env)
+                action = player.act(observation)
+                mark.act(action)
+                observation, reward, _, truncated, info = env.step(action)
+                fractions.append(info["fractional_success"])
+                total += reward
+                if not truncated and turn.step(env):
+                    observation, info = env.present()
+                    drawn |= _drawn(env, env.world.index)
+                mark.look()
+            if watch is not None:
+                watch(env)
+        scores = scored(fractions, success=bool(info["is_success"]), total=total)
+        return Row(
+            *who, engine, protocol.name, seed, episode, len(fractions), scores, drawn, str(mark)
+        )
+
+    def _turn(self, protocol: Protocol) -> Turn:
+        kept, found = self._turns.get(protocol.name, (None, None))
+        if found is None or kept != protocol:
+            found = turn_of(protocol, self.env)
+            self._turns[protocol.name] = protocol, found
+        found.memory = Memory()
+        return found
+
+    def close(self) -> None:
+        """Free the engine."""
+        self.env.close()
+
+
+def scored(fractions: list[float], *, success: bool, total: float) -> dict[str, float]:
+    """Compute the scores of an episode.
+
+    Args:
+        fractions: Fractional success after each control step.
+        success: Whether it succeeded in the end.
+        total: Sum of the rewards.
+
+    Returns:
+        A number for each of ``METRICS``.
+
+    Example:
+        >>> found = scored([0.0, 0.5, 1.0], success=True, total=2.5)
+        >>> [found[name] for name in METRICS]
+        [1.0, 0.5, 0.5, 1.0, 2.5]
+
+    Source:
+        CausalWorld 1.2, ``metrics``: full, last integrated and last fractional success. There the
+        second one is the mean of the first step and the last nineteen.
+    """
+    ends = fractions[-LAST:]
+    return {
+        "last_fractional_success": fractions[-1],
+        "last_integrated_fractional_success": sum(ends) / len(ends),
+        "full_integrated_fractional_success": sum(fractions) / len(fractions),
+        "success": float(success),
+        "return": total,
+    }
+
+
+def _drawn(env: ScmWorldEnv, step: int) -> dict[str, list[float]]:
+    """Read the values of what was intervened on at a control step."""
+    asked: Mapping[str, Any] = {
+        name: act
+        for at, request in env.interventions
+        if at == step
+        for name, act in request.items()
+    }
+    return {
+        name: np.ravel(env.world[name]).astype(float).tolist()
+        for name, act in asked.items()
+        if not isinstance(act, Null) and name in env.world.model and name != "action"
+    }
+
+
+@contextmanager
+def _placed(place: dict[str, Any], env: ScmWorldEnv) -> Iterator[None]:
+    """Say of an error in which episode it happened."""
+    try:
+        yield
+    except EvaluationError as error:
+        raise EvaluationError({**place, **error.place}, error.reason) from error
+    except ScmWorldError as error:
+        if env.world.index:
+            place = {**place, "control step": env.world.index}
+        raise EvaluationError(place, str(error)) from error
+    except Exception as error:
+        error.add_note(", ".join(f"{name} {value}" for name, value in place.items()))
+        raise

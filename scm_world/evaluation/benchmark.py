@@ -1,0 +1,149 @@
+"""The protocols P0 to P11 of every task, as rows of a table.
+
+Source:
+    CausalWorld 1.2, ``benchmark/benchmarks.py``, for reaching, pushing, picking, pick_and_place
+    and stacking2: names, variables and spaces are the published ones. The published patterns name
+    the size of the block; here block and goal share it as ``block.size``. Where the predecessor
+    has no protocol (P1 to P4 and P6 to P11 of reaching, P3 of stacking2, and the four tasks that
+    build larger shapes), the row follows the same pattern with the variables that play the part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import final
+
+from scm_world.curricula import together
+from scm_world.curricula.parts import Goal, Part, Resample
+from scm_world.errors import UnknownOption
+from scm_world.evaluation.protocols import Protocol
+from scm_world.tasks import TASKS
+from scm_world.variables.kinds import SpaceName
+
+FRICTION = "floor_friction"
+
+
+@final
+@dataclass(frozen=True)
+class Roles:
+    """Which variables of a task play which part.
+
+    Attributes:
+        mass: What is moved, how heavy it is.
+        size: How large it is.
+        tool: Where it begins.
+        goal: Where it should be. None: the goals are a shape that the task draws.
+        kept: Causes of the shape that are not varied with it.
+    """
+
+    mass: str
+    size: str
+    tool: str
+    goal: str | None
+    kept: tuple[str, ...] = ()
+
+
+_WALL = Roles(
+    "blocks_mass",
+    "blocks_min_size",
+    "tool_level_0_num_0.cylindrical_position",
+    None,
+    ("blocks_mass", "blocks_min_size"),
+)
+_BLOCK = Roles(
+    "tool_block.mass",
+    "block.size",
+    "tool_block.cylindrical_position",
+    "goal_block.cylindrical_position",
+)
+
+ROLES: Mapping[str, Roles] = {
+    "reaching": Roles(
+        "robot_finger_*.mass",
+        "number_of_obstacles",
+        "joint_positions",
+        "goal_*.cylindrical_position",
+    ),
+    "pushing": _BLOCK,
+    "picking": _BLOCK,
+    "pick_and_place": _BLOCK,
+    "stacking2": Roles(
+        "tool_block_*.mass",
+        "block.size",
+        "tool_block_*.cylindrical_position",
+        "goal_tower.cylindrical_position",
+    ),
+    "towers": Roles("blocks_mass", "tower_dims", "tool_*.cylindrical_position", "tower_center"),
+    "stacked_blocks": _WALL,
+    "creative_stacked_blocks": _WALL,
+    "general": Roles(
+        "blocks_mass",
+        "tool_block_size",
+        "tool_*.cylindrical_position",
+        None,
+        ("blocks_mass", "tool_block_size", "nums_objects"),
+    ),
+}
+"""Of each task."""
+
+ROWS: tuple[tuple[str, str, SpaceName], ...] = (
+    ("P0", "", "A|B"),
+    ("P1", "mass", "A"),
+    ("P2", "mass", "B"),
+    ("P3", "size", "A"),
+    ("P4", "tool", "A"),
+    ("P5", "goal", "A"),
+    ("P6", "goal tool", "B"),
+    ("P7", "goal tool mass", "A"),
+    ("P8", "goal tool mass", "B"),
+    ("P9", "goal tool mass friction", "B"),
+    ("P10", "all", "A"),
+    ("P11", "all", "B"),
+)
+"""Name, what varies, and the space."""
+
+REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
+"""Reaching has one more."""
+
+WORDS = {"mass": "mass", "size": "size", "tool": "start", "goal": "goal", "friction": "friction"}
+
+
+def protocols_of(task: str) -> tuple[Protocol, ...]:
+    """Give the protocols of a task.
+
+    P10 and P11 draw everything that the predecessor draws, the joints excepted; a fair coin
+    decides in each episode whether sizes or positions are drawn, as published.
+
+    Args:
+        task: Name of a registered task.
+
+    Raises:
+        UnknownOption: There is no such task, or it has no protocols of its own.
+
+    Example:
+        >>> [(p.name, p.space) for p in protocols_of("pushing")[1:3]]
+        [('P1', 'A'), ('P2', 'B')]
+    """
+    if task not in ROLES:
+        own = f"protocols of one's own for {task!r}" if task in TASKS else "a registered task"
+        raise UnknownOption("task with protocols", task, (*ROLES, own))
+    rows = (*ROWS, REACHING) if task == "reaching" else ROWS
+    return tuple(_protocol(ROLES[task], *row) for row in rows)
+
+
+def _protocol(roles: Roles, name: str, what: str, space: SpaceName) -> Protocol:
+    words = what.split()
+    if not words:
+        return Protocol(name, doc="the default task")
+    if words == ["all"]:
+        act = Resample("@published", space=space, exclusive=True)
+        return Protocol(name, space=space, act=act, doc=f"everything from {space}")
+    doc = f"{', '.join(WORDS[word] for word in words)} from {space}"
+    named = [FRICTION if w == "friction" else getattr(roles, w) for w in words]
+    if None not in named:
+        return Protocol(name, named, space, doc=doc)
+    shape = Goal(space=space, besides=roles.kept)
+    others = [pattern for pattern in named if pattern is not None]
+    act_: Part = together(shape, Resample(others, space=space)) if others else shape
+    return Protocol(name, space=space, act=act_, doc=doc)

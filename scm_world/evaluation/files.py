@@ -1,0 +1,204 @@
+"""Evaluations in files: JSON for people and programs, Parquet or CSV for the episodes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation.arena import METRICS
+from scm_world.evaluation.results import KEYS, TEXTS, WHOLE, Columns, Evaluation, merged_rows
+from scm_world.graph.exchange.libraries import load as load_library
+from scm_world.output.durable import write_durably, write_whole
+
+FORMAT = "scm_world/evaluation/1"
+RESULTS = "results.json"
+TABLE = "episodes"
+ADVICE = "give the folder, or the results.json, that an evaluation wrote"
+
+
+def save(evaluation: Evaluation, folder: Path, form: str) -> tuple[Path, Path]:
+    """Write the table, then the summary that names it; see ``Evaluation.save``."""
+    if form not in CODECS:
+        raise UnknownOption("format", form, CODECS)
+    folder.mkdir(parents=True, exist_ok=True)
+    table, summary = folder / f"{TABLE}.{form}", folder / RESULTS
+    write_durably(table, CODECS[form][0](evaluation.columns))
+    data = {
+        "format": FORMAT,
+        "table": {"file": table.name, "rows": len(evaluation), "digest": evaluation.digest},
+        "scores": summarized(evaluation),
+        "about": dict(evaluation.about),
+    }
+    write_whole(json.dumps(data, indent=1, allow_nan=False) + "\n", summary)
+    return summary, table
+
+
+def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """List the scores with their intervals: one row for each agent, engine and protocol."""
+    return [
+        {
+            "agent": agent,
+            "engine": engine,
+            "protocol": protocol,
+            **{
+                metric: mine.score(protocol, metric, agent=agent, engine=engine).as_dict()
+                for metric in METRICS
+            },
+        }
+        for agent in evaluation.agents
+        for engine in evaluation.only(agent=agent).engines
+        for mine in [evaluation.only(agent=agent, engine=engine)]
+        for protocol in mine.protocols
+    ]
+
+
+def load(path: Path) -> Evaluation:
+    """Read an evaluation; see ``Evaluation.load``."""
+    file = path / RESULTS if path.is_dir() else path
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+        if data["format"] != FORMAT:
+            raise ValueError("it is no evaluation")
+        table = file.parent / Path(data["table"]["file"]).name
+        decode = CODECS[table.suffix.removeprefix(".")][1]
+        found = Evaluation(data["about"], decode(table.read_bytes()))
+        if found.digest != data["table"]["digest"]:
+            raise ValueError(f"{table.name} is not the table that was written with it")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UnreadableFile(str(file), _said(error), ADVICE) from None
+    return found
+
+
+def _said(error: Exception) -> str:
+    return f"it has no {error}" if isinstance(error, KeyError) else str(error)
+
+
+def merge(evaluations: Iterable[Evaluation]) -> Evaluation:
+    """Put evaluations of one environment together, such as those of several machines.
+
+    Rows that several of them have must be the same, bit for bit.
+
+    Raises:
+        ModelError: They are of other tasks, options or protocols, of other versions of one engine,
+            of two policies with one name, or differ in a row that both have.
+    """
+    listed = list(evaluations)
+    if not listed:
+        raise ModelError(["there is no evaluation to merge"])
+    problems = [why for other in listed[1:] for why in _differences(listed[0], other)]
+    problems += _clashes(listed)
+    columns = merged_rows(listed)
+    identity = list(zip(*(columns[key].tolist() for key in KEYS), strict=True))
+    first: dict[Any, int] = {}
+    for place, who in enumerate(identity):
+        before = first.setdefault(who, place)
+        if columns["hash"][before] != columns["hash"][place]:
+            row = ", ".join(f"{k} {v}" for k, v in zip(KEYS, who, strict=True))
+            problems.append(f"{row} did not happen alike in two of them")
+    if problems:
+        raise ModelError(problems)
+    kept = np.array(sorted(first.values()), dtype=np.int64)
+    return Evaluation(_about(listed), {name: column[kept] for name, column in columns.items()})
+
+
+def _differences(one: Evaluation, other: Evaluation) -> list[str]:
+    """Say what of two evaluations cannot stand in one table."""
+    found = [
+        f"{what} is {one.about[what]!r} in one and {other.about[what]!r} in another"
+        for what in ("task", "arguments", "env")
+        if one.about[what] != other.about[what]
+    ]
+    for engine in one.about["versions"].keys() & other.about["versions"].keys():
+        mine, its = one.about["versions"][engine], other.about["versions"][engine]
+        found += [
+            f"{package} is {mine.get(package)} in one and {its.get(package)} in another"
+            for package in sorted(mine.keys() | its.keys())
+            if mine.get(package) != its.get(package)
+        ]
+    return found
+
+
+def _clashes(listed: Sequence[Evaluation]) -> list[str]:
+    """Name protocols and agents that mean two things."""
+    known: dict[tuple[str, Any], Any] = {}
+    found = []
+    for evaluation in listed:
+        named = [(("protocol", p["name"]), p) for p in evaluation.about["protocols"]]
+        named += [((f"agent {a['agent']}", a["run"]), a) for a in evaluation.about["agents"]]
+        for key, content in named:
+            if known.setdefault(key, content) != content:
+                found.append(f"{key[0]} {key[1]} is not the same in two of them")
+    return found
+
+
+def _about(listed: Sequence[Evaluation]) -> dict[str, Any]:
+    """Put what evaluations are about together."""
+    found: dict[str, Any] = dict(listed[0].about)
+    for what in ("engines", "agents", "protocols", "seeds"):
+        every = [one for evaluation in listed for one in evaluation.about[what]]
+        found[what] = [one for place, one in enumerate(every) if one not in every[:place]]
+    found["n"] = max(evaluation.about["n"] for evaluation in listed)
+    found["versions"] = {k: v for one in listed for k, v in one.about["versions"].items()}
+    return found
+
+
+# --- tables -----------------------------------------------------------------------------------
+
+
+def _to_parquet(columns: Columns) -> bytes:
+    arrow = load_library("pyarrow", "pyarrow", "data")
+    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
+    made = arrow.table({n: arrow.array(c, from_pandas=False) for n, c in columns.items()})
+    sink = arrow.BufferOutputStream()
+    parquet.write_table(made, sink, compression="zstd", use_dictionary=list(TEXTS))
+    return bytes(sink.getvalue())
+
+
+def _from_parquet(data: bytes) -> Columns:
+    arrow = load_library("pyarrow", "pyarrow", "data")
+    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
+    try:
+        table = parquet.read_table(arrow.BufferReader(data))
+    except (arrow.ArrowException, OSError) as error:
+        raise ValueError(f"the table is no whole Parquet file ({error})") from None
+    return _typed({name: table[name].to_pylist() for name in table.column_names})
+
+
+def _to_csv(columns: Columns) -> bytes:
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(map(_word, c.tolist()) for c in columns.values()), strict=True))
+    return stream.getvalue().encode()
+
+
+def _word(value: Any) -> str:
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def _from_csv(data: bytes) -> Columns:
+    head, *rows = list(csv.reader(io.StringIO(data.decode(), newline="")))
+    return _typed(dict(zip(head, zip(*rows, strict=True), strict=True)))
+
+
+def _typed(columns: Mapping[str, Sequence[Any]]) -> Columns:
+    """Give columns the types that they had."""
+    missing = [name for name in (*KEYS, "steps", *METRICS, "hash") if name not in columns]
+    if missing:
+        raise ValueError(f"the table has no column {missing[0]!r}")
+    kinds: dict[str, Any] = {**dict.fromkeys(TEXTS, str), **dict.fromkeys(WHOLE, np.int64)}
+    return {n: np.array(list(c), dtype=kinds.get(n, np.float64)) for n, c in columns.items()}
+
+
+CODECS: Mapping[str, tuple[Callable[[Columns], bytes], Callable[[bytes], Columns]]] = {
+    "parquet": (_to_parquet, _from_parquet),
+    "csv": (_to_csv, _from_csv),
+}
+"""How tables are written and read, by the ending of the file."""

@@ -1,0 +1,70 @@
+"""Finished shards of an evaluation: small files that are whole or absent."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+from scm_world.errors import UnreadableFile
+from scm_world.evaluation.arena import Row
+from scm_world.output.durable import write_whole
+
+FORMAT = "scm_world/evaluation-part/1"
+FOLDER = "parts"
+
+
+def part_path(folder: Path, key: str) -> Path:
+    """Name the file of a shard.
+
+    Args:
+        folder: Of the evaluation.
+        key: Of the shard.
+    """
+    return folder / FOLDER / f"{key}.json"
+
+
+def write_part(folder: Path, key: str, rows: Sequence[Row]) -> None:
+    """Write the episodes of a shard.
+
+    Raises:
+        UnwritableFolder: There is no room, or no permission.
+    """
+    path = part_path(folder, key)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plain = [asdict(row) for row in rows]
+    text = json.dumps({"format": FORMAT, "key": key, "sum": _sum(plain), "rows": plain})
+    write_whole(text + "\n", path)
+
+
+def read_part(folder: Path, key: str, count: int) -> list[Row] | None:
+    """Read the episodes of a shard; None if it has not been played.
+
+    Args:
+        folder: Of the evaluation.
+        key: Of the shard.
+        count: How many episodes it has.
+
+    Raises:
+        UnreadableFile: The file is damaged, or not of this shard.
+    """
+    path = part_path(folder, key)
+    if not path.exists():
+        return None
+    advice = "delete this file; its episodes are then played again"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        found = (data["format"], data["key"], data["sum"], len(data["rows"]))
+        if found != (FORMAT, key, _sum(data["rows"]), count):
+            raise ValueError("its content is not what was written")
+        return [Row(**row) for row in data["rows"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
+
+
+def _sum(rows: Any) -> str:
+    text = json.dumps(rows, sort_keys=True)
+    return blake2b(text.encode(), digest_size=12).hexdigest()

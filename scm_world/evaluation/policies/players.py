@@ -1,0 +1,253 @@
+"""Players: policies of every kind behind two methods, ``begin`` and ``act``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, final, runtime_checkable
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.env import ScmWorldEnv
+from scm_world.env.delta import MODES, PREFIX
+from scm_world.errors import ActionError, UnknownOption
+from scm_world.queries.policies import Policy
+
+Actions = NDArray[Any]
+About = dict[str, Any]
+"""What a policy is, as plain data: its kind, its name, and where it comes from."""
+
+SHAPE = (9,)
+_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+
+
+@runtime_checkable
+class Player(Protocol):
+    """Someone who acts in an environment, episode after episode."""
+
+    @property
+    def about(self) -> About:
+        """What the policy is; ``player_from`` makes it again where that is possible."""
+
+    def begin(self, env: ScmWorldEnv) -> None:
+        """Take note of a new episode; called after every reset.
+
+        Args:
+            env: Whose episode has begun.
+        """
+
+    def act(self, observation: Any) -> Actions:
+        """Choose an action of the environment, shape (9,).
+
+        Args:
+            observation: What the environment shows: an array, or arrays by name.
+
+        Raises:
+            ActionError: The policy gave something else.
+        """
+
+
+def checked(action: Any, env: gymnasium.Env[Any, Any] | None, name: str) -> Actions:
+    """Check that a policy gave nine finite numbers; numbers beyond the range are left alone.
+
+    Args:
+        action: What it gave.
+        env: Where it acts, for the message.
+        name: Of the policy.
+
+    Returns:
+        The same array; anything but floats becomes 64-bit floats.
+
+    Raises:
+        ActionError: It is no such array.
+
+    Example:
+        >>> checked([0] * 9, None, "lazy")
+        array([0., 0., 0., 0., 0., 0., 0., 0., 0.])
+        >>> checked([0.0, 1.0], None, "short")
+        Traceback (most recent call last):
+        scm_world.errors.ActionError: the policy 'short' gave [0.0, 1.0]; an action is an array of
+        shape (9,) with finite numbers
+    """
+    if type(action) is np.ndarray and action.dtype in _FLOATS and action.shape == SHAPE:
+        found: Actions = action
+        if math.isfinite(sum(action.tolist())):  # faster than numpy for nine numbers
+            return found
+    else:
+        found = _as_floats(action)
+    if found.shape == SHAPE and np.isfinite(found).all():
+        return found
+    where = "" if env is None else f" of {env.action_space}"
+    raise ActionError(
+        f"the policy {name!r} gave {action!r}; an action is an array of shape {SHAPE} with finite "
+        f"numbers{where}",
+        action,
+    )
+
+
+def _as_floats(action: Any) -> Actions:
+    try:
+        found = np.asarray(action)
+        if found.dtype.kind == "f":
+            return found
+        return found.astype(np.float64, casting="safe" if found.dtype.kind in "bui" else "no")
+    except (TypeError, ValueError):
+        return np.empty(0)
+
+
+@final
+@dataclass(frozen=True)
+class WorldPolicy:
+    """Marks a policy that looks at the world instead of the observation.
+
+    It is called with the world of the environment and gives an action in the units of the action
+    mode (rad, N m or m), shape (9,). It serves as a decorator.
+
+    Attributes:
+        policy: The function; a class is made anew for every episode.
+
+    Example:
+        >>> @WorldPolicy
+        ... def lazy(world):
+        ...     return 0.5 * (world.action_low + world.action_high)
+    """
+
+    policy: Callable[..., Any]
+
+    def __call__(self, world: Any) -> Any:
+        """Choose the action."""
+        return self.policy(world)
+
+
+class Playing:
+    """What all players here share: who they are, and where they act."""
+
+    def __init__(self, about: Mapping[str, Any]) -> None:
+        self._about, self._name = dict(about), str(about["name"])
+        self._env: ScmWorldEnv | None = None
+
+    @property
+    def about(self) -> About:
+        """What the policy is, as plain data."""
+        return dict(self._about)
+
+    def _checked(self, action: Any) -> Actions:
+        return checked(action, self._env, self._name)
+
+
+def inner(env: gymnasium.Env[Any, Any]) -> ScmWorldEnv:
+    """Give the environment of this package that a wrapper is about.
+
+    Raises:
+        UnknownOption: There is none.
+    """
+    found = env.unwrapped
+    if not isinstance(found, ScmWorldEnv):
+        raise UnknownOption("environment", type(found).__name__, ("an environment of scm_world",))
+    return found
+
+
+@final
+class ByObservation(Playing):
+    """Calls a function of the observation; its method ``reset`` begins an episode, if it has one.
+
+    Args:
+        policy: Gives an action.
+        about: What it is.
+    """
+
+    def __init__(self, policy: Callable[[Any], Any], about: Mapping[str, Any]) -> None:
+        super().__init__(about)
+        self._policy = policy
+
+    def begin(self, env: ScmWorldEnv) -> None:
+        """Let the policy forget the last episode."""
+        self._env = env
+        forget(self._policy)
+
+    def act(self, observation: Any) -> Actions:
+        """Choose an action, shape (9,)."""
+        return self._checked(self._policy(observation))
+
+
+def forget(policy: Any) -> None:
+    """Call the method ``reset`` of a policy, if it has one."""
+    reset = getattr(policy, "reset", None)
+    if callable(reset):
+        reset()
+
+
+@final
+class ByPrediction(Playing):
+    """Asks a model of Stable-Baselines3, or whatever has its method ``predict``.
+
+    What a recurrent model remembers is carried from step to step, and forgotten at a reset.
+
+    Args:
+        model: It is asked for its deterministic action.
+        about: What it is.
+    """
+
+    def __init__(self, model: Any, about: Mapping[str, Any]) -> None:
+        super().__init__(about)
+        self._model, self._state, self._first = model, None, True
+
+    def begin(self, env: ScmWorldEnv) -> None:
+        """Forget the last episode."""
+        self._env, self._state, self._first = env, None, True
+
+    def act(self, observation: Any) -> Actions:
+        """Choose an action, shape (9,)."""
+        action, self._state = self._model.predict(
+            observation,
+            state=self._state,
+            episode_start=np.array([self._first]),
+            deterministic=True,
+        )
+        self._first = False
+        return self._checked(action)
+
+
+@final
+class ByWorld(Playing):
+    """Asks a policy that looks at the world.
+
+    Args:
+        make: Gives the policy of one episode.
+        about: What it is.
+    """
+
+    def __init__(self, make: Callable[[], Policy], about: Mapping[str, Any]) -> None:
+        super().__init__(about)
+        self._make = make
+
+    def begin(self, env: ScmWorldEnv) -> None:
+        """Make the policy of a new episode.
+
+        Raises:
+            UnknownOption: The actions are relative, which those of the policy are not.
+        """
+        refuse_relative(env)
+        self._env, self._policy = env, self._make()
+        forget(self._policy)
+
+    def act(self, observation: Any) -> Actions:
+        """Choose an action, shape (9,), dtype float64; it is not rounded."""
+        if self._env is None:
+            raise ActionError(f"the policy {self._name!r} acts in no episode; call begin()", None)
+        command = self._checked(self._policy(self._env.world))
+        return self._env.as_action(command)
+
+
+def refuse_relative(env: ScmWorldEnv) -> None:
+    """Refuse an environment with relative actions, for commands that are absolute.
+
+    Raises:
+        UnknownOption: It has them.
+    """
+    if env.action_mode.startswith(PREFIX):
+        allowed = [mode for mode in MODES if not mode.startswith(PREFIX)]
+        raise UnknownOption("action_mode for absolute commands", env.action_mode, allowed)

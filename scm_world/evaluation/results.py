@@ -1,0 +1,369 @@
+"""What an evaluation gives: a table with a row for each episode, and what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.errors import UnknownOption
+from scm_world.evaluation.arena import METRICS, Row
+from scm_world.evaluation.statistics import (
+    Causes,
+    Interval,
+    aggregate,
+    difference_interval,
+    find_causes,
+    mean_interval,
+)
+
+TEXTS = ("agent", "engine", "protocol", "hash")
+WHOLE = ("run", "seed", "episode", "steps")
+KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
+"""The columns that say which episode a row is of."""
+
+SCORE = "last_fractional_success"
+"""The metric of the published figures."""
+
+DRAWN = "drawn "
+"""First word of the columns with the values that were drawn."""
+
+Columns = dict[str, NDArray[Any]]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """All episodes of an evaluation.
+
+    Attributes:
+        about: What was evaluated, as plain data: task, options, agents, protocols, seeds, versions.
+        columns: The table, each column of shape ``(n,)``: ``KEYS``, ``steps``, ``METRICS``,
+            ``hash``, and the values that were drawn (NaN where a variable was not).
+    """
+
+    about: Mapping[str, Any]
+    columns: Columns
+
+    @classmethod
+    def of(cls, about: Mapping[str, Any], rows: Sequence[Row]) -> Evaluation:
+        """Make the table of some rows."""
+        columns: Columns = {}
+        for name in (*KEYS, "steps"):
+            kind: Any = str if name in TEXTS else np.int64
+            columns[name] = np.array([getattr(row, name) for row in rows], dtype=kind)
+        for metric in METRICS:
+            columns[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
+        columns["hash"] = np.array([row.hash for row in rows], dtype=str)
+        return cls(about, {**columns, **_drawn(rows)})
+
+    def __len__(self) -> int:
+        return len(self.columns["episode"])
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether both have the same rows, bit for bit."""
+        return isinstance(other, Evaluation) and self.digest == other.digest
+
+    __hash__ = None  # type: ignore[assignment] # compared by content
+
+    @cached_property
+    def digest(self) -> str:
+        """A word that sums up the table, bit for bit, in whatever order its columns are."""
+        found = blake2b(digest_size=16)
+        for name in sorted(self.columns):
+            column = self.columns[name]
+            found.update(f"\0{name}\0".encode())
+            text = "\0".join(column) if column.dtype.kind == "U" else ""
+            found.update(text.encode() if text else np.ascontiguousarray(column).tobytes())
+        return found.hexdigest()
+
+    # --- what there is ------------------------------------------------------------------------
+
+    def _listed(self, name: str) -> tuple[Any, ...]:
+        return tuple(dict.fromkeys(self.columns[name].tolist()))
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return str(self.about["task"])
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Who acted."""
+        return self._listed("agent")
+
+    @property
+    def engines(self) -> tuple[str, ...]:
+        """On which engines."""
+        return self._listed("engine")
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """In which protocols."""
+        return self._listed("protocol")
+
+    def runs(self, agent: str) -> tuple[int, ...]:
+        """List the training runs of an agent."""
+        return self.only(agent=agent)._listed("run")
+
+    def only(self, **wanted: Any) -> Evaluation:
+        """Give the rows of one agent, run, engine, protocol, seed or episode.
+
+        Raises:
+            UnknownOption: There are none.
+        """
+        kept = np.ones(len(self), dtype=bool)
+        for name, value in wanted.items():
+            if name not in KEYS:
+                raise UnknownOption("column", name, KEYS)
+            if value is not None:
+                if value not in self._listed(name):
+                    raise UnknownOption(name, value, tuple(map(str, self._listed(name))))
+                kept &= self.columns[name] == value
+        columns = {name: column[kept] for name, column in self.columns.items()}
+        return Evaluation(self.about, columns)
+
+    def the(self, name: str, given: str | None) -> str:
+        """Choose an agent or an engine; where there is only one it need not be named.
+
+        Raises:
+            UnknownOption: There are several, or none of this name.
+        """
+        known = self._listed(name)
+        if given is None and len(known) == 1:
+            return str(known[0])
+        if given not in known:
+            raise UnknownOption(name, given, known)
+        return str(given)
+
+    # --- what it says -------------------------------------------------------------------------
+
+    def scores(
+        self, metric: str = SCORE, *, agent: str | None = None, engine: str | None = None
+    ) -> Floats:
+        """Give the scores of an agent on an engine.
+
+        Returns:
+            Shape ``(runs, protocols, episodes)``; episodes in the order of seed and number.
+
+        Raises:
+            UnknownOption: There is no such metric, agent or engine, or protocols do not have the
+                same episodes.
+        """
+        _known(metric)
+        agent, engine = self.the("agent", agent), self.the("engine", engine)
+        mine = self.only(agent=agent, engine=engine)
+        parts = [
+            [mine.only(run=run, protocol=protocol)._by_unit(metric) for protocol in self.protocols]
+            for run in mine._listed("run")
+        ]
+        lengths = {len(scores) for row in parts for scores in row}
+        if len(lengths) != 1:
+            raise UnknownOption("episodes", lengths, ("the same number in every protocol",))
+        return np.array(parts)
+
+    def _by_unit(self, metric: str) -> Floats:
+        order = np.lexsort([self.columns["episode"], self.columns["seed"]])
+        found: Floats = self.columns[metric][order]
+        return found
+
+    def score(
+        self,
+        protocol: str,
+        metric: str = SCORE,
+        *,
+        agent: str | None = None,
+        engine: str | None = None,
+    ) -> Interval:
+        """Estimate the mean score in a protocol, with its 95 % interval over episodes.
+
+        Several training runs are strata: the interval says how sure we are of these runs.
+
+        Raises:
+            UnknownOption: There is no such protocol, metric, agent or engine.
+        """
+        _known(metric)
+        agent, engine = self.the("agent", agent), self.the("engine", engine)
+        mine = self.only(agent=agent, engine=engine, protocol=protocol)
+        proportion = None if metric != "return" else False
+        values, runs = mine.columns[metric], mine.columns["run"]
+        return mean_interval(values, runs, proportion=proportion)
+
+    def difference(
+        self,
+        one: str,
+        other: str,
+        protocol: str,
+        metric: str = SCORE,
+        *,
+        engine: str | None = None,
+    ) -> Interval:
+        """Estimate by how much an agent is better than another one, episode by episode.
+
+        Both met the same draws, so this interval is mostly much smaller than those of the two
+        scores. Of several runs of an agent the mean counts.
+
+        Raises:
+            UnknownOption: They did not play the same episodes.
+        """
+        engine = self.the("engine", engine)
+        here = self.only(engine=engine, protocol=protocol)
+        return _paired(here.only(agent=one), here.only(agent=other), _known(metric))
+
+    def gap(
+        self,
+        one: str,
+        other: str,
+        protocol: str,
+        metric: str = SCORE,
+        *,
+        agent: str | None = None,
+    ) -> Interval:
+        """Estimate by how much an agent does better on an engine than on another one.
+
+        Raises:
+            UnknownOption: It did not play the same episodes on both.
+        """
+        here = self.only(agent=self.the("agent", agent), protocol=protocol)
+        return _paired(here.only(engine=one), here.only(engine=other), _known(metric))
+
+    def overall(
+        self, metric: str = SCORE, *, agent: str | None = None, engine: str | None = None
+    ) -> dict[str, Interval]:
+        """Estimate mean, median, interquartile mean and optimality gap over all protocols.
+
+        Over training runs if there are several, else over episodes; see ``aggregate``.
+        """
+        scores = self.scores(metric, agent=agent, engine=engine)
+        return aggregate(scores, over="runs" if len(scores) > 1 else "episodes")
+
+    def drawn(self) -> dict[str, Floats]:
+        """Give the values that were drawn in all rows, by variable, shape ``(n, numbers)``."""
+        found: dict[str, list[Floats]] = {}
+        for name, column in self.columns.items():
+            if name.startswith(DRAWN):
+                found.setdefault(name.removeprefix(DRAWN).partition("[")[0], []).append(column)
+        return {name: np.stack(parts, axis=1) for name, parts in found.items()}
+
+    def causes(
+        self,
+        protocol: str,
+        metric: str = SCORE,
+        *,
+        agent: str | None = None,
+        engine: str | None = None,
+    ) -> Causes:
+        """Estimate what each variable that a protocol varies does to the score.
+
+        The values were drawn at random, each on its own, so what goes with them is their effect.
+        Of several runs of an agent the mean counts.
+        """
+        agent, engine = self.the("agent", agent), self.the("engine", engine)
+        mine = self.only(agent=agent, engine=engine, protocol=protocol)
+        first = mine.only(run=mine._listed("run")[0])
+        units = first._units()
+        scores = np.array([_means(mine, _known(metric))[unit] for unit in units])
+        varied = {n: v for n, v in first.drawn().items() if not np.isnan(v).all()}
+        return find_causes(varied, scores)
+
+    def _units(self) -> list[tuple[int, int]]:
+        return list(
+            zip(self.columns["seed"].tolist(), self.columns["episode"].tolist(), strict=True)
+        )
+
+    def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
+        """Give means and standard deviations under the predecessor's names, by protocol."""
+        agent, engine = self.the("agent", agent), self.the("engine", engine)
+        found: dict[str, Any] = {}
+        for protocol in self.protocols:
+            mine = self.only(agent=agent, engine=engine, protocol=protocol)
+            found[protocol] = {
+                f"{how}_{metric}": float(getattr(np, how)(mine.columns[metric]))
+                for metric in METRICS[:3]
+                for how in ("mean", "std")
+            }
+        return found
+
+    # --- files --------------------------------------------------------------------------------
+
+    def save(self, folder: Path | str, *, kind: str = "parquet") -> tuple[Path, Path]:
+        """Write ``results.json`` and the table beside it, ``"parquet"`` or ``"csv"``.
+
+        Raises:
+            MissingExtra: pyarrow is not installed.
+            UnwritableFolder: There is no room, or no permission.
+        """
+        from scm_world.evaluation.files import save
+
+        return save(self, Path(folder), kind)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Evaluation:
+        """Read what ``save`` wrote: the folder, or its ``results.json``.
+
+        Raises:
+            UnreadableFile: It is damaged, or something else.
+        """
+        from scm_world.evaluation.files import load
+
+        return load(Path(path))
+
+
+def _drawn(rows: Sequence[Row]) -> Columns:
+    """Give a column for each number of each variable that was drawn."""
+    sizes: dict[str, int] = {}
+    for row in rows:
+        for name, values in row.drawn.items():
+            sizes[name] = max(sizes.get(name, 0), len(values))
+    found: Columns = {}
+    for name, size in sizes.items():
+        table = np.full((len(rows), size), np.nan)
+        for place, row in enumerate(rows):
+            values = row.drawn.get(name, [])
+            table[place, : len(values)] = values
+        labels = [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
+        found |= {DRAWN + label: table[:, k].copy() for k, label in enumerate(labels)}
+    return found
+
+
+def _known(metric: str) -> str:
+    if metric not in METRICS:
+        raise UnknownOption("metric", metric, METRICS)
+    return metric
+
+
+def _means(table: Evaluation, metric: str) -> dict[tuple[int, int], float]:
+    """Give the mean over runs of each episode."""
+    found: dict[tuple[int, int], list[float]] = {}
+    for unit, score in zip(table._units(), table.columns[metric].tolist(), strict=True):
+        found.setdefault(unit, []).append(score)
+    return {unit: sum(scores) / len(scores) for unit, scores in found.items()}
+
+
+def _paired(one: Evaluation, other: Evaluation, metric: str) -> Interval:
+    mine, its = _means(one, metric), _means(other, metric)
+    if mine.keys() != its.keys():
+        differ = sorted(mine.keys() ^ its.keys())[0]
+        allowed = ("episodes that both have played",)
+        raise UnknownOption("seed and episode of a pair", differ, allowed)
+    units = sorted(mine)
+    return difference_interval([mine[u] for u in units], [its[u] for u in units])
+
+
+def merged_rows(tables: Iterable[Evaluation]) -> Columns:
+    """Put the rows of tables under one another."""
+    listed = list(tables)
+    names = dict.fromkeys(name for table in listed for name in table.columns)
+    return {
+        name: np.concatenate(
+            [table.columns.get(name, np.full(len(table), np.nan)) for table in listed]
+        )
+        for name in names
+    }

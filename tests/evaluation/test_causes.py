@@ -1,0 +1,278 @@
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world._types import Floats
+from scm_world.errors import UnknownOption
+from scm_world.evaluation.statistics import Cause, Causes, find_causes
+from scm_world.evaluation.statistics.causes import FEWEST
+from scm_world.evaluation.statistics.shares import (
+    basis,
+    holm,
+    piece_count,
+    pieces,
+    share_of_variance,
+)
+
+N = 200
+NOISE = 0.3
+VARIANCES = {"line": 1 / 12, "weak": 0.25 / 12, "parabola": 4 / 45, "pose": 0.25 * 2 / 12}
+TOTAL = sum(VARIANCES.values()) + NOISE**2
+SHARES = {name: part / TOTAL for name, part in VARIANCES.items()} | {"nothing": 0.0, "null": 0.0}
+
+
+def episodes(seed: int, n: int = N) -> tuple[dict[str, Floats], Floats]:
+    """Draw variables of which the effects on the score are known: those of ``SHARES``."""
+    rng = np.random.default_rng(seed)
+    drawn = {
+        "line": rng.random(n),
+        "weak": rng.random(n),
+        "parabola": rng.uniform(-1.0, 1.0, n),
+        "pose": rng.random((n, 2)),
+        "nothing": rng.random(n),
+        "null": rng.random((n, 3)),
+    }
+    score = drawn["weak"] / 2 - drawn["line"] + drawn["parabola"] ** 2
+    return drawn, score + drawn["pose"].sum(axis=1) / 2 + NOISE * rng.standard_normal(n)
+
+
+def expected_contrast(name: str, lower: float, upper: float) -> float:
+    """Compute the mean effect of values from ``upper`` on minus that of values up to ``lower``."""
+    if name == "parabola":
+        return (1.0 + upper + upper**2 - (1.0 - lower + lower**2)) / 3.0
+    return {"line": -1.0, "weak": 0.5}[name] * (1.0 + upper - lower) / 2.0
+
+
+def by_name(causes: Causes) -> Mapping[str, Cause]:
+    """Find causes by the variables' names."""
+    return {cause.variable: cause for cause in causes.causes}
+
+
+def test_known_effects_are_recovered() -> None:
+    """With many episodes, shares and contrasts are those that were put in."""
+    drawn, scores = episodes(0, n=20_000)
+    found = by_name(find_causes(drawn, scores, resamples=200, permutations=100))
+    for name, share in SHARES.items():
+        assert found[name].share.value == pytest.approx(share, abs=0.02), name
+    assert found["line"].column.contrast.value == pytest.approx(-2 / 3, abs=0.03)
+    assert found["weak"].column.contrast.value == pytest.approx(1 / 3, abs=0.03)
+    assert found["parabola"].column.contrast.value == pytest.approx(0.0, abs=0.03)
+    directions = [found[name].column.direction for name in ("line", "weak", "parabola")]
+    assert directions == ["down", "up", "unclear"]
+
+
+def test_two_hundred_episodes_name_the_causes_and_no_other() -> None:
+    """Strong causes are found in twenty protocols of twenty; others hardly ever are."""
+    mistakes = 0
+    for seed in range(20):
+        found = find_causes(*episodes(seed), resamples=1)
+        assert {cause.variable for cause in found.found()} >= {"line", "parabola"}
+        assert found.ranked()[0].variable in ("line", "parabola")
+        mistakes += not {cause.variable for cause in found.found()} <= set(VARIANCES)
+    assert mistakes <= 4  # at most one is expected; more than four have probability 0.003
+
+
+def test_the_column_that_matters_is_named() -> None:
+    """Of a variable with three components, the one that breaks the agent is shown."""
+    rng = np.random.default_rng(0)
+    position = rng.random((N, 3))
+    position[:, 2] = 0.0325
+    found = find_causes({"tool_block.position": position}, (position[:, 1] < 0.5).astype(float))
+    (cause,) = found.causes
+    assert cause.column.name == "tool_block.position[1]"
+    assert [column.name for column in cause.columns] == [
+        "tool_block.position[0]",
+        "tool_block.position[1]",
+    ]
+    assert found.left_out == {"tool_block.position[2]": "it was 0.0325 in every episode"}
+    assert "tool_block.position[2]: left out, it was 0.0325 in every episode" in str(found)
+
+
+def test_an_effect_on_failures_at_both_ends_is_found() -> None:
+    """A variable that breaks the agent when small and when large has no contrast but a share."""
+    size = np.random.default_rng(0).permutation(np.linspace(0.0, 1.0, N))
+    (cause,) = find_causes({"size": size}, (np.abs(size - 0.5) < 0.3).astype(float)).causes
+    assert cause.share.low > 0.5
+    assert not cause.column.contrast.excludes(0.0)
+
+
+def test_an_agent_that_always_succeeds_was_not_broken() -> None:
+    """A constant score has no causes: share 0, p = 1, and no warning."""
+    drawn, _ = episodes(2)
+    for score in (0.0, 1.0, 0.3):
+        for cause in find_causes(drawn, np.full(N, score)).causes:
+            assert (cause.share.value, cause.share.high, cause.p, cause.p_holm) == (0, 0, 1, 1)
+            assert cause.column.contrast.value == pytest.approx(0.0, abs=1e-12)
+            assert not cause.column.contrast.excludes(0.0)
+
+
+def test_episodes_that_did_not_vary_a_variable_are_left_out_for_it_alone() -> None:
+    """NaN rows change nothing for the others, and are no evidence for their own."""
+    drawn, scores = episodes(3)
+    coin = np.random.default_rng(9).random(N) < 0.5
+    alone = by_name(find_causes({"line": drawn["line"][coin]}, scores[coin]))["line"]
+    drawn["line"][~coin] = np.nan
+    found = by_name(find_causes(drawn, scores))
+    assert found["line"].n == coin.sum()
+    assert found["line"].share == alone.share
+    assert found["line"].column == alone.column
+    assert found["weak"].n == N
+
+
+def test_columns_that_were_varied_in_other_episodes_are_compared_apart() -> None:
+    """Two columns never varied together have no joint effect, and that is said."""
+    values = np.full((N, 2), np.nan)
+    values[: N // 2, 0] = values[N // 2 :, 1] = np.arange(N // 2)
+    found = find_causes({"pose": values}, np.arange(N) % 7)
+    assert found.causes == ()
+    assert found.left_out == {"pose": "only 0 episodes varied all its 2 columns"}
+
+
+def test_few_episodes_say_nothing() -> None:
+    """A column with less than the fewest episodes is left out, and the reason is given."""
+    few = np.linspace(0.0, 1.0, FEWEST - 1)
+    found = find_causes({"mass": few}, few)
+    assert found.causes == ()
+    assert found.left_out == {"mass": f"only {FEWEST - 1} episodes varied it; {FEWEST} are needed"}
+    enough = np.linspace(0.0, 1.0, FEWEST)
+    assert find_causes({"mass": enough}, enough).causes[0].share.value == pytest.approx(1.0)
+
+
+def test_categories_are_their_own_bins() -> None:
+    """A category of which only the middle one fails explains all of the score."""
+    color = np.random.default_rng(0).integers(3, size=N)
+    (cause,) = find_causes({"color": color}, (color != 1).astype(float)).causes
+    assert cause.share.value == pytest.approx(1.0)
+    rare = (np.arange(N) % 10 == 0).astype(int)
+    (cause,) = find_causes({"rare": rare}, rare.astype(float)).causes
+    assert cause.column.contrast.value == 1.0
+    assert (cause.column.lower, cause.column.upper) == (0.0, 1.0)
+    (cause,) = find_causes({"often": 1 - rare}, rare.astype(float)).causes
+    assert cause.column.contrast.value == -1.0
+
+
+def test_one_variable_does_not_change_another() -> None:
+    """Except for the correction, a variable's effect is the same alone and among others."""
+    drawn, scores = episodes(4)
+    among, alone = (
+        by_name(find_causes(given, scores))["pose"] for given in (drawn, {"pose": drawn["pose"]})
+    )
+    assert among.share == alone.share
+    assert among.columns == alone.columns
+    assert (among.p, alone.p_holm) == (alone.p, alone.p)
+    assert among.p_holm >= alone.p_holm
+
+
+def test_the_same_seed_finds_the_same() -> None:
+    """Bootstrap and permutations come from the seed."""
+    drawn, scores = episodes(5)
+    assert find_causes(drawn, scores) == find_causes(drawn, scores)
+    assert find_causes(drawn, scores, seed=1) != find_causes(drawn, scores)
+
+
+def test_the_correction_of_holm() -> None:
+    """Holm's steps, the same in any order; nothing to correct is nothing."""
+    assert holm([0.02, 0.01, 0.5]) == pytest.approx([0.04, 0.03, 0.5])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+@pytest.mark.parametrize("n", [12, 15, 60, 200, 1000])
+@pytest.mark.parametrize("columns", [1, 3])
+def test_pieces_span_a_proper_basis(n: int, columns: int) -> None:
+    """Uncorrelated columns without mean, a line among them, for smooth and for tied values."""
+    rng = np.random.default_rng(n)
+    table = rng.random((columns, n))
+    table[-1, : n * 9 // 10] = table[-1].max() + 1.0  # nine of ten at the upper end
+    regressors = basis(pieces(column, piece_count(n, columns)) for column in table)
+    r = regressors.shape[1]
+    assert columns <= r < n - 1
+    np.testing.assert_allclose(regressors.T @ regressors / n, np.eye(r), atol=1e-9)
+    np.testing.assert_allclose(regressors.mean(axis=0), 0.0, atol=1e-9)
+    line = table[0] - table[0].mean()
+    np.testing.assert_allclose(regressors @ (regressors.T @ line) / n, line, atol=1e-9)
+
+
+def test_shares_are_right_on_average_and_their_intervals_as_wide_as_they_vary() -> None:
+    """Over 300 small data sets, chance is taken off and the width is 2 x 1.96 deviations."""
+    found = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        cause = rng.random((2, 60))
+        scores = cause.sum(axis=0) + np.sqrt(1 / 6) * rng.standard_normal(60)
+        regressors = basis(pieces(column, piece_count(60, 2)) for column in cause)
+        found.append(share_of_variance(regressors, scores, np.arange(60)[None], 0.95))
+    values, low, high = np.array([(share.value, share.low, share.high) for share in found]).T
+    assert values.mean() == pytest.approx(0.5, abs=4 * values.std() / np.sqrt(300))
+    assert np.mean(high - low) == pytest.approx(3.92 * values.std(), rel=0.12)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"drawn": {"mass": np.zeros(3)}},
+        {"drawn": {"mass": np.array(["a"] * N)}},
+        {"drawn": {"mass": np.full(N, np.inf)}},
+        {"drawn": {"mass": np.zeros((N, 2, 2))}},
+        {"scores": np.full(N, np.nan)},
+        {"scores": []},
+        {"level": 1.0},
+        {"permutations": 0},
+        {"resamples": 0.5},
+    ],
+)
+def test_bad_input_is_refused(given: dict[str, Any]) -> None:
+    """Values of another shape, no numbers, and impossible options are errors that say so."""
+    values = np.random.default_rng(0).random(N)
+    with pytest.raises(UnknownOption, match=r"cannot be .*; it can be"):
+        find_causes(**({"drawn": {"mass": values}, "scores": values} | given))
+
+
+def test_null_variables_are_rarely_called_causes() -> None:
+    """Over 200 data sets, p-values of variables without effect are uniform."""
+    p = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        wins = (rng.random(60) < 0.7).astype(float)
+        drawn = {"one": rng.random(60), "three": rng.random((60, 3))}
+        found = find_causes(drawn, wins, permutations=99, resamples=1, seed=seed)
+        p += [cause.p for cause in found.causes]
+    # Four standard errors of 400 draws from a uniform distribution.
+    for level in (0.05, 0.2, 0.5):
+        error = 4.0 * np.sqrt(level * (1.0 - level) / len(p))
+        assert np.mean(np.array(p) <= level) == pytest.approx(level, abs=error)
+
+
+@pytest.mark.slow
+def test_intervals_of_effects_cover_what_they_should() -> None:
+    """Over 400 protocols, intervals contain the truth in 90 to 99 % of the cases."""
+    shares = dict.fromkeys(VARIANCES, 0)
+    contrasts = {"line": 0, "weak": 0, "parabola": 0}
+    for seed in range(400):
+        found = by_name(find_causes(*episodes(seed), permutations=1, resamples=500, seed=seed))
+        for name in shares:
+            share = found[name].share
+            shares[name] += share.low <= SHARES[name] <= share.high
+        for name in contrasts:
+            column = found[name].column
+            truth = expected_contrast(name, column.lower, column.upper)
+            contrasts[name] += column.contrast.low <= truth <= column.contrast.high
+    assert all(360 <= n <= 396 for n in shares.values()), shares
+    assert all(360 <= n <= 396 for n in contrasts.values()), contrasts
+
+
+@pytest.mark.slow
+def test_a_family_of_null_variables_is_rarely_called_a_cause() -> None:
+    """After Holm's correction, five of a hundred protocols name any of ten null variables."""
+    named = 0
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        drawn = {f"v{k}": rng.random((N, 1 + k % 3)) for k in range(10)}
+        scores = rng.beta(4, 1, N)
+        found = find_causes(drawn, scores, permutations=999, resamples=1, seed=seed)
+        named += bool(found.found())
+    assert 5 <= named <= 38  # 20 expected; four standard errors

@@ -1,0 +1,284 @@
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.errors import UnknownOption
+from scm_world.evaluation.statistics import (
+    METRICS,
+    Interval,
+    aggregate,
+    difference_interval,
+    mean_interval,
+    pairing_gain,
+    performance_profile,
+    probability_of_improvement,
+    unpaired_interval,
+)
+
+# Reference numbers: rliable 1.2.0 with arch 7.2.0, pandas 2.3.3, numpy 2.4.6 and scipy 1.17.1, on
+# x = default_rng(7).random((5, 4)).round(2), then y = (the same generator's random((6, 4)) *
+# 1.2).round(1). Its intervals are percentiles of 20,000 (aggregates), 5,000 (profiles) and 4,000
+# (improvement) resamples after np.random.seed(0).
+_RNG = np.random.default_rng(7)
+X = _RNG.random((5, 4)).round(2)
+Y = (_RNG.random((6, 4)) * 1.2).round(1)
+TAU = np.linspace(0.0, 1.0, 6)
+RLIABLE = {
+    "x": (X, [0.577, 0.585, 0.589, 0.423]),
+    "y": (Y, [0.4875, 0.4666666666666667, 0.45, 0.5208333333333333]),
+    "a part of x": (
+        X[:3, :3],
+        [0.5622222222222222, 0.5766666666666667, 0.596, 0.4377777777777778],
+    ),
+}
+RLIABLE_LOW = [0.36666666666666664, 0.3, 0.3166666666666667, 0.4]
+RLIABLE_HIGH = [0.6166666666666667, 0.6583333333333334, 0.6333333333333333, 0.6375]
+
+
+def test_the_reference_matrices_are_those_that_rliable_saw() -> None:
+    """The generator still draws the numbers from which the references were made."""
+    assert X[0].tolist() == [0.63, 0.9, 0.78, 0.23]
+    assert Y[-1].tolist() == [0.3, 1.1, 0.6, 1.0]
+
+
+@pytest.mark.parametrize("name", RLIABLE)
+def test_aggregates_are_those_of_rliable(name: str) -> None:
+    """Mean, median, interquartile mean and optimality gap equal the library's."""
+    scores, expected = RLIABLE[name]
+    found = aggregate(scores, resamples=10)
+    np.testing.assert_allclose([found[metric].value for metric in METRICS], expected, rtol=1e-12)
+
+
+def test_intervals_of_aggregates_are_those_of_rliable() -> None:
+    """The stratified bootstrap over runs gives the library's percentiles, but for chance."""
+    found = aggregate(Y, resamples=20_000)
+    np.testing.assert_allclose([found[m].low for m in METRICS], RLIABLE_LOW, atol=0.012)
+    np.testing.assert_allclose([found[m].high for m in METRICS], RLIABLE_HIGH, atol=0.012)
+
+
+def test_profiles_and_their_bands_are_those_of_rliable() -> None:
+    """The share of scores above each threshold, and its band, equal the library's."""
+    profile = performance_profile(Y, TAU, resamples=5000)
+    shares = [0.875, 2 / 3, 0.5, 0.2916666666666667, 1 / 6, 1 / 12]
+    low = [0.75, 0.5, 0.3333333333333333, 0.125, 0.041666666666666664, 0.0]
+    high = [0.9583333333333334, 0.8333333333333334, 2 / 3, 0.4583333333333333, 0.291666667, 5 / 24]
+    np.testing.assert_allclose(profile.share, shares, rtol=1e-12)
+    np.testing.assert_allclose(profile.low, low, atol=1.01 / 24)  # one score of 24
+    np.testing.assert_allclose(profile.high, high, atol=1.01 / 24)
+    np.testing.assert_allclose(
+        performance_profile(X, TAU, resamples=1).share, [1.0, 0.95, 0.7, 0.5, 0.25, 0.0]
+    )
+
+
+def test_probability_of_improvement_is_that_of_rliable() -> None:
+    """Pairs won, ties half, averaged over protocols, for unequal numbers of runs."""
+    found = probability_of_improvement(X.round(1), Y, resamples=4000)
+    assert found.value == pytest.approx(0.5541666666666666, rel=1e-12)
+    assert (found.low, found.high) == pytest.approx((0.39166667, 0.70833333), abs=0.015)
+    assert probability_of_improvement(X, Y).value == pytest.approx(0.5625, rel=1e-12)
+    assert probability_of_improvement(Y, X.round(1)).value == pytest.approx(0.44583333, rel=1e-6)
+
+
+def test_over_episodes_an_episode_stands_where_a_run_stood() -> None:
+    """One run of many episodes has the values that as many runs would have."""
+    one_run = Y.T[None]  # (1, protocols, episodes)
+    by_run, by_episode = aggregate(Y), aggregate(one_run, over="episodes")
+    assert by_episode == by_run
+    wins = probability_of_improvement(X.T[None], Y.T[None], over="episodes")
+    assert wins == probability_of_improvement(X, Y)
+    profile = performance_profile(one_run, TAU, over="episodes")
+    np.testing.assert_array_equal(profile.low, performance_profile(Y, TAU).low)
+
+
+def test_episodes_are_resampled_within_their_run() -> None:
+    """Runs that differ, each always the same, leave nothing to chance over episodes."""
+    scores = np.repeat([[[0.1]], [[0.9]]], 20, axis=2)  # (2 runs, 1 protocol, 20 episodes)
+    episodes, runs = aggregate(scores, over="episodes")["mean"], aggregate(scores)["mean"]
+    assert (episodes.value, runs.value) == pytest.approx((0.5, 0.5))
+    assert episodes.width == pytest.approx(0.0, abs=1e-12)
+    assert runs.width == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("of", [aggregate, performance_profile])
+def test_one_run_cannot_be_resampled_over_runs(of: Callable[..., Any]) -> None:
+    """With one run the error says to resample episodes."""
+    with pytest.raises(UnknownOption, match="'episodes' with two episodes or more"):
+        of(np.zeros((1, 12, 200)))
+    with pytest.raises(UnknownOption, match=r"\(runs, protocols, episodes\)"):
+        of(np.zeros((5, 12)), over="episodes")
+    with pytest.raises(UnknownOption, match="runs, episodes"):
+        of(np.zeros((5, 12)), over="seeds")
+
+
+def test_policies_must_meet_the_same_protocols() -> None:
+    """Probability of improvement refuses scores of other protocols."""
+    with pytest.raises(UnknownOption, match="the 4 protocols of x"):
+        probability_of_improvement(X, Y[:, :3])
+
+
+def test_a_mean_has_the_interval_of_its_standard_error() -> None:
+    """For many smooth values the bootstrap agrees with mean +- 1.96 standard errors."""
+    values = np.random.default_rng(0).random(400)
+    found = mean_interval(values, resamples=10_000)
+    error = 1.96 * values.std() / math.sqrt(values.size)
+    assert found.value == values.mean()
+    assert (found.low, found.high) == pytest.approx(
+        (found.value - error, found.value + error), abs=0.05 * error
+    )
+
+
+def test_strata_take_out_the_differences_between_them() -> None:
+    """Values that differ between protocols but not within them have a certain mean."""
+    values, strata = np.repeat([0.2, 0.8], 50), np.repeat(["P0", "P1"], 50)
+    assert mean_interval(values, strata).width == pytest.approx(0.0, abs=1e-12)
+    assert mean_interval(values).width > 0.1
+
+
+def test_success_rates_have_wilson_intervals() -> None:
+    """Proportions have the textbook interval, and a width even where all succeed."""
+    some = mean_interval([1.0] * 81 + [0.0] * 182)  # Newcombe 1998, table I: 0.2553, 0.3662
+    assert (some.low, some.high) == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    every, none = mean_interval([1.0] * 200), mean_interval([0.0] * 200)
+    assert (every.low, every.high) == pytest.approx((200 / 203.8415, 1.0), abs=1e-6)
+    assert (none.low, none.high) == pytest.approx((0.0, 3.8415 / 203.8415), abs=1e-6)
+
+
+def test_a_return_that_is_always_zero_is_not_a_rate() -> None:
+    """On request zeros are no failures, and values between are no proportion."""
+    assert mean_interval([0.0] * 200, proportion=False).width == 0.0
+    with pytest.raises(UnknownOption, match="0 or 1"):
+        mean_interval([0.5, 1.0], proportion=True)
+
+
+def test_success_rates_of_unlike_protocols_are_more_certain() -> None:
+    """Strata narrow the Wilson interval if rates differ, and hardly change it if they do not."""
+    strata = np.repeat([0, 1], 100)
+    unlike, alike = np.repeat([0.0, 1.0], 100), np.tile([0.0, 1.0], 100)
+    assert mean_interval(unlike, strata).width < 0.3 * mean_interval(unlike).width
+    assert mean_interval(alike, strata).width == pytest.approx(mean_interval(alike).width)
+
+
+def test_one_value_says_nothing_about_its_interval() -> None:
+    """A single score has unknown ends; a single success still has a Wilson interval."""
+    one = mean_interval([0.4])
+    assert (one.value, str(one)) == (0.4, "0.40 [unknown]")
+    assert not one.excludes(5.0)
+    assert json.loads(json.dumps(one.as_dict(), allow_nan=False))["low"] is None
+    assert mean_interval([1.0]).low == pytest.approx(1.0 / 4.8415, abs=1e-4)
+
+
+def test_paired_differences_are_much_more_certain() -> None:
+    """Two policies that met the same draws differ by little, and that is seen."""
+    rng = np.random.default_rng(0)
+    luck = rng.random(200)
+    a, b = luck + 0.05 + 0.01 * rng.standard_normal(200), luck
+    paired, unpaired = difference_interval(a, b), unpaired_interval(a, b)
+    assert paired.value == pytest.approx(unpaired.value)
+    assert paired.excludes(0.0)
+    assert not unpaired.excludes(0.0)
+    gain = pairing_gain(a, b)
+    assert gain > 1000
+    assert (unpaired.width / paired.width) ** 2 == pytest.approx(gain, rel=0.2)
+
+
+def test_differences_of_success_rates_have_a_width_where_all_succeed() -> None:
+    """Two policies that always succeed may still differ a little."""
+    ones = np.ones(200)
+    paired, unpaired = difference_interval(ones, ones), unpaired_interval(ones, ones)
+    assert (paired.low, paired.high) == pytest.approx((-0.0137, 0.0137), abs=1e-4)
+    assert 0.01 < unpaired.high == -unpaired.low < 0.03
+    always = difference_interval(ones, 1.0 - ones)
+    assert (always.value, always.high) == (1.0, 1.0)
+    assert 0.95 < always.low < 1.0
+
+
+def test_unpaired_proportions_have_newcombes_interval() -> None:
+    """56 of 70 against 48 of 80: Newcombe 1998, table II, method 10."""
+    found = unpaired_interval([1.0] * 56 + [0.0] * 14, [1.0] * 48 + [0.0] * 32)
+    assert (found.low, found.high) == pytest.approx((0.0524, 0.3339), abs=5e-5)
+
+
+def test_gain_of_pairing_where_nothing_varies() -> None:
+    """Constant scores gain nothing, a constant difference everything."""
+    assert pairing_gain([1.0, 1.0], [0.5, 0.5]) == 1.0
+    assert pairing_gain([1.0, 2.0, 3.0], [0.0, 1.0, 2.0]) == math.inf
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: mean_interval([]),
+        lambda: mean_interval([0.1, math.nan]),
+        lambda: mean_interval(["good", "bad"]),
+        lambda: mean_interval([0.1, 0.2], [0]),
+        lambda: mean_interval([0.1, 0.2], level=95),
+        lambda: mean_interval([0.1, 0.2], resamples=0),
+        lambda: difference_interval([0.1, 0.2], [0.1]),
+        lambda: pairing_gain([1.0], [1.0]),
+        lambda: aggregate(np.zeros((2, 0))),
+        lambda: aggregate(X, gamma=math.nan),
+        lambda: performance_profile(X, []),
+    ],
+)
+def test_bad_input_is_refused(call: Callable[[], object]) -> None:
+    """Nothing, NaN, text, wrong lengths and impossible options are errors that say so."""
+    with pytest.raises(UnknownOption, match=r"cannot be .*; it can be"):
+        call()
+
+
+def test_the_same_seed_gives_the_same_interval() -> None:
+    """Results depend on the seed and on no global generator."""
+    np.random.seed(1)  # noqa: NPY002 - to show that it does not matter
+    first = aggregate(Y, seed=3)
+    np.random.seed(2)  # noqa: NPY002
+    assert aggregate(Y, seed=3) == first
+    assert aggregate(Y, seed=4) != first
+    fractions = Y.ravel() / 2.0
+    assert mean_interval(fractions, seed=0) != mean_interval(fractions, seed=1)
+
+
+def test_intervals_print_short() -> None:
+    """Two digits where that is enough, more where the interval is narrow, no minus zero."""
+    assert str(Interval(0.9312, 0.904, 0.952, 0.95, 200)) == "0.93 [0.90, 0.95]"
+    assert str(Interval(0.9312, 0.9301, 0.9322, 0.95, 200)) == "0.931 [0.930, 0.932]"
+    assert str(Interval(0.5, 0.5, 0.5, 0.95, 9)) == "0.50 [0.50, 0.50]"
+    assert str(Interval(-0.001, -0.2, 0.2, 0.95, 9)) == "0.00 [-0.20, 0.20]"
+
+
+@pytest.mark.slow
+def test_intervals_cover_what_they_should() -> None:
+    """Over 1,000 data sets the intervals contain the truth in 90 to 99 % of the cases."""
+    hits = {"fraction": 0, "rate": 0, "paired": 0, "unpaired": 0, "strata": 0}
+    levels = np.repeat([0.05, 0.5, 0.99], 40)
+    for seed in range(1000):
+        rng = np.random.default_rng(seed)
+        skewed, other = rng.beta(4, 1, 100), rng.beta(4, 1, 100)
+        wins = (rng.random(100) < 0.95).astype(float)
+        rates = (rng.random(120) < levels).astype(float)
+        found = {
+            "fraction": (mean_interval(skewed, seed=seed), 0.8),
+            "rate": (mean_interval(wins), 0.95),
+            "paired": (difference_interval(wins, wins * (rng.random(100) < 0.9)), 0.095),
+            "unpaired": (unpaired_interval(skewed, other, seed=seed), 0.0),
+            "strata": (mean_interval(rates, levels), float(levels.mean())),
+        }
+        for name, (interval, truth) in found.items():
+            hits[name] += interval.low <= truth <= interval.high
+    assert {name: n for name, n in hits.items() if not 900 <= n <= 990} == {}
+
+
+def test_no_statistic_warns_on_constant_scores() -> None:
+    """Scores that are all the same are ordinary data."""
+    ones = np.ones((3, 2, 4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert aggregate(ones)["interquartile_mean"].value == 1.0
+        assert probability_of_improvement(ones, ones).value == 0.5
+        assert performance_profile(ones).share[-1] == 0.0
