@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from scm_world.cli.evaluate import evaluate, explain
 from scm_world.cli.options import (
     Acts,
     Arguments,
@@ -157,6 +158,10 @@ def discover(
         tuple(option or ()),
     )
     raise typer.Exit(exam.run(sitting, out=out))
+
+
+app.command()(evaluate)
+app.command()(explain)
 
 
 @app.command()

@@ -1,1 +1,43 @@
-"""Measuring policies: where an agent generalises, and how sure that is."""
+"""Where does an agent generalise, and how sure are we: protocols, scores, explanations.
+
+An evaluation is one call::
+
+    found = evaluate({"mine": policy, "random": "random"}, task="pushing", n=200)
+    print(found.score("P6", agent="mine"))
+    print(found.causes("P6", agent="mine"))
+    found.save("results")
+"""
+
+from scm_world.evaluation.again import Check, check
+from scm_world.evaluation.arena import METRICS
+from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.explanation import Explanation, Otherwise, why
+from scm_world.evaluation.files import merge
+from scm_world.evaluation.pipeline import evaluate
+from scm_world.evaluation.policies import Player, WorldPolicy, as_player
+from scm_world.evaluation.protocols import Protocol
+from scm_world.evaluation.recording import Recorder, Recording, record
+from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.statistics import Causes, Interval
+
+__all__ = [
+    "METRICS",
+    "Causes",
+    "Check",
+    "Evaluation",
+    "Explanation",
+    "Interval",
+    "Otherwise",
+    "Player",
+    "Protocol",
+    "Recorder",
+    "Recording",
+    "WorldPolicy",
+    "as_player",
+    "check",
+    "evaluate",
+    "merge",
+    "protocols_of",
+    "record",
+    "why",
+]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +24,9 @@ from scm_world.world.start import whole_number
 
 SHARD = 25
 """Episodes that are played and written down at once."""
+
+_MINE = ("task", "backend", "render_mode")
+"""Options of the environment that an evaluation sets by itself."""
 
 _TRIES = 25  # observations on which a policy without a file is tried out
 
@@ -199,9 +203,10 @@ def prepare(
         ScmWorldError: What is wrong, by name.
     """
     options = dict(env or {})
-    for mine in ("task", "backend", "render_mode"):
-        if mine in options:
-            raise UnknownOption("option of the environment", mine, (f"{mine}, given beside env",))
+    allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]
+    for name in options:
+        if name not in allowed:
+            raise UnknownOption("option of the environment", name, allowed)
     place = Place(task, options)
     engines = _several("backend", backend)
     for engine in engines:

@@ -129,7 +129,8 @@ def check_region(variable: Variable, region: SpaceName | Space) -> None:
         return  # known only when it is set
     n = region.n_uniforms(variable.shape)
     for corner in (0.0, np.nextafter(1.0, 0.0)):
-        check_bounds(variable, region.transform(np.full(n, corner), variable.shape, {}), {})
+        drawn = region.transform(np.full((1, n), corner), variable.shape, {})
+        check_bounds(variable, drawn[0], {})
 
 
 def check_space(

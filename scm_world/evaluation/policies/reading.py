@@ -22,11 +22,11 @@ from scm_world.evaluation.policies.players import (
     Player,
     WorldPolicy,
 )
+from scm_world.evaluation.policies.sb2 import load_sb2
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.policies import NAMED, Policy, Random, Sweep, still
 from scm_world.queries.policies import Sequence as Given
-from scm_world.training import load_sb2
 from scm_world.variables import Function
 
 PACKAGE = "scm_world"

@@ -19,7 +19,7 @@ from os import PathLike, fspath
 import numpy as np
 
 from scm_world.errors import UnreadableFile
-from scm_world.training.policy import Layer, MlpPolicy, Weights
+from scm_world.evaluation.policies.mlp import Layer, MlpPolicy, Weights
 
 MEMBER = "parameters"
 LARGEST = 2**28  # [bytes] of the weights: more is no policy, and might be a trap

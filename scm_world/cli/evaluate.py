@@ -1,0 +1,113 @@
+"""The commands ``evaluate`` and ``explain``: their options. What they do is loaded when called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scm_world.cli.options import Arguments, Out
+
+ENV = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--env",
+        metavar="NAME=VALUE",
+        help="Option of the environment, such as frame_skip=3; give it once for each.",
+    ),
+]
+METRIC = "last_fractional_success"
+
+
+def evaluate(
+    policy: Annotated[
+        str | None,
+        typer.Argument(
+            help="A file (.onnx, .zip, .npz, .parquet), random, still, sweep, grasp, or "
+            "module:function; several with commas; NAME=POLICY names one, and A+B are its runs."
+        ),
+    ] = None,
+    task: Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.")] = "pushing",
+    protocols: Annotated[
+        str | None,
+        typer.Option(help="Names with commas, such as P0,P5; P2@100 is within episodes; all else."),
+    ] = None,
+    n: Annotated[int, typer.Option("-n", "--n", min=1, help="Episodes of each protocol.")] = 200,
+    seeds: Annotated[str, typer.Option(help="Of the noise, with commas between them.")] = "0",
+    backend: Annotated[
+        str, typer.Option(help="mujoco, bullet, or both with a comma between them.")
+    ] = "mujoco",
+    env: ENV = None,
+    option: Arguments = None,
+    metric: Annotated[
+        str, typer.Option(help="Score that is shown and drawn; all are written.")
+    ] = METRIC,
+    workers: Annotated[
+        int, typer.Option(min=0, help="Processes; 0 for as many as there are cores.")
+    ] = 0,
+    format_: Annotated[str, typer.Option("--format", help="parquet or csv.")] = "parquet",
+    videos: Annotated[
+        bool, typer.Option("--videos", help="Film the best, median and worst episodes.")
+    ] = False,
+    out: Out = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(help="Play a random part of these results again, and compare every bit."),
+    ] = None,
+    part: Annotated[int, typer.Option(min=1, help="Episodes that --check plays.")] = 12,
+) -> None:
+    """Find out how well policies do in protocols, with intervals.
+
+    Writes results.json, a table of all episodes, plots and an HTML report. Ctrl-C keeps what is
+    finished (exit code 130); the same command goes on. With --check FILE nothing is evaluated: a
+    part of FILE is played again; exit code 1 if anything is different.
+    """
+    from scm_world.cli import evaluation
+
+    if check is not None:
+        raise typer.Exit(evaluation.check_again(check, part, policy))
+    if policy is None:
+        raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
+    options = evaluation.Options(
+        policy,
+        task,
+        protocols,
+        n,
+        seeds,
+        backend,
+        tuple(env or ()),
+        tuple(option or ()),
+        metric,
+        workers,
+        format_,
+        videos,
+    )
+    raise typer.Exit(evaluation.run(options, out=out))
+
+
+def explain(
+    results: Annotated[Path, typer.Argument(help="Folder or results.json of an evaluation.")],
+    protocol: Annotated[
+        str | None, typer.Option(help="Name of a protocol; all that vary something by default.")
+    ] = None,
+    episode: Annotated[
+        int | None,
+        typer.Option(min=0, help="What this one would have been, had one variable been another."),
+    ] = None,
+    agent: Annotated[str | None, typer.Option(help="Who acted, if there are several.")] = None,
+    backend: Annotated[str | None, typer.Option(help="Engine, if there are several.")] = None,
+    metric: Annotated[str, typer.Option(help="Score that is explained.")] = METRIC,
+    versus: Annotated[
+        str | None, typer.Option(help="A: from the training space; default: left as it is.")
+    ] = None,
+) -> None:
+    """Say which variables decided the scores, or what an episode would have been without them."""
+    from scm_world.cli import evaluation
+
+    where = evaluation.Where(results, agent, backend, metric)
+    if episode is None:
+        raise typer.Exit(evaluation.show_causes(where, protocol))
+    if protocol is None:
+        raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
+    raise typer.Exit(evaluation.show_otherwise(where, protocol, episode, versus))

@@ -1,0 +1,182 @@
+"""Evaluations that are run again: in part, to see that they give the same bits."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world.errors import SnapshotMismatch, UnknownOption
+from scm_world.evaluation.arena import METRICS, Arena
+from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.policies import Player, as_player, player_from
+from scm_world.evaluation.protocols import Protocol
+from scm_world.evaluation.results import KEYS, Evaluation
+from scm_world.evaluation.setups import Place, Seat, Setup, Shard
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.progress import Progress
+from scm_world.tasks import TASKS
+from scm_world.world.start import whole_number
+
+
+@final
+@dataclass(frozen=True)
+class Check:
+    """Some episodes that were played again.
+
+    Attributes:
+        episodes: How many.
+        seed: With which they were chosen.
+        wrong: Where something else happened, in words.
+    """
+
+    episodes: int
+    seed: int
+    wrong: tuple[str, ...]
+
+    def __bool__(self) -> bool:
+        """Whether everything happened again."""
+        return not self.wrong
+
+
+def bench_of(evaluation: Evaluation, *, policy: Any = None, trusted: Sequence[str] = ()) -> Bench:
+    """Prepare to play episodes of an evaluation again.
+
+    Args:
+        evaluation: That was run.
+        policy: Who acted, as it was given to ``evaluate``; made again from what the evaluation
+            says if None.
+        trusted: Packages whose functions may be policies, or parts of protocols.
+
+    Raises:
+        SnapshotMismatch: It was made with other versions.
+        UnknownOption: A policy cannot be made again, or the task is not registered.
+        UnreadableFile: The file of a policy is another one by now.
+    """
+    about = evaluation.about
+    if about["task"] not in TASKS:
+        raise UnknownOption("task", about["task"], TASKS)
+    options = dict(about["env"])
+    if about["arguments"]:
+        options["task_options"] = about["arguments"]
+    place = Place(about["task"], options)
+    _same_versions(place, about["versions"])
+    given = _given(policy, about["agents"])
+    seats = [
+        Seat(one["agent"], one["run"], _player(one, given, trusted), one["policy"])
+        for one in about["agents"]
+    ]
+    protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
+    setup = Setup(
+        place,
+        tuple(seats),
+        tuple(about["engines"]),
+        tuple(protocols),
+        tuple(about["seeds"]),
+        about["n"],
+        about["versions"],
+    )
+    return Bench(setup, trusted)
+
+
+def _same_versions(place: Place, made: Mapping[str, Mapping[str, str]]) -> None:
+    for engine, then in made.items():
+        arena = Arena(place.env(engine))
+        now = versions(arena.env.world.engine)
+        arena.close()
+        differ = [
+            f"{package} {then.get(package, 'none')} (here {now.get(package, 'none')})"
+            for package in sorted(then.keys() | now.keys())
+            if then.get(package) != now.get(package)
+        ]
+        if differ:
+            raise SnapshotMismatch(
+                f"it was made with {', '.join(differ)}; the same bits are promised for the same "
+                "versions only: install those"
+            )
+
+
+def _given(policy: Any, agents: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], Any]:
+    """Sort the policies that a user gives again by agent and run."""
+    if policy is None:
+        return {}
+    names = list(dict.fromkeys(one["agent"] for one in agents))
+    if not isinstance(policy, Mapping):
+        if len(names) > 1:
+            raise UnknownOption("policy", policy, (f"one by the name of each of {names}",))
+        policy = {names[0]: policy}
+    found: dict[tuple[str, int], Any] = {}
+    for name, runs in policy.items():
+        listed = runs if isinstance(runs, list) else [runs]
+        found |= {(name, run): one for run, one in enumerate(listed)}
+    return found
+
+
+def _player(
+    one: Mapping[str, Any], given: Mapping[tuple[str, int], Any], trusted: Sequence[str]
+) -> Player:
+    mine = given.get((one["agent"], one["run"]))
+    if mine is not None:
+        return as_player(mine)
+    return player_from(one["policy"], trusted=trusted)
+
+
+def check(
+    evaluation: Evaluation,
+    *,
+    episodes: int = 12,
+    seed: int | None = None,
+    policy: Any = None,
+    trusted: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Check:
+    """Play a random part of an evaluation again, and compare it bit for bit.
+
+    Args:
+        evaluation: That was run, here or elsewhere.
+        episodes: How many.
+        seed: Which ones; by chance if None.
+        policy: Who acted, if it is no file and has no name: as it was given to ``evaluate``.
+        trusted: Packages whose functions may be policies, or parts of protocols.
+        progress: Told how many are done.
+
+    Raises:
+        SnapshotMismatch: It was made with other versions.
+        UnknownOption: A policy cannot be made again.
+    """
+    count = min(whole_number("episodes", episodes, least=1), len(evaluation))
+    drawn = secrets.randbits(32) if seed is None else whole_number("seed", seed, least=0)
+    places = np.random.default_rng(drawn).choice(len(evaluation), count, replace=False)
+    bench = bench_of(evaluation, policy=policy, trusted=trusted)
+    wrong = []
+    try:
+        for done, place in enumerate(sorted(places.tolist())):
+            wrong += _compared(bench, evaluation, place)
+            if progress is not None:
+                progress(done + 1, count)
+    finally:
+        bench.close()
+    return Check(count, drawn, tuple(wrong))
+
+
+def _compared(bench: Bench, evaluation: Evaluation, place: int) -> list[str]:
+    """Play one row again; say what is different."""
+    row = {name: column[place].item() for name, column in evaluation.columns.items()}
+    setup = bench.setup
+    seats = [(seat.agent, seat.run) for seat in setup.seats]
+    names = [protocol.name for protocol in setup.protocols]
+    seat, protocol = seats.index((row["agent"], row["run"])), names.index(row["protocol"])
+    episode = row["episode"]
+    shard = Shard(seat, row["engine"], protocol, row["seed"], episode, episode + 1)
+    again = bench.play(shard, episode)
+    where = ", ".join(f"{key} {row[key]}" for key in KEYS)
+    if again.hash != row["hash"]:
+        return [f"{where}: other states or actions"]
+    return [
+        f"{where}: {metric} is {again.scores[metric]!r}, not {row[metric]!r}"
+        for metric in METRICS
+        if again.scores[metric] != row[metric]
+    ]

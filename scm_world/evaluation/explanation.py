@@ -1,0 +1,228 @@
+"""Why an episode went as it did: what it would have been, had one variable been another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+import numpy as np
+
+from scm_world.curricula.parts import Acts, AnyPart, Part
+from scm_world.curricula.situations import Situation
+from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
+from scm_world.evaluation.again import bench_of
+from scm_world.evaluation.arena import Arena, Row
+from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.protocols import Protocol
+from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.setups import Shard
+from scm_world.queries.progress import Progress
+from scm_world.variables import Draw
+
+VERSUS = ("A", "default")
+
+
+@final
+class Instead(Part):
+    """Do what a part does, but one thing differently.
+
+    Attributes:
+        of: The part.
+        name: Of the variable.
+        versus: ``"A"``: it is drawn from the training space, with the same noise; ``"default"``:
+            it is left as it is.
+    """
+
+    kind: Literal["instead"] = "instead"
+    of: AnyPart
+    name: str
+    versus: Literal["A", "default"]
+
+    def parts(self) -> tuple[Part, ...]:
+        """Give the part."""
+        return (self.of,)
+
+    def acts(self, situation: Situation) -> Acts:
+        """Replace what is done to the variable, or leave it out."""
+        acts = self.of.acts(situation)
+        if self.name not in acts:
+            return acts
+        act = acts[self.name]
+        rest = {name: act for name, act in acts.items() if name != self.name}
+        if self.versus == "default":
+            return rest
+        stream = act.stream if isinstance(act, Draw) else None
+        return {**rest, self.name: Draw("A", stream=stream)}
+
+
+@final
+@dataclass(frozen=True)
+class Otherwise:
+    """An episode as it would have been.
+
+    Attributes:
+        variable: What would have been another.
+        was: Its value in the episode.
+        would_be: Its value otherwise.
+        score: Of the episode.
+        would_score: It would have scored this.
+        would_succeed: Whether it would have succeeded in the end.
+    """
+
+    variable: str
+    was: tuple[float, ...]
+    would_be: tuple[float, ...]
+    score: float
+    would_score: float
+    would_succeed: bool
+
+    @property
+    def gain(self) -> float:
+        """By how much the score would have been higher."""
+        return self.would_score - self.score
+
+    def __str__(self) -> str:
+        success = "succeeded" if self.would_succeed else "not succeeded"
+        was, would_be = (_numbers(value) for value in (self.was, self.would_be))
+        return (
+            f"with {self.variable} = {would_be} instead of {was} it would have {success}: "
+            f"{self.would_score:.2f} instead of {self.score:.2f}"
+        )
+
+
+@final
+@dataclass(frozen=True)
+class Explanation:
+    """What an episode would have been, had one variable been another.
+
+    Attributes:
+        score: Of the episode.
+        others: For each variable that was varied, the best first.
+        left_out: Variables that cannot be another while the rest stays, with the reason.
+    """
+
+    score: float
+    others: tuple[Otherwise, ...]
+    left_out: dict[str, str]
+
+    def __str__(self) -> str:
+        lines = [*map(str, self.others)]
+        lines += [f"{name}: left out, {why}" for name, why in self.left_out.items()]
+        return "\n".join(lines)
+
+
+def _numbers(value: Sequence[float]) -> str:
+    shown = [f"{number:.4g}" for number in value]
+    return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
+
+
+def why(
+    evaluation: Evaluation,
+    protocol: str,
+    episode: int,
+    *,
+    agent: str | None = None,
+    run: int = 0,
+    engine: str | None = None,
+    seed: int | None = None,
+    metric: str = SCORE,
+    versus: str | None = None,
+    policy: Any = None,
+    trusted: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Explanation:
+    """Ask for each variable that a protocol varied what the episode would have been without it.
+
+    The episode happens again with the same noise and the same policy, which acts anew on what it
+    then sees; all other variables keep the values that were drawn.
+
+    Args:
+        evaluation: Its table has the episode.
+        protocol: Name of the protocol.
+        episode: Number of the episode.
+        agent: Who acted; need not be said if there is one.
+        run: Number of the training run.
+        engine: On which engine; need not be said if there is one.
+        seed: Of the noise; the first one if None.
+        metric: What is compared.
+        versus: ``"A"``: the variable drawn from its training space; ``"default"``: left as it is
+            without the protocol. If None, A where the protocol draws from elsewhere.
+        policy: Who acted, if it is no file and has no name: as it was given to ``evaluate``.
+        trusted: Packages whose functions may be policies, or parts of protocols.
+        progress: Told how many variables are done.
+
+    Raises:
+        UnknownOption: There is no such episode, or nothing was varied in it.
+        SnapshotMismatch: The episode does not happen again bit for bit.
+    """
+    agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
+    seeds = evaluation.only(agent=agent, engine=engine, protocol=protocol)._listed("seed")
+    seed = seeds[0] if seed is None else seed
+    where = {"agent": agent, "run": run, "engine": engine, "protocol": protocol, "seed": seed}
+    one = evaluation.only(**where, episode=episode)
+    if versus not in (None, *VERSUS):
+        raise UnknownOption("versus", versus, VERSUS)
+    bench = bench_of(evaluation, policy=policy, trusted=trusted)
+    try:
+        setup = bench.setup
+        seat = next(i for i, s in enumerate(setup.seats) if (s.agent, s.run) == (agent, run))
+        number = next(i for i, p in enumerate(setup.protocols) if p.name == protocol)
+        shard = Shard(seat, engine, number, seed, episode, episode + 1)
+        row = bench.play(shard, episode)
+        if row.hash != one.columns["hash"][0]:
+            raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
+        return _others(bench, shard, row, metric, versus, progress)
+    finally:
+        bench.close()
+
+
+def _others(
+    bench: Bench,
+    shard: Shard,
+    row: Row,
+    metric: str,
+    versus: str | None,
+    progress: Progress | None,
+) -> Explanation:
+    protocol = bench.setup.protocols[shard.protocol]
+    if not row.drawn:
+        allowed = ("an episode in which a protocol varies something",)
+        raise UnknownOption("episode", f"{row.protocol}, {row.episode}", allowed)
+    arena = bench.arena(shard.engine)
+    where: Any = {"seed": shard.seed, "episode": row.episode, "who": (row.agent, row.run)}
+    found, left_out = [], {}
+    for done, name in enumerate(row.drawn):
+        usual = _natural(arena, shard, row)
+        how: Any = versus or _versus(arena, usual, name, row)
+        part = Instead(of=protocol.part, name=name, versus=how)
+        other = Protocol(f"{protocol.name} without {name}", act=part)
+        try:
+            then = arena.play(bench.player(shard.seat), other, **where)
+        except EvaluationError as error:
+            left_out[name] = error.reason
+        else:
+            value = then.drawn.get(name, np.ravel(usual[name]).astype(float).tolist())
+            scores = row.scores[metric], then.scores[metric], bool(then.scores["success"])
+            found.append(Otherwise(name, tuple(row.drawn[name]), tuple(value), *scores))
+        if progress is not None:
+            progress(done + 1, len(row.drawn))
+    best_first = tuple(sorted(found, key=lambda one: -one.gain))
+    return Explanation(row.scores[metric], best_first, left_out)
+
+
+def _natural(arena: Arena, shard: Shard, row: Row) -> dict[str, Any]:
+    """Give the values of an episode in which nobody intervenes."""
+    arena.env.reset(seed=shard.seed, options={"episode": row.episode})
+    return arena.env.world.values()
+
+
+def _versus(arena: Arena, usual: Mapping[str, Any], name: str, row: Row) -> str:
+    """Say what a variable is held against: A, unless it lies there already."""
+    model = arena.env.world.model
+    if name not in model:
+        return "default"
+    variable = model.declared(name)
+    drawn = {n: model.declared(n).array(v) for n, v in row.drawn.items() if n in model}
+    inside = variable.in_space(drawn[name], "A", {**usual, **drawn})
+    return "default" if variable.a is None or inside else "A"
