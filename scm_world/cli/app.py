@@ -122,7 +122,7 @@ def discover(
     ] = None,
     policy: Annotated[
         str,
-        typer.Option(help="random, sweep, across, still; sweep or, by step, random if usual."),
+        typer.Option(help="random, sweep, across, grasp, still; sweep or, by step, random if usual."),
     ] = "usual",
     steps: Steps = 25,
     sensor_noise: Annotated[

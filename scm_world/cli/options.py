@@ -51,5 +51,5 @@ Acts = Annotated[
 ]
 Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
 Policy = Annotated[
-    str, typer.Option(help="random, sweep: the fingertips go to the middle, or still.")
+    str, typer.Option(help="random, grasp, still, or sweep: the fingertips go to the middle.")
 ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
+from scm_world.queries.grasping import Grasp
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import forward, inverse
 from scm_world.world import World
@@ -135,6 +136,7 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
     "random": Random,
     "sweep": cache(Sweep),
     "across": cache(partial(Sweep, across=True)),
+    "grasp": Grasp,
 }
 """Policies that have a name."""
 
@@ -144,7 +146,8 @@ def as_policy(given: Any) -> Policy:
 
     Args:
         given: A policy, actions, ``"random"``, ``"sweep"`` (to the middle), ``"across"``
-            (one finger), or None: where the robot begins it stays.
+            (one finger), ``"grasp"`` (blocks, to their goals), or None: where the robot begins
+            it stays.
 
     Raises:
         ActionError: It is none of these.

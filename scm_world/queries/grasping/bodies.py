@@ -1,0 +1,128 @@
+"""Boxes on a table, as a hand that comes from above sees them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.geometry.penetration import box_box_kernel
+from scm_world.geometry.rotations import rotation_kernel
+
+QUARTER = math.pi / 2.0
+SKY = 10.0  # [m] above and below everything
+ALIKE = 0.003  # [m] by which edges may differ of which one may stand for the other
+
+
+def turn_about_z(yaw: float) -> Floats:
+    """Give the axes of something turned about the vertical as columns, shape (3, 3)."""
+    sine, cosine = math.sin(yaw), math.cos(yaw)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def smallest(angle: float, period: float = 2.0 * math.pi) -> float:
+    """Bring an angle nearest to zero by whole periods [rad]."""
+    return angle - period * round(angle / period)
+
+
+@final
+@dataclass(frozen=True)
+class Body:
+    """A box that stands on one of its faces.
+
+    Attributes:
+        name: Of block, obstacle or goal.
+        half: Half its edges: along its own x and y, and upwards, shape (3,) [m].
+        place: Its center, shape (3,) [m].
+        yaw: Of its own x from that of the world [rad].
+        lean: x and y of the unit vector that points upwards in it, shape (2,).
+    """
+
+    name: str
+    half: Floats
+    place: Floats
+    yaw: float
+    lean: Floats = field(default_factory=lambda: np.zeros(2))
+
+    @property
+    def top(self) -> float:
+        """Height of its upper face [m]."""
+        return float(self.place[2] + self.half[2])
+
+    @property
+    def bottom(self) -> float:
+        """Height of its lower face [m]."""
+        return float(self.place[2] - self.half[2])
+
+    def at(self, place: Floats, yaw: float) -> Body:
+        """Put it elsewhere."""
+        return replace(self, place=place, yaw=yaw)
+
+    def world(self, points: Floats) -> Floats:
+        """Turn points of its own frame, shape (n, 3), into points of the world [m]."""
+        return self.place + points @ turn_about_z(self.yaw).T
+
+    def own(self, points: Floats) -> Floats:
+        """Turn points of the world, shape (n, 3), into points of its own frame [m]."""
+        return (points - self.place) @ turn_about_z(self.yaw)
+
+    def depth_in(self, other: Body, *, margin: float = 0.0, flat: bool = False) -> float:
+        """Measure how deep it lies in another one [m].
+
+        Args:
+            other: The other one.
+            margin: By which its sides are moved outwards [m].
+            flat: Whether only what is seen from above counts.
+        """
+        half, place = self.half.copy(), self.place
+        half[:2] += margin
+        if flat:
+            half[2] += SKY
+            place = np.array([*place[:2], other.place[2]])
+        first = half, place, turn_about_z(self.yaw)
+        return float(box_box_kernel(*first, other.half, other.place, turn_about_z(other.yaw)))
+
+
+def body_of(name: str, values: Mapping[str, Value]) -> Body:
+    """See a box: which of its faces is below, and how it is turned about the vertical."""
+    axes = np.empty((3, 3))
+    rotation_kernel(np.asarray(values[f"{name}.orientation"], dtype=np.float64), axes)
+    up = int(np.argmax(np.abs(axes[2])))
+    x, y = (up + 1) % 3, (up + 2) % 3
+    half = 0.5 * np.asarray(values[f"{name}.size"], dtype=np.float64)[[x, y, up]]
+    place = np.array(values[f"{name}.cartesian_position"], dtype=np.float64)
+    lean = axes[:2, up] if axes[2, up] > 0.0 else -axes[:2, up]
+    return Body(name, half, place, math.atan2(axes[1, x], axes[0, x]), lean)
+
+
+def turns(block: Body, goal: Body) -> tuple[float, ...]:
+    """List by how much a block may be turned to stand like its goal, the least first [rad].
+
+    A box looks the same after half a turn, and after a quarter if it is as wide as it is deep.
+    """
+    gap = goal.yaw - block.yaw
+    straight = abs(block.half[:2] - goal.half[:2]).max()
+    across = abs(block.half[:2] - goal.half[1::-1]).max()
+    found = [smallest(gap + QUARTER * quarter) for quarter in range(4)]
+    fitting = [
+        turn
+        for quarter, turn in enumerate(found)
+        if (across if quarter % 2 else straight) <= min(straight, across) + ALIKE
+    ]
+    return tuple(sorted(fitting, key=abs))
+
+
+def solids(bodies: Iterable[Body], grow: float = 0.0) -> tuple[Floats, Floats, Floats]:
+    """Gather half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3)."""
+    listed = list(bodies)
+    if not listed:
+        return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
+    return (
+        np.array([body.half + grow for body in listed]),
+        np.array([body.place for body in listed]),
+        np.array([turn_about_z(body.yaw) for body in listed]),
+    )

@@ -1,0 +1,213 @@
+"""A policy that grasps blocks."""
+
+import importlib.util
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.errors import ActionError, UnknownOption
+from scm_world.geometry import from_rotation_vector
+from scm_world.queries import World
+from scm_world.queries.grasping import Grasp, Pace
+from scm_world.queries.grasping.bodies import Body, body_of, smallest, turns
+from scm_world.queries.grasping.grips import grips
+from scm_world.queries.grasping.hand import Hand
+from scm_world.queries.policies import as_policy
+from scm_world.scene import trifinger
+from scm_world.tasks import Picking
+
+MODE = "end_effector_positions"
+ENGINES = [
+    name
+    for name in ("mujoco", "bullet")
+    if importlib.util.find_spec(name.replace("bullet", "pybullet"))
+]
+TASKS = ("picking", "pick_and_place", "stacking2")
+engines = pytest.mark.parametrize("engine", ENGINES)
+YAW = from_rotation_vector([0.0, 0.0, 0.5]).tolist()
+
+
+def world_of(task: Any, engine: str, mode: str = MODE) -> World:
+    """Make a world with an episode."""
+    world = World(task, backend=engine, action_mode=mode)
+    world.reset(seed=0)
+    return world
+
+
+# --- whole episodes -------------------------------------------------------------------------------
+
+
+@engines
+@pytest.mark.parametrize("task", TASKS)
+def test_it_solves_the_tasks(engine: str, task: str) -> None:
+    """The blocks fill their goals at the end of the episode."""
+    assert world_of(task, engine).rollout("grasp").final("success")
+
+
+@engines
+@pytest.mark.parametrize(
+    ("task", "do"),
+    [
+        ("picking", {"goal_block.height": 0.2, "tool_block.mass": 0.09}),
+        ("pick_and_place", {"goal_block.polar": [0.09, 1.2], "goal_block.orientation": YAW}),
+        ("stacking2", {"goal_tower.polar": [0.05, -1.0], "goal_tower.orientation": YAW}),
+    ],
+)
+def test_it_solves_other_goals(engine: str, task: str, do: dict[str, Any]) -> None:
+    """Goals elsewhere, turned ones, and heavy blocks are no obstacle."""
+    assert world_of(task, engine).rollout(Grasp(), do=do).final("success")
+
+
+@engines
+def test_joints_may_be_commanded(engine: str) -> None:
+    """The policy speaks in joints where these are the actions."""
+    world = world_of("picking", engine, "joint_positions")
+    assert world.rollout("grasp").final("success")
+
+
+def test_it_goes_where_the_goal_goes() -> None:
+    """A block that is held in the air follows its goal."""
+    world, policy = world_of("picking", "mujoco"), Grasp()
+    for _ in range(200):
+        world.step(policy(world))
+    assert world["success"]
+    world.do({"goal_block.height": 0.17})
+    for _ in range(40):
+        world.step(policy(world))
+    assert world["tool_block.cartesian_position"][2] == pytest.approx(0.17, abs=0.003)
+
+
+def test_it_tries_again() -> None:
+    """A block that is taken out of the hand is picked up anew."""
+    world, policy = world_of(Picking(), "mujoco"), Grasp()
+    for _ in range(60):
+        world.step(policy(world))
+    assert world["tool_block.cartesian_position"][2] > 0.05
+    world.do({"tool_block.cartesian_position": [0.0, -0.12, 0.0325]})
+    for _ in range(190):
+        world.step(policy(world))
+    assert world["success"]
+
+
+# --- one instance, many episodes ------------------------------------------------------------------
+
+
+@engines
+def test_it_begins_anew_with_an_episode(engine: str) -> None:
+    """One instance gives the same episode again, bit for bit, wherever it was interrupted."""
+    world, policy = world_of("picking", engine), Grasp()
+    first = world.rollout(policy, steps=60)
+    world.rollout(policy, steps=33, do={"tool_block.mass": 0.05})
+    assert world.rollout(policy, steps=60) == first
+    other = pickle.loads(pickle.dumps(policy))  # noqa: S301 # our own
+    assert world.rollout(other, steps=60) == first
+
+
+def test_it_serves_several_worlds_at_once() -> None:
+    """Worlds that take turns with one instance do not disturb one another."""
+    policy, worlds = Grasp(), [world_of(task, "mujoco") for task in TASKS[:2]]
+    together = []
+    for _ in range(30):
+        for world in worlds:
+            together.append(policy(world))
+            world.step(together[-1])
+    for task, world in enumerate(worlds):
+        alone = world.rollout(Grasp(), steps=30)
+        np.testing.assert_array_equal(together[task::2], alone.actions)
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+def test_torques_are_refused() -> None:
+    """Where actions are torques there is nothing it could say."""
+    world = world_of("picking", "fake", "joint_torques")
+    with pytest.raises(ActionError, match="positions as actions, not torques"):
+        Grasp()(world)
+
+
+def test_a_task_without_blocks_is_refused() -> None:
+    """The error names the task."""
+    with pytest.raises(ActionError, match="blocks that have goals; 'reaching' has none"):
+        Grasp()(world_of("reaching", "fake"))
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, math.inf, math.nan])
+def test_a_pace_is_positive(rate: float) -> None:
+    """Nothing moves backwards, or at no speed."""
+    with pytest.raises(UnknownOption, match="carry"):
+        Pace(carry=rate)
+
+
+def test_it_has_a_name() -> None:
+    """Each rollout that asks for it by name gets its own."""
+    one, other = as_policy("grasp"), as_policy("grasp")
+    assert isinstance(one, Grasp)
+    assert one is not other
+
+
+# --- its parts ------------------------------------------------------------------------------------
+
+
+def test_fingertips_come_where_they_are_told() -> None:
+    """With what carries them, and nothing to press, they hang within 0.3 mm."""
+    world = world_of("picking", "mujoco", "joint_positions")
+    hand = Hand(world.evaluate(()), world.control_period)
+    joints = np.array(trifinger.REST) + 0.1
+    tips = hand.tips(joints)
+    for _ in range(60):
+        world.step(hand.command(tips, np.zeros((3, 3)), world["joint_positions"]))
+    np.testing.assert_allclose(world["end_effector_positions"], tips, atol=3e-4)
+
+
+def test_strength_ends_where_a_joint_does_all_it_can() -> None:
+    """Forces of that strength need the largest torque at one joint, and more at none."""
+    hand = Hand(world_of("picking", "fake").evaluate(()), 0.04)
+    joints, forces = np.array(trifinger.REST), np.eye(3)
+    strength = hand.strength(joints, forces)
+    torques = hand.carrying(joints) + strength * hand.pressing(joints, forces)
+    assert np.abs(torques).max() == pytest.approx(0.97 * 0.36)
+
+
+def test_grips_are_balanced() -> None:
+    """Fingers press against one another, at the faces, and do not turn the block."""
+    block = Body("block", np.array([0.03, 0.035, 0.0325]), np.zeros(3), 0.0)
+    listed = list(grips(block))
+    assert {sum(grip.used) for grip in listed} == {2, 3}
+    for grip in listed:
+        np.testing.assert_allclose(grip.inward.sum(axis=0), 0.0, atol=1e-12)
+        moments = np.cross(grip.touch, grip.inward).sum(axis=0)
+        np.testing.assert_allclose(moments, 0.0, atol=1e-12)
+
+
+def test_a_cube_has_four_ways_to_stand() -> None:
+    """A longer box has two, and a turn is never longer than half of what brings it back."""
+    names = ("size", "cartesian_position", "orientation")
+
+    def box(size: list[float], yaw: float) -> Body:
+        orientation = from_rotation_vector([0.0, 0.0, yaw])
+        values = zip(names, (size, np.zeros(3), orientation), strict=True)
+        return body_of("b", {f"b.{name}": np.array(value) for name, value in values})
+
+    cube, bar = [0.06, 0.06, 0.06], [0.06, 0.08, 0.06]
+    assert len(turns(box(cube, 0.0), box(cube, 1.0))) == 4
+    assert abs(turns(box(cube, 0.0), box(cube, 1.0))[0]) == pytest.approx(math.pi / 2 - 1.0)
+    assert sorted(turns(box(bar, 0.0), box(bar, 1.0))) == pytest.approx([1.0 - math.pi, 1.0])
+    assert smallest(3.0, math.pi) == pytest.approx(3.0 - math.pi)
+
+
+def test_a_block_on_another_face_is_seen() -> None:
+    """What is seen is a box that stands, turned about the vertical."""
+    values = {
+        "b.size": np.array([0.06, 0.08, 0.1]),
+        "b.cartesian_position": np.array([0.0, 0.0, 0.04]),
+        "b.orientation": from_rotation_vector([math.pi / 2, 0.0, 0.0]),
+    }
+    body = body_of("b", values)
+    assert body.half[2] == pytest.approx(0.04)
+    assert body.bottom == pytest.approx(0.0)
+    np.testing.assert_allclose(sorted(body.half[:2]), [0.03, 0.05])
+    np.testing.assert_allclose(body.lean, 0.0, atol=1e-12)
