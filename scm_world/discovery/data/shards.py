@@ -204,7 +204,7 @@ def _from_parquet(data: bytes, names: Sequence[str]) -> Raw:
     arrow = load_library("pyarrow", "pyarrow", "data")
     parquet = load_library("pyarrow.parquet", "pyarrow", "data")
     try:
-        table = parquet.read_table(arrow.BufferReader(data))
+        table = parquet.read_table(arrow.BufferReader(data), use_threads=False)
     except (arrow.ArrowException, OSError) as error:
         raise ValueError(f"it is no whole Parquet file ({error})") from None
     if table.column_names != [*RESERVED, *names]:

@@ -1,0 +1,111 @@
+"""Everything that is drawn and written of an evaluation, in one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from scm_world.evaluation.again import bench_of
+from scm_world.evaluation.outputs import (
+    draw_bars,
+    draw_causes,
+    draw_gap,
+    draw_profile,
+    draw_radar,
+    record_videos,
+    write_report,
+)
+from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.queries.progress import Progress
+
+CORNERS = 3
+"""With fewer protocols a radar has no area."""
+
+
+def write_outputs(
+    evaluation: Evaluation,
+    folder: Path | str,
+    *,
+    metric: str = SCORE,
+    videos: bool = False,
+    policy: Any = None,
+    trusted: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> tuple[Path, ...]:
+    """Write plots, the report, and videos if they are wanted.
+
+    Args:
+        evaluation: What is shown.
+        folder: Where to; it is there.
+        metric: Score that is drawn.
+        videos: Whether the best, the median and the worst episode of each agent are filmed.
+        policy: Who acted, for videos of policies that are no files and have no names.
+        trusted: Packages whose functions may be policies, for videos.
+        progress: Told how many control steps of a video are done.
+
+    Returns:
+        The files.
+
+    Raises:
+        UnknownOption: There is no such metric.
+        UnwritableFolder: There is no room, or no permission.
+        MissingExtra: Videos are wanted, and moviepy is not installed.
+    """
+    place = Path(folder)
+    films: list[Path] = []
+    if videos:
+        films = _films(evaluation, place, metric, policy, trusted, progress)
+    files = []
+    for name, draw in _pictures(evaluation, metric).items():
+        files.append(place / f"{name}.png")
+        draw(evaluation, files[-1])
+    report = place / "report.html"
+    write_report(evaluation, report, videos=films, metric=metric)
+    return (*files, report, *films)
+
+
+def _pictures(evaluation: Evaluation, metric: str) -> dict[str, Callable[..., Any]]:
+    """List the pictures that an evaluation has enough for."""
+    found: dict[str, Callable[..., Any]] = {"bars": partial(draw_bars, metric=metric)}
+    if len(evaluation.protocols) >= CORNERS:
+        found["radar"] = partial(draw_radar, metric=metric)
+    found["profile"] = partial(draw_profile, metric=metric)
+    if len(evaluation.engines) > 1:
+        found["gap"] = partial(draw_gap, metric=metric)
+    if evaluation.drawn():
+        doers = [(agent, engine) for agent in evaluation.agents for engine in evaluation.engines]
+        for agent, engine in doers:
+            name = "causes" if len(doers) == 1 else f"causes-{agent}-{engine}"
+            draw = partial(draw_causes, agent=agent, engine=engine, metric=metric)
+            found[name.replace("/", "_")] = draw
+    return found
+
+
+def _films(
+    evaluation: Evaluation,
+    folder: Path,
+    metric: str,
+    policy: Any,
+    trusted: Sequence[str],
+    progress: Progress | None,
+) -> list[Path]:
+    bench = bench_of(evaluation, policy=policy, trusted=trusted)
+    try:
+        return [
+            film
+            for agent in evaluation.agents
+            for engine in evaluation.engines
+            for film in record_videos(
+                bench,
+                evaluation,
+                folder,
+                agent=agent,
+                engine=engine,
+                metric=metric,
+                progress=progress,
+            )
+        ]
+    finally:
+        bench.close()

@@ -1,0 +1,506 @@
+"""Pictures and pages of evaluations: what is on them, and that all of it can be read."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from html import unescape
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from output_samples import LONG, NAMES, made
+
+from scm_world.errors import UnknownOption, UnwritableFolder
+from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.outputs import (
+    draw_bars,
+    draw_causes,
+    draw_gap,
+    draw_profile,
+    draw_radar,
+    write_report,
+)
+from scm_world.evaluation.outputs.bars import bars_figure
+from scm_world.evaluation.outputs.causes import SURE, causes_figure, causes_of
+from scm_world.evaluation.outputs.gap import gap_figure, gaps_of
+from scm_world.evaluation.outputs.looks import Looks, metric_words
+from scm_world.evaluation.outputs.profiles import compare_agents, profile_figure
+from scm_world.evaluation.outputs.radar import radar_figure
+from scm_world.evaluation.outputs.sheets import text_size, wrapped
+from scm_world.evaluation.outputs.tables import Pairs, best
+from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.statistics import Interval
+
+DOCS = {protocol.name: protocol.doc for protocol in protocols_of("pushing")}
+BOTH = ("mujoco", "bullet")
+FEW = ("P0", "P5", "P7")
+BAD = "<script>alert(1)</script> & $x$"
+
+EVALUATIONS: dict[str, Callable[[], Evaluation]] = {
+    "one agent": lambda: made(1, 3),
+    "nine agents": lambda: made(9),
+    "two engines": lambda: made(4, 5, engines=BOTH, runs=2),
+    "long names": lambda: made([LONG.format(k) for k in range(3)], 5),
+    "zeros": lambda: made(2, 4, score=0.0),
+    "ones": lambda: made(2, 4, score=1.0),
+    "one episode": lambda: made(2, 3, runs=2, n=1),
+}
+
+
+def profile(evaluation: Evaluation, metric: str = "last_fractional_success") -> Figure:
+    """Draw profiles."""
+    found = {engine: compare_agents(evaluation, engine, metric) for engine in evaluation.engines}
+    return profile_figure(evaluation, found, metric)
+
+
+def causes(evaluation: Evaluation) -> Figure:
+    """Draw the causes of the first agent on the first engine."""
+    agent, engine = evaluation.agents[0], evaluation.engines[0]
+    return causes_figure(evaluation, causes_of(evaluation, agent, engine), agent, engine)
+
+
+FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
+    "bars": bars_figure,
+    "returns": lambda evaluation: bars_figure(evaluation, "return"),
+    "radar": radar_figure,
+    "profile": profile,
+    "causes": causes,
+}
+
+
+def texts(figure: Figure) -> Iterator[Text]:
+    """Give all texts that are seen."""
+    yield from figure.texts
+    for legend in figure.legends:
+        yield from legend.get_texts()
+    for ax in figure.axes:
+        yield from ax.texts
+        yield from (ax.title, ax._left_title)  # type: ignore[attr-defined]
+        for axis in (ax.xaxis, ax.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            yield axis.label
+            yield from (
+                tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high
+            )
+
+
+def words(figure: Figure) -> list[str]:
+    """Give what stands on a picture, lines joined."""
+    return [" ".join(text.get_text().split()) for text in texts(figure) if text.get_text().strip()]
+
+
+def named(figure: Figure, gid: str) -> list[Any]:
+    """Find what has a name that fits a pattern."""
+    return [one for one in figure.findobj() if re.fullmatch(gid, str(one.get_gid() or ""))]
+
+
+def assert_readable(figure: Figure) -> None:
+    """Assert that no two texts overlap, and that all are on the sheet."""
+    figure.canvas.draw()
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    seen = [text for text in texts(figure) if text.get_text().strip()]
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in seen]
+    sheet = figure.bbox
+    for text, box in boxes:
+        inside = box.x0 >= 0 and box.y0 >= 0 and box.x1 <= sheet.x1 and box.y1 <= sheet.y1
+        assert inside, f"{text!r} is not on the sheet"
+    for (one, a), (other, b) in combinations(boxes, 2):
+        wide = min(a.x1, b.x1) - max(a.x0, b.x0)
+        high = min(a.y1, b.y1) - max(a.y0, b.y0)
+        assert wide <= 1.0 or high <= 1.0, f"{one!r} and {other!r} overlap"
+
+
+# --- all pictures -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("which", "figure"),
+    [
+        *((which, figure) for which in list(EVALUATIONS)[:4] for figure in FIGURES),
+        *((which, "bars") for which in list(EVALUATIONS)[4:]),
+        ("one episode", "returns"),
+        ("zeros", "causes"),
+        ("zeros", "radar"),
+    ],
+)
+def test_no_text_hides_another(which: str, figure: str) -> None:
+    """However many agents, engines and protocols there are, all texts can be read."""
+    assert_readable(FIGURES[figure](EVALUATIONS[which]()))
+
+
+def test_no_text_hides_another_in_gaps() -> None:
+    """That holds for three engines as well, of which each pair has its panels."""
+    evaluation = made(9, 5, engines=(*BOTH, "fake"))
+    figure = gap_figure(evaluation, gaps_of(evaluation))
+    assert_readable(figure)
+    labels = {ax.get_ylabel() for ax in figure.axes}
+    assert labels == {"mujoco minus bullet", "mujoco minus fake", "bullet minus fake"}
+
+
+@pytest.mark.parametrize("draw", [draw_bars, draw_radar, draw_profile, draw_causes, draw_gap])
+def test_the_same_evaluation_gives_the_same_bytes(draw: Any, tmp_path: Path) -> None:
+    """Nothing of the time or the place is in a picture."""
+    evaluation = made(1, 4, engines=BOTH, runs=2)
+    given = {"agent": "ppo", "engine": "bullet"} if draw is draw_causes else {}
+    pictures = []
+    for name in ("one.png", "other.png"):
+        draw(evaluation, tmp_path / name, **given)
+        pictures.append((tmp_path / name).read_bytes())
+    assert pictures[0] == pictures[1]
+    assert pictures[0].startswith(b"\x89PNG")
+    with pytest.raises(UnwritableFolder):
+        draw(evaluation, tmp_path / "none" / "one.png", **given)
+
+
+@pytest.mark.parametrize("draw", [draw_bars, draw_radar, draw_profile, draw_causes, draw_gap])
+def test_an_unknown_metric_is_refused(draw: Any, tmp_path: Path) -> None:
+    """The metrics that there are, are named."""
+    evaluation = made(1, 3, engines=("mujoco",) if draw is draw_causes else BOTH)
+    with pytest.raises(UnknownOption, match="last_fractional_success"):
+        draw(evaluation, tmp_path / "none.png", metric="luck")
+    assert not list(tmp_path.iterdir())
+
+
+def test_all_lines_look_different() -> None:
+    """Twenty agents on two engines have forty kinds of bars and of lines."""
+    looks = Looks(made([f"agent {k}" for k in range(20)], 1, engines=BOTH, n=1))
+    bars = {(bar["facecolor"], bar["hatch"]) for bar in map(looks.bar, looks.lines)}
+    lines = {tuple(map(str, looks.line(line).values())) for line in looks.lines}
+    assert len(bars) == len(lines) == len(looks.lines) == 40
+
+
+def test_texts_are_broken_where_they_are_too_wide() -> None:
+    """Between words, and within a word that is too long by itself."""
+    broken = wrapped("a robot_finger_120_link_3.mass_of_something", 1.0, 8.0).splitlines()
+    assert len(broken) > 2
+    assert all(text_size(line, 8.0)[0] <= 1.0 for line in broken)
+    assert "".join(broken) == "arobot_finger_120_link_3.mass_of_something"
+
+
+# --- bars -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("agents", "protocols", "engines"), [(1, 3, 1), (4, 12, 1), (9, 12, 2)])
+def test_every_agent_has_a_bar_in_every_protocol(agents: int, protocols: int, engines: int) -> None:
+    """None is left out, however many there are; a bar is as high as the mean score."""
+    evaluation = made(agents, protocols, engines=BOTH[:engines])
+    figure = bars_figure(evaluation)
+    bars = {bar.get_gid(): bar.get_height() for bar in named(figure, r"[^ ]*\|.*\|P\d+")}
+    assert len(bars) == agents * protocols * engines
+    last = evaluation.protocols[-1]
+    score = evaluation.score(last, agent=NAMES[agents - 1], engine=BOTH[engines - 1])
+    assert bars[f"{NAMES[agents - 1]}|{BOTH[engines - 1]}|{last}"] == score.value
+
+    (interval,) = named(
+        figure, rf"#222222 interval {NAMES[agents - 1]}\|{BOTH[engines - 1]}\|{last}"
+    )
+    np.testing.assert_array_equal(interval.get_segments()[0][:, 1], [score.low, score.high])
+
+
+def test_bars_are_named() -> None:
+    """Below the bars stand protocols and what varies, in the legend agents and engines."""
+    seen = words(bars_figure(made(2, engines=BOTH)))
+    for name, doc in DOCS.items():
+        assert name in seen
+        assert doc in seen
+    assert {"ppo on mujoco", "ppo on bullet", "sac on mujoco", "sac on bullet"} <= set(seen)
+    assert {"ppo", "sac"} <= set(words(bars_figure(made(2))))
+
+
+def test_the_axis_fits_the_metric() -> None:
+    """Fractions have lines at 0 and 1; returns have one at 0 and may be negative."""
+    fractions, returns = bars_figure(made(2, 3)), bars_figure(made(2, 3), "return")
+    assert len(named(fractions, "line 0")) == len(named(fractions, "line 1")) == 1
+    assert len(named(returns, "line 0")) == 1
+    assert not named(returns, "line 1")
+    assert returns.axes[0].get_ylim()[0] < -60.0
+    assert metric_words("return") in words(returns)
+
+
+def test_a_protocol_in_which_an_agent_did_not_act_has_a_dash() -> None:
+    """It is no score of zero."""
+    evaluation = made(2, 3, kept=lambda row: (row.agent, row.protocol) != ("sac", "P1"))
+    figure = bars_figure(evaluation)
+    assert len(named(figure, r"sac\|mujoco\|.*")) == 2
+    assert words(figure).count("–") == 1
+
+
+def test_a_score_of_one_episode_has_no_whisker() -> None:
+    """The data say nothing about its interval."""
+    figure = bars_figure(made(1, 3, n=1))
+    assert len(named(figure, r"ppo\|.*")) == 3
+    assert not named(figure, ".*interval .*")
+
+
+# --- radar ------------------------------------------------------------------------------------
+
+
+def test_the_first_axis_of_a_radar_is_up() -> None:
+    """The others follow clockwise, and the rings say their score."""
+    figure = radar_figure(made(2))
+    (ax,) = figure.axes
+    assert (ax.get_theta_offset(), ax.get_theta_direction()) == (np.pi / 2, -1)  # type: ignore[attr-defined]
+    places = {text.get_text(): text.get_position() for text in figure.texts}
+    assert places["P0"][1] == max(places[name][1] for name in DOCS)
+    assert places["P3"][0] == max(places[name][0] for name in DOCS)
+    assert {"0.2", "0.4", "0.6", "0.8", "1"} <= set(words(figure))
+    assert set(DOCS.values()) <= set(words(figure))
+
+
+@pytest.mark.parametrize(("agents", "panels"), [(6, 1), (7, 7), (9, 9)])
+def test_no_agent_is_dropped_from_a_radar(agents: int, panels: int) -> None:
+    """More than six lines have a radar for each agent; every line has its band."""
+    evaluation = made(agents, 4)
+    figure = radar_figure(evaluation)
+    assert len(figure.axes) == panels
+    for agent in evaluation.agents:
+        (line,) = named(figure, rf"{agent}\|mujoco")
+        assert line.get_ydata()[2] == evaluation.score("P2", agent=agent).value
+        assert len(named(figure, rf"band {agent}\|mujoco")) == 1
+    if panels > 1:
+        assert set(evaluation.agents) <= {text.get_text() for text in figure.texts}
+
+
+def test_a_radar_grows_with_its_protocols() -> None:
+    """The names of thirty axes do not meet."""
+    many, few = radar_figure(made(1, 30, n=2)), radar_figure(made(1, 12, n=2))
+    assert_readable(many)
+    assert many.get_figwidth() > few.get_figwidth()
+    assert "goal, start, mass from A after 100 steps" in words(many)
+
+
+def test_two_protocols_make_no_radar(tmp_path: Path) -> None:
+    """The message says what to draw instead."""
+    with pytest.raises(UnknownOption, match="draw_bars"):
+        draw_radar(made(1, 2), tmp_path / "none.png")
+
+
+def test_returns_may_be_negative_in_a_radar() -> None:
+    """The center is below the lowest end of all intervals."""
+    (ax,) = radar_figure(made(2, 4), "return").axes
+    assert ax.get_ylim()[0] < -66.0
+
+
+# --- profiles ---------------------------------------------------------------------------------
+
+
+def test_profiles_and_pairs_are_complete() -> None:
+    """Every agent has a line and a band; every pair of agents has a point."""
+    evaluation = made(4, 3, runs=2)
+    figure = profile(evaluation)
+    for agent in evaluation.agents:
+        assert len(named(figure, agent)) == len(named(figure, f"band {agent}")) == 1
+    points = named(figure, ".* > .*")
+    assert len(points) == 6
+    assert all(point.get_xdata()[0] > 0.9 for point in points)  # each is better than the next
+    assert any("of a run in a protocol" in word for word in words(figure))
+
+
+def test_one_run_is_compared_by_episodes() -> None:
+    """The picture says so. One agent has no pairs."""
+    figure = profile(made(1, 3))
+    assert any("of an episode in a protocol" in word for word in words(figure))
+    assert len(figure.axes) == 1
+
+
+def test_agents_in_other_protocols_have_no_profile(tmp_path: Path) -> None:
+    """A comparison over different protocols would say nothing."""
+    evaluation = made(2, 3, kept=lambda row: (row.agent, row.protocol) != ("sac", "P1"))
+    with pytest.raises(UnknownOption, match="P1"):
+        draw_profile(evaluation, tmp_path / "none.png")
+
+
+# --- causes -----------------------------------------------------------------------------------
+
+
+def test_causes_are_ranked_and_marked() -> None:
+    """Heavy blocks make the score lower from P7 on, and nothing does so before."""
+    figure = causes(made(1, n=40))
+    panels = {ax: [bar.get_gid() for bar in ax.patches] for ax in figure.axes}
+    assert len(panels) == 11  # nothing varies in P0
+    for ax, bars in panels.items():
+        protocol = bars[0].partition("|")[0]
+        signs = [text.get_text() for text in ax.texts]
+        assert len(bars) == len(signs) == 2
+        stars = [sign.endswith("*") for sign in signs]
+        assert [to_hex(bar.get_facecolor()) == SURE.lower() for bar in ax.patches] == stars
+        if int(protocol[1:]) > 6:
+            assert bars[0] == f"{protocol}|tool_block.mass"
+            assert signs[0].startswith("▼ -0.")
+            assert stars[0]
+    assert any("Nothing varies in P0." in word for word in words(figure))
+
+
+def test_a_score_that_never_changes_has_no_causes() -> None:
+    """There is nothing to explain; the picture says where."""
+    figure = causes(made(1, 3, score=0.0))
+    assert not figure.axes
+    assert any("the same score in P1, P2." in word for word in words(figure))
+
+
+def test_too_few_episodes_say_nothing() -> None:
+    """The picture says what is left out."""
+    figure = causes(made(1, 3, n=5))
+    assert not figure.axes
+    assert sum("only 5 episodes varied it" in word for word in words(figure)) == 2
+
+
+# --- gaps -------------------------------------------------------------------------------------
+
+
+def test_gaps_are_paired_differences() -> None:
+    """Everybody is better by 0.1 on the second engine where the best score leaves room."""
+    evaluation = made(3, 4, engines=BOTH)
+    figure = gap_figure(evaluation, gaps_of(evaluation))
+    points = {point.get_gid(): point.get_ydata()[0] for point in named(figure, r"\w+\|P\d+")}
+    assert len(points) == 12
+    assert points["td3|P2"] == evaluation.gap("mujoco", "bullet", "P2", agent="td3").value
+    assert points["td3|P2"] == pytest.approx(-0.1, abs=0.03)
+
+
+def test_one_engine_has_no_gap(tmp_path: Path) -> None:
+    """The message says what is needed."""
+    with pytest.raises(UnknownOption, match="two engines"):
+        draw_gap(made(1, 3), tmp_path / "none.png")
+
+
+# --- the report -------------------------------------------------------------------------------
+
+
+def report(evaluation: Evaluation, folder: Path, **given: Any) -> str:
+    """Write a report and read it."""
+    write_report(evaluation, folder / "report.html", **given)
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+def sections(page: str) -> dict[str, str]:
+    """Cut a page into its sections, by anchor."""
+    return dict(re.findall(r'<section id="(\w+)">(.*?)</section>', page, flags=re.S))
+
+
+def test_a_report_has_everything(tmp_path: Path) -> None:
+    """Two agents on two engines: scores, pictures, differences, gaps, causes, and what it was."""
+    evaluation = made(2, 8, engines=BOTH, runs=2, kept=lambda row: row.protocol in FEW)
+    page = report(evaluation, tmp_path)
+    found = sections(page)
+    assert list(found) == [
+        "summary", "overall", "bars", "radar", "profile", "differences", "gap", "causes", "numbers",
+        "about",
+    ]  # fmt: skip
+    score = evaluation.score("P5", agent="sac", engine="bullet")
+    assert str(score) in found["summary"]
+    assert str(evaluation.difference("ppo", "sac", "P5", engine="bullet")) in found["differences"]
+    assert str(evaluation.gap("mujoco", "bullet", "P5", agent="sac")) in found["gap"]
+    assert (
+        str(evaluation.overall(agent="sac", engine="bullet")["interquartile_mean"])
+        in found["overall"]
+    )
+    assert "2 training runs" in found["overall"]
+    assert "tool_block.mass explains" in found["causes"]
+    assert "mean_full_integrated_fractional_success" in found["numbers"]
+    assert "std_last_fractional_success" in found["numbers"]
+    assert "5ha256 of sac" in found["about"]
+    assert "scm-world evaluate --check results.json" in found["about"]
+    assert evaluation.digest in found["about"]
+    assert page.count("data:image/png") == 8  # four of all, and causes of two agents on two engines
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Evaluation, str]:
+    """Give an evaluation of three agents whose names are markup, and its page with a video."""
+    evaluation = made([BAD, "b", "c"], 3)
+    folder = tmp_path_factory.mktemp("report")
+    return evaluation, report(evaluation, folder, videos=[folder / "videos" / "worst P6.mp4"])
+
+
+def test_a_report_needs_nothing_else(small: tuple[Evaluation, str]) -> None:
+    """It loads nothing, and holds its numbers."""
+    evaluation, page = small
+    assert not re.search(r"https?://|<link|src=\"(?!data:)", page)
+    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page)
+    data = json.loads(text)
+    assert (data["rows"], data["digest"]) == (len(evaluation), evaluation.digest)
+    row = next(one for one in data["scores"] if (one["agent"], one["protocol"]) == ("b", "P2"))
+    assert row["success"] == evaluation.score("P2", "success", agent="b").as_dict()
+    assert row["success"]["n"] == 12
+
+
+def test_only_who_is_better_is_bold(small: tuple[Evaluation, str], tmp_path: Path) -> None:
+    """The best agent stands out if its paired differences exclude 0, and nobody else does."""
+    better = sections(small[1])["summary"]
+    assert better.count('class="best"') == 3
+    assert len(re.findall(r'<td class="best"[^>]*>0\.[89]', better)) == 3
+    equal = sections(report(made(3, 2, score=1.0), tmp_path))["summary"]
+    assert 'class="best"' not in equal
+
+
+def test_a_better_mean_alone_is_not_bold() -> None:
+    """An interval that holds 0 says that it may be chance, whichever of the two is first."""
+    evaluation = made(3, 1, n=1)
+    sure, unsure = Interval(0.2, 0.1, 0.3, 0.95, 9), Interval(0.2, -0.1, 0.3, 0.95, 9)
+    worse = Interval(-0.2, -0.3, -0.1, 0.95, 9)
+    for third, expected in ((sure, {"sac"}), (unsure, set()), ("other episodes", set())):
+        pairs: Pairs = {
+            ("mujoco", "P0", "ppo", "sac"): worse,
+            ("mujoco", "P0", "ppo", "td3"): unsure,
+            ("mujoco", "P0", "sac", "td3"): third,
+        }
+        assert {line.agent for line, _ in best(evaluation, pairs)} == expected
+
+
+def test_a_report_of_little_says_what_is_missing(tmp_path: Path) -> None:
+    """One episode of one agent in two protocols has neither radar, nor profile, nor intervals."""
+    found = sections(report(made(1, 2, n=1), tmp_path))
+    assert not {"radar", "gap", "differences"} & set(found)
+    assert "There are none" in found["profile"]
+    assert "[unknown]" in found["summary"]
+    assert "too few episodes varied anything" in found["causes"]
+    with pytest.raises(UnknownOption, match="without episodes"):
+        write_report(Evaluation.of({"task": "pushing"}, []), tmp_path / "none.html")
+
+
+def test_a_report_of_unequal_agents_is_written(tmp_path: Path) -> None:
+    """Where an agent did not act, or played other episodes, the page says so."""
+    unequal = made(2, 3, kept=lambda row: row.agent == "ppo" or row.protocol != "P1")
+    found = sections(report(unequal, tmp_path))
+    assert '<td data-v="">–</td>' in found["summary"]
+    assert "There are none" in found["profile"]
+    fewer = made(2, 3, kept=lambda row: row.agent == "ppo" or row.episode > 3)
+    found = sections(report(fewer, tmp_path))
+    assert "they played other episodes" in found["differences"]
+
+
+def test_names_cannot_harm_a_page(small: tuple[Evaluation, str]) -> None:
+    """Names of agents are written as texts."""
+    page = small[1]
+    assert "<script>alert" not in page
+    assert BAD in unescape(sections(page)["summary"])
+
+
+def test_videos_are_linked_beside_the_page(small: tuple[Evaluation, str]) -> None:
+    """Links are relative, so that the folder can be moved."""
+    assert '<a href="videos/worst%20P6.mp4">worst P6.mp4</a>' in small[1]
+
+
+def test_the_same_evaluation_gives_the_same_page(
+    small: tuple[Evaluation, str], tmp_path: Path
+) -> None:
+    """Byte for byte, wherever it is written."""
+    videos = [tmp_path / "videos" / "worst P6.mp4"]
+    assert report(small[0], tmp_path, videos=videos) == small[1]
+
+
+def test_a_report_can_be_about_another_metric(tmp_path: Path) -> None:
+    """Returns have their own scale."""
+    evaluation = made(1, 2)
+    found = sections(report(evaluation, tmp_path, metric="return"))
+    assert str(evaluation.score("P1", "return")) in found["summary"]
+    with pytest.raises(UnknownOption, match="metric"):
+        report(evaluation, tmp_path, metric="luck")
