@@ -41,7 +41,15 @@ def test_the_tables_of_variables_are_up_to_date() -> None:
     assert (ROOT / "docs" / "variables.md").read_text() == markdown()
 
 
-EXAMPLES = ("interventions", "discovery", "environments", "learners", "new_family", "own_learner")
+EXAMPLES = (
+    "interventions",
+    "curricula",
+    "discovery",
+    "environments",
+    "learners",
+    "new_family",
+    "own_learner",
+)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

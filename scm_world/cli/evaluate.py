@@ -63,10 +63,10 @@ def evaluate(
     finished (exit code 130); the same command goes on. With --check FILE nothing is evaluated: a
     part of FILE is played again; exit code 1 if anything is different.
     """
-    from scm_world.cli import evaluation
+    from scm_world.cli import evaluation, explanation
 
     if check is not None:
-        raise typer.Exit(evaluation.check_again(check, part, policy))
+        raise typer.Exit(explanation.check_again(check, part, policy))
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     options = evaluation.Options(
@@ -103,11 +103,11 @@ def explain(
     ] = None,
 ) -> None:
     """Say which variables decided the scores, or what an episode would have been without them."""
-    from scm_world.cli import evaluation
+    from scm_world.cli import explanation
 
-    where = evaluation.Where(results, agent, backend, metric)
+    where = explanation.Where(results, agent, backend, metric)
     if episode is None:
-        raise typer.Exit(evaluation.show_causes(where, protocol))
+        raise typer.Exit(explanation.show_causes(where, protocol))
     if protocol is None:
         raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
-    raise typer.Exit(evaluation.show_otherwise(where, protocol, episode, versus))
+    raise typer.Exit(explanation.show_otherwise(where, protocol, episode, versus))

@@ -1,4 +1,4 @@
-"""``scm-world evaluate`` and ``scm-world explain``."""
+"""``scm-world evaluate``."""
 
 from __future__ import annotations
 
@@ -18,20 +18,18 @@ from scm_world.cli.console import (
     check_writable,
     console,
     keep_whole,
-    show,
     table,
     written,
 )
 from scm_world.cli.questions import shown_episodes
 from scm_world.cli.tasks import build, suffix
 from scm_world.errors import UnknownOption
-from scm_world.evaluation import METRICS, Evaluation, check, evaluate, why
+from scm_world.evaluation import METRICS, Evaluation, evaluate
 from scm_world.evaluation.files import CODECS
-from scm_world.evaluation.outputs import write_outputs
+from scm_world.evaluation.reporting import write_outputs
 from scm_world.evaluation.parts import FOLDER
 
 INTERRUPTED = 130
-SHOWN = 8  # variables that are listed
 _WORDS = {"true": True, "false": False, "none": None}
 
 
@@ -185,117 +183,3 @@ def _gaps(found: Evaluation, metric: str) -> Any:
         gaps = (found.gap(one, other, protocol, metric, agent=agent) for agent in found.agents)
         made.add_row(protocol, *(Text(str(gap)) for gap in gaps))
     return made
-
-
-# --- again, and why ----------------------------------------------------------------------------
-
-
-def _policy(text: str | None) -> Any:
-    return None if text is None else policies_of(text)
-
-
-def check_again(path: Path, episodes: int, policy: str | None) -> int:
-    """Play a part of some results again; return the exit code."""
-    sys.path.insert(0, str(Path.cwd()))
-    results = Evaluation.load(path)
-    trusted = _own(results)
-    with shown_episodes() as progress:
-        found = check(
-            results, episodes=episodes, policy=_policy(policy), trusted=trusted, progress=progress
-        )
-    terminal = console()
-    for line in found.wrong:
-        terminal.print(Text(line), soft_wrap=True)
-    said = "the same bits in all of them" if found else f"{len(found.wrong)} differ"
-    chosen = f"{found.episodes} of {len(results)} episodes, chosen with seed {found.seed}"
-    terminal.print(f"played again: {chosen}: {said}", soft_wrap=True)
-    return 0 if found else 1
-
-
-def _own(results: Evaluation) -> tuple[str, ...]:
-    """Name the packages of policies that are functions: who checks results has them at hand."""
-    policies = [agent["policy"] for agent in results.about["agents"]]
-    names = [str(one["name"]) for one in policies if one.get("kind") == "function"]
-    return tuple({name.partition(":")[0].partition(".")[0] for name in names})
-
-
-@final
-@dataclass(frozen=True)
-class Where:
-    """Which results are explained.
-
-    Attributes:
-        path: Folder or file.
-        agent: Who acted, if there are several.
-        engine: On which engine, if there are several.
-        metric: Score that is explained.
-    """
-
-    path: Path
-    agent: str | None
-    engine: str | None
-    metric: str
-
-
-def show_causes(where: Where, protocol: str | None) -> int:
-    """Print for each protocol what its variables did to the score; return the exit code."""
-    results = Evaluation.load(where.path)
-    agent, engine = results.the("agent", where.agent), results.the("engine", where.engine)
-    terminal = console()
-    for name in results.protocols if protocol is None else (protocol,):
-        found = results.causes(name, where.metric, agent=agent, engine=engine)
-        if not found.causes:
-            continue
-        score = results.score(name, where.metric, agent=agent, engine=engine)
-        made = table(
-            "variable",
-            "share of variance",
-            "p (Holm)",
-            "upper - lower third",
-            title=f"{name}: {agent} on {engine}, {where.metric.replace('_', ' ')} {score}",
-        )
-        for cause in found.ranked()[:SHOWN]:
-            column = cause.column
-            of = "" if column.name == cause.variable else f" ({column.name})"
-            made.add_row(
-                cause.variable,
-                Text(str(cause.share)),
-                f"{cause.p_holm:.3g}",
-                Text(f"{column.contrast}{of}"),
-            )
-        if len(found.causes) > SHOWN:
-            made.add_row(f"and {len(found.causes) - SHOWN} more", "", "", "")
-        terminal.print(keep_whole(made, terminal, 0))
-    return 0
-
-
-def show_otherwise(where: Where, protocol: str, episode: int, versus: str | None) -> int:
-    """Print what an episode would have been; return the exit code."""
-    sys.path.insert(0, str(Path.cwd()))
-    results = Evaluation.load(where.path)
-    with shown_episodes() as progress:
-        found = why(
-            results,
-            protocol,
-            episode,
-            agent=where.agent,
-            engine=where.engine,
-            metric=where.metric,
-            versus=versus,
-            trusted=_own(results),
-            progress=progress,
-        )
-    title = f"{protocol}, episode {episode}: {where.metric.replace('_', ' ')} {found.score:.3g}"
-    made = table("had it been", "instead of", "score", "success", title=title)
-    for other in found.others:
-        made.add_row(
-            Text(f"{other.variable} = {show(other.would_be)}"),
-            show(other.was),
-            f"{other.would_score:.3g} ({other.gain:+.3g})",
-            "yes" if other.would_succeed else "no",
-        )
-    for name, reason in found.left_out.items():
-        made.add_row(Text(name), "", "left out", Text(reason))
-    terminal = console()
-    terminal.print(made)
-    return 0

@@ -10,11 +10,12 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Value, Values
+from scm_world.curricula.base import words
 from scm_world.curricula.targets import matching
 from scm_world.curricula.wrapper import environment
 from scm_world.errors import ActionError, InterventionError, UnknownOption
-from scm_world.variables import Box, Subset
+from scm_world.variables import Box, Integers, Subset
 from scm_world.variables.kinds import SpaceName, Variable
 from scm_world.variables.subsets import as_region
 from scm_world.world.start import whole_number
@@ -36,12 +37,14 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
     Args:
         env: Of this package, with actions in a box.
         what: Names, patterns or groups of what may be set, as in ``resample``.
-        space: Where values may lie: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``.
+        space: Where values may lie: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``; if None, where
+            interventions on the environment may (its ``variables_space``), or else ``"A"``.
         most: How often it may intervene in an episode; any number if None.
         flat: Whether an action is one vector.
 
     Raises:
-        UnknownOption: A variable has no region with two ends, or an option is none.
+        UnknownOption: A variable has no region with two ends, actions are no vector, or an option
+            is none.
         UnknownVariable: A pattern names nothing.
 
     Example:
@@ -60,15 +63,21 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
         env: gymnasium.Env[Any, Any],
         what: str | Iterable[str],
         *,
-        space: SpaceName | Subset = "A",
+        space: SpaceName | Subset | None = None,
         most: int | None = None,
         flat: bool = False,
     ) -> None:
-        patterns = (what,) if isinstance(what, str) else tuple(what)
-        RecordConstructorArgs.__init__(self, what=patterns, space=space, most=most, flat=flat)
+        patterns = words("what", what)
+        region = as_region("space", space)
+        data = region.model_dump(mode="json") if isinstance(region, Subset) else region
+        RecordConstructorArgs.__init__(self, what=patterns, space=data, most=most, flat=flat)
         super().__init__(env)
         self._inner = environment(env, "InterveningAgent")
-        self._space: Any = as_region("space", space)
+        if not isinstance(env.action_space, gymnasium.spaces.Box):
+            allowed = ("one with actions in a box",)
+            raise UnknownOption("environment for InterveningAgent", str(env), allowed)
+        self._space: Any = region or self._inner.world.variables_space or "A"
+        self._shape = env.action_space.shape
         self._most = None if most is None else whole_number("most", most, least=0)
         self._flat, self._left = flat, -1
         declaration = self._inner.world.declaration
@@ -84,16 +93,16 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
         """The variables that may be set, in their order."""
         return self._names
 
-    def _box(self, variable: Variable) -> Box:
+    def _box(self, variable: Variable) -> Box | Integers:
         """Give the region of a variable.
 
         Raises:
-            UnknownOption: It has none, or one that is no box.
+            UnknownOption: It has none, or one without two ends.
         """
         space = self._space
         region = space.space_of(variable) if isinstance(space, Subset) else variable.space(space)
-        if not isinstance(region, Box):
-            allowed = (f"variables whose region is a box, unlike that of {variable.name}",)
+        if not isinstance(region, Box | Integers):
+            allowed = (f"one in which {variable.name} lies between two ends",)
             raise UnknownOption("space", str(space), allowed)
         return region
 
@@ -115,7 +124,7 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
+        """Begin an episode, in which all interventions are left."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._left = -1 if self._most is None else self._most
         return observation, {**info, "refused": "", "interventions_left": self._left}
@@ -124,7 +133,7 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
         """Intervene, then advance one control step.
 
         Raises:
-            ActionError: It is none of the space.
+            ActionError: It is none of the space; nothing has happened.
         """
         inner, which, values = self._parts(action)
         refused = self._intervene(which, values) if which.any() else ""
@@ -134,18 +143,20 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
 
     def _parts(self, action: Any) -> tuple[Any, NDArray[np.bool_], Floats]:
         n, numbers = len(self._names), sum(self._sizes)
+        inner: Any = None
         try:
             if self._flat:
                 given = np.asarray(action)
-                inner, gates, values = np.split(given, [given.size - n - numbers, -numbers])
+                inner, gates, values = np.split(given, [-n - numbers, -numbers])
                 which = gates > 0.0
             else:
                 inner = action["action"]
                 which, values = np.asarray(action["which"]) > 0, action["values"]
             values = np.asarray(values, dtype=np.float64)
         except (TypeError, KeyError, ValueError, IndexError):
-            which, values, inner = np.zeros(0, bool), np.zeros(0), None
-        if which.shape != (n,) or values.shape != (numbers,) or not np.isfinite(values).all():
+            which, values = np.zeros(0, bool), np.zeros(0)
+        fits = np.shape(inner) == self._shape and which.shape == (n,)
+        if not fits or values.shape != (numbers,) or not np.isfinite(values).all():
             raise ActionError(f"an action is one of {self.action_space}, got {action!r}", action)
         return inner, which, np.clip(values, -1.0, 1.0)
 
@@ -160,12 +171,20 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
             which, self._variables, ends, self._sizes, strict=True
         ):
             if chosen:
-                low, high = self._box(variable).bounds(variable.shape, present)
                 share = (values[end - size : end].reshape(variable.shape) + 1.0) / 2.0
-                request[variable.name] = low + (high - low) * share
+                request[variable.name] = self._value(variable, share, present)
         try:
             self._inner.do(request, space=self._space)
         except InterventionError as error:
             return str(error)
         self._left -= self._left > 0
         return ""
+
+    def _value(self, variable: Variable, share: Floats, present: Values) -> Value:
+        """Give what lies between the ends of a region, at a share of the way in each component."""
+        region = self._box(variable)
+        if isinstance(region, Integers):
+            between = np.rint(region.low + (region.high - region.low) * share)
+            return np.asarray(between, dtype=np.int64)
+        low, high = region.bounds(variable.shape, present)
+        return np.asarray(low + (high - low) * share)

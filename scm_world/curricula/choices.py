@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, Literal, final
 
 import numpy as np
 
-from scm_world.curricula.parts import Acts, AnyPart, Part, as_part
+from scm_world.curricula.base import Acts, AnyPart, Part, as_part
 from scm_world.curricula.situations import Memory, Progress, Situation
 from scm_world.errors import UnknownOption
 from scm_world.world.requests import merged
@@ -53,7 +53,15 @@ class InTurn(_Several):
 
     def acts(self, situation: Situation) -> Acts:
         """Let the one act whose turn it is."""
-        return self.of[situation.episode // self.each % len(self.of)].acts(situation)
+        return self._present(situation.episode).acts(situation)
+
+    def _present(self, episode: int) -> Part:
+        return self.of[episode // self.each % len(self.of)]
+
+    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
+        """List it and the one whose turn it is."""
+        yield self
+        yield from self._present(episode).live(memory, episode)
 
 
 @final
@@ -71,7 +79,8 @@ class Weighted(_Several):
         """Let the one act that was drawn at the beginning of the episode."""
         ends = np.cumsum(self.weights)
         drawn = replace(situation, step=0).uniform(self.key) * ends[-1]
-        return self.of[int(np.searchsorted(ends, drawn, side="right"))].acts(situation)
+        chosen = int(np.searchsorted(ends, drawn, side="right"))
+        return self.of[min(chosen, len(self.of) - 1)].acts(situation)  # a product may round up
 
 
 @final
@@ -93,6 +102,11 @@ class Stages(_Several):
         """Let the present stage act."""
         return self.of[self.progress(situation.memory).level].acts(situation)
 
+    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
+        """List it and the present stage."""
+        yield self
+        yield from self.of[self.progress(memory).level].live(memory, episode)
+
     def progress(self, memory: Memory) -> Progress:
         """Give what is remembered of this part."""
         return memory.stages.setdefault(self.key, Progress())
@@ -113,6 +127,19 @@ class Stages(_Several):
             kept.recent.clear()
 
 
+def count(parts: Iterable[Part], memory: Memory, *, success: bool) -> None:
+    """Take an episode into account, for all stages that acted in it.
+
+    Args:
+        parts: What could act.
+        memory: Of the curriculum.
+        success: Whether the task was solved at the end.
+    """
+    stages_by_key = {part.key: part for part in parts if isinstance(part, Stages)}
+    for part in stages_by_key.values():
+        part.ended(memory, success=success)
+
+
 def _several(option: str, given: Iterable[Any]) -> tuple[Part, ...]:
     made = tuple(as_part(part) for part in given)
     if not made:
@@ -121,7 +148,10 @@ def _several(option: str, given: Iterable[Any]) -> tuple[Part, ...]:
 
 
 def together(*parts: Any) -> Together:
-    """Do all of it.
+    """Do all of it; of two that set one quantity the later one counts.
+
+    Raises:
+        UnknownOption: There is no part.
 
     Example:
         >>> both = together({"floor_friction": 0.4}, {"tool_block.mass": 0.03})
@@ -132,30 +162,41 @@ def together(*parts: Any) -> Together:
 
 
 def in_turn(*parts: Any, each: int = 1) -> InTurn:
-    """Do one of it in ``each`` episodes, then the next."""
+    """Do one of it in ``each`` episodes, then the next.
+
+    Raises:
+        UnknownOption: There is no part, or ``each`` is no positive whole number.
+
+    Example:
+        >>> in_turn({"gravity": [0.0, 0.0, -9.8]}, {}, each=10).each
+        10
+    """
     each = whole_number("each", each, least=1)
     return InTurn(of=_several("in_turn", parts), each=each)
 
 
 def weighted(*pairs: tuple[float, Any]) -> Weighted:
-    """Do one of it by lot.
+    """Do one of it by lot, anew in each episode.
 
     Args:
         pairs: A weight and a part each.
 
     Raises:
-        UnknownOption: A weight is no positive number.
+        UnknownOption: There is no pair, or a weight is no positive number.
 
     Example:
         >>> weighted((3.0, {"floor_friction": 0.4}), (1.0, {})).weights
         (3.0, 1.0)
     """
-    weights = []
-    for weight, _ in pairs:
-        if not isinstance(weight, int | float) or not 0.0 < weight < float("inf"):
-            raise UnknownOption("weight", weight, ("any positive number",))
-        weights.append(float(weight))
-    return Weighted(of=_several("weighted", (part for _, part in pairs)), weights=tuple(weights))
+    for pair in pairs:
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise UnknownOption("weighted", pair, ("pairs of a weight and a part",))
+        if isinstance(pair[0], bool) or not isinstance(pair[0], int | float):
+            raise UnknownOption("weight", pair[0], ("any positive number",))
+        if not 0.0 < pair[0] < float("inf"):
+            raise UnknownOption("weight", pair[0], ("any positive number",))
+    weights = tuple(float(weight) for weight, _ in pairs)
+    return Weighted(of=_several("weighted", (part for _, part in pairs)), weights=weights)
 
 
 def stages(*parts: Any, up: float = 0.8, down: float | None = None, window: int = 100) -> Stages:
@@ -168,7 +209,11 @@ def stages(*parts: Any, up: float = 0.8, down: float | None = None, window: int 
         window: How many episodes count.
 
     Raises:
-        UnknownOption: A share is none, or ``down`` is not below ``up``.
+        UnknownOption: There is no part, a share is none, or ``down`` is not below ``up``.
+
+    Example:
+        >>> stages({}, {"tool_block.mass": 0.08}, up=0.9, window=50).window
+        50
     """
     window = whole_number("window", window, least=1)
     if not 0.0 < up <= 1.0:

@@ -1,21 +1,22 @@
-"""Curricula as values, and what runs them."""
+"""Curricula as values, with files."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, final
 
 from pydantic import ValidationError
 
-from scm_world.curricula.choices import Stages
-from scm_world.curricula.parts import Acts, AnyPart, as_part, check_names
-from scm_world.curricula.situations import Memory, Situation
-from scm_world.errors import ModelError, UnreadableFile
+from scm_world.curricula.base import AnyPart, as_part
+from scm_world.curricula.times import AtStep, Every
+from scm_world.errors import ModelError, UnknownVariable, UnreadableFile
 from scm_world.queries.plans import PACKAGE
 from scm_world.variables import Subset
-from scm_world.variables.checks import check_region
+from scm_world.variables.checks import check_subset
 from scm_world.variables.spaces import Frozen
 from scm_world.world import World
 
@@ -122,109 +123,65 @@ class Curriculum(Frozen):
     def check(self, world: World) -> None:
         """Look for names that do not exist and regions that are impossible.
 
+        Where it decides which bodies there are, names are looked up when it acts: they may be
+        those of bodies that are not there yet.
+
+        Args:
+            world: Whose episodes begin with the structure that its declaration has.
+
         Raises:
             InterventionError: With the name.
         """
-        check_names(self.part.walk(), world.declaration)
-        for pattern, region in () if self.space is None else self.space.parts:
-            if region is not None and pattern in world.model:
-                check_region(world.model.declared(pattern), region)
+        may_come = self._may_restructure(world)
+        for part in self.part.walk():
+            try:
+                part.declared(world.declaration)
+            except UnknownVariable:
+                if not may_come:
+                    raise
+        if self.space is not None:
+            check_subset(self.space, world.model.variables, may_come=may_come)
+
+    def _may_restructure(self, world: World) -> bool:
+        head = tuple(world.family.head)
+        goals = world.task.goal_causes
+        return any(
+            any(fnmatchcase(name, pattern) for name in head)
+            or pattern in ("@everything", "@published")
+            or (pattern == "@goals" and not set(head).isdisjoint(goals))
+            for part in self.part.walk()
+            for pattern in part.names()
+        )
+
+    @cached_property
+    def _times(self) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
+        """When parts act: at these steps, and from the one step on every so many."""
+        timed = [p for p in self.part.walk() if isinstance(p, AtStep | Every)]
+        steps = frozenset(p.step for p in timed if isinstance(p, AtStep))
+        return steps, tuple({(p.first, p.steps) for p in timed if isinstance(p, Every)})
+
+    def may_act(self, step: int) -> bool:
+        """Tell whether anything may be due after so many control steps, in some episode."""
+        steps, series = self._times
+        return (
+            step == 0
+            or step in steps
+            or any(step >= first and (step - first) % period == 0 for first, period in series)
+        )
 
     @property
     def steps_matter(self) -> bool:
         """Whether it may act after the reset."""
-        return any(part.kind in _IN_EPISODES for part in self.part.walk())
-
-
-_IN_EPISODES = ("at_step", "every")
-
-
-class Doable(Protocol):
-    """An environment that can be intervened on."""
-
-    world: World
-
-    def do(self, request: Mapping[str, Any], *, space: Any = None) -> Any:
-        """Intervene now."""
-
-    def snapshot(self) -> Any:
-        """Save this instant."""
-
-    def restore(self, snapshot: Any) -> None:
-        """Go back to it."""
-
-
-@final
-class Turn:
-    """A curriculum at work: it counts episodes, remembers successes, and intervenes.
-
-    Args:
-        curriculum: What is done.
-        memory: Where it goes on; at the beginning if None.
-
-    Attributes:
-        memory: The state that decides how it goes on.
-    """
-
-    def __init__(self, curriculum: Any, memory: Memory | None = None) -> None:
-        self.curriculum = as_curriculum(curriculum)
-        self.memory = Memory() if memory is None else memory
-        self._stages = [p for p in self.curriculum.part.walk() if isinstance(p, Stages)]
-        self._waits = self.curriculum.steps_matter
-
-    def begin(self, env: Doable, episode: int | None = None) -> bool:
-        """Do what is due at a reset, just after it.
-
-        Args:
-            env: At the beginning of an episode.
-            episode: Its number; as many as have begun if None.
-
-        Returns:
-            Whether anything was done.
-        """
-        if episode is not None:
-            self.memory.episode = episode
-        return self._act(env, 0)
-
-    def step(self, env: Doable) -> bool:
-        """Do what is due after a control step; tell whether that was anything."""
-        return self._waits and self._act(env, env.world.index)
-
-    def ended(self, *, success: bool) -> None:
-        """Take an episode into account that has ended, and count it."""
-        for part in self._stages:
-            part.ended(self.memory, success=success)
-        self.memory.episode += 1
-
-    def _act(self, env: Doable, step: int) -> bool:
-        """Intervene; first on what decides which bodies there are, for others have their names."""
-        acts = self._asked(env.world, step)
-        head = env.world.family.head
-        first = {name: act for name, act in acts.items() if name in head}
-        if not acts:
-            return False
-        if not first:
-            env.do(acts, space=self.curriculum.space)
-            return True
-        before = env.snapshot()
-        env.do(first, space=self.curriculum.space)
-        rest = {n: a for n, a in self._asked(env.world, step).items() if n not in first}
-        if rest:
-            try:
-                env.do(rest, space=self.curriculum.space)
-            except BaseException:
-                env.restore(before)
-                raise
-        return True
-
-    def _asked(self, world: World, step: int) -> Acts:
-        memory = self.memory
-        situation = Situation(world, memory.episode, step, memory, due=step == 0)
-        return self.curriculum.part.acts(situation)
+        steps, series = self._times
+        return bool(series) or max(steps, default=0) > 0
 
 
 def as_curriculum(given: Any) -> Curriculum:
-    """Take a curriculum, or make one of a part, or of an intervention.
+    """Take a curriculum, or make one of a part, of plain data, or of an intervention.
+
+    Raises:
+        UnknownOption: It is none of these.
+        ModelError: The data is none of a curriculum.
 
     Example:
         >>> as_curriculum({"floor_friction": 0.4}).part.kind

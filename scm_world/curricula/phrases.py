@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from scm_world.curricula.parts import Follow, Goal, Interpolate, Resample
-from scm_world.errors import UnknownOption
-from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.curricula.moves import Follow, Interpolate
+from scm_world.curricula.parts import Goal, Resample
+from scm_world.variables.kinds import SpaceName
 
 
 def resample(what: Any, space: Any = "A", *, besides: Any = ()) -> Resample:
@@ -15,7 +15,7 @@ def resample(what: Any, space: Any = "A", *, besides: Any = ()) -> Resample:
 
     Args:
         what: Names, patterns with ``*``, or groups such as ``"@looks"``; one or several.
-        space: ``"A"``, ``"B"``, ``"A|B"``, a set such as a ``Box``, or a ``Subset``.
+        space: ``"A"``, ``"B"``, ``"A|B"``, a distribution such as a ``Box``, or a ``Subset``.
         besides: What is left as it is, likewise.
 
     Raises:
@@ -28,15 +28,17 @@ def resample(what: Any, space: Any = "A", *, besides: Any = ()) -> Resample:
     return Resample(what, space=space, besides=besides)
 
 
-def goals(space: SpaceName = "A") -> Goal:
+def goals(space: SpaceName = "A", *, besides: Any = ()) -> Goal:
     """Draw a new goal, as the task draws goals.
+
+    Args:
+        space: ``"A"``, ``"B"`` or ``"A|B"``.
+        besides: Causes of the goal that are left as they are.
 
     Raises:
         UnknownOption: There is no such space.
     """
-    if space not in SPACES:
-        raise UnknownOption("space", space, SPACES)
-    return Goal(space=space)
+    return Goal(space, besides=besides)
 
 
 def poses(space: Any = "A") -> Resample:

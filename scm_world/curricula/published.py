@@ -9,8 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
+from scm_world.curricula.base import Do, Part
 from scm_world.curricula.choices import together
-from scm_world.curricula.parts import Do, Goal, Part, Resample
+from scm_world.curricula.parts import Goal, Resample
 from scm_world.curricula.times import AtStep, During
 from scm_world.errors import UnknownOption
 from scm_world.variables.kinds import SPACES, SpaceName
@@ -101,12 +104,17 @@ def active(part: Any, actives: Iterable[float]) -> Part:
         2
     """
     given = tuple(actives)
-    whole = len(given) == 4 and all(number == int(number) >= 0 for number in given)
+    whole = len(given) == 4 and all(_is_count(number) for number in given)
     if not whole or given[2] < 1 or given[1] < given[0]:
         allowed = ("(first episode, last episode, period, control step), whole numbers",)
         raise UnknownOption("actives", given, allowed)
     first, last, period, step = map(int, given)
     return AtStep(step, During(range(first, last + 1, period), part))
+
+
+def _is_count(number: Any) -> bool:
+    is_number = isinstance(number, int | float | np.integer) and not isinstance(number, bool)
+    return is_number and 0 <= number < float("inf") and number == int(number)
 
 
 def published_curriculum(
@@ -123,7 +131,7 @@ def published_curriculum(
         UnknownOption: There are not as many of both, or one is wrong.
 
     Example:
-        >>> both = published_curriculum(["goal_actor"], [(0, 1e9, 1, 0)])
+        >>> both = published_curriculum(["goal_actor"], [ALWAYS])
         >>> both.of[0].part.part.kind
         'goal'
     """

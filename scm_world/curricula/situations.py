@@ -85,6 +85,8 @@ class Situation:
         step: The control step within the episode; 0 is the reset.
         memory: Of the curriculum.
         due: Whether what has no time of its own acts now.
+        first: Where bodies come and go: what decides that, which is asked for before all else,
+            so that the rest finds the bodies that there are then; else None.
     """
 
     world: World
@@ -92,6 +94,7 @@ class Situation:
     step: int
     memory: Memory
     due: bool
+    first: frozenset[str] | None = None
 
     @property
     def declaration(self) -> Declaration:

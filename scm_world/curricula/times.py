@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Literal, final
 
-from scm_world.curricula.parts import Acts, AnyPart, Part, as_part
-from scm_world.curricula.situations import Situation
+from scm_world.curricula.base import Acts, AnyPart, Part, as_part
+from scm_world.curricula.situations import Memory, Situation
 from scm_world.errors import UnknownOption
 from scm_world.world.start import whole_number
 
@@ -98,34 +99,79 @@ class During(_Timed):
                 allowed = ("a range such as range(1_000, 5_000)", "range(first, stop, period)")
                 raise UnknownOption("episodes", episodes, allowed)
             fields |= {"first": episodes.start, "stop": episodes.stop, "period": episodes.step}
+        fields["first"] = whole_number("first", fields.get("first", 0), least=0)
+        fields["period"] = whole_number("period", fields.get("period", 1), least=1)
         super().__init__(part=as_part(part), **fields)
 
     def acts(self, situation: Situation) -> Acts:
         """Let it act, in its episodes."""
-        since = situation.episode - self.first
-        ended = self.stop is not None and situation.episode >= self.stop
-        if since < 0 or since % self.period or ended:
-            return {}
-        return self.part.acts(situation)
+        return self.part.acts(situation) if self._includes(situation.episode) else {}
+
+    def _includes(self, episode: int) -> bool:
+        since = episode - self.first
+        ended = self.stop is not None and episode >= self.stop
+        return since >= 0 and not since % self.period and not ended
+
+    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
+        """List it, and what acts in its episodes if this is one."""
+        yield self
+        if self._includes(episode):
+            yield from self.part.live(memory, episode)
 
 
 def at_reset(part: Any) -> AtStep:
-    """Act at the beginning of every episode; so does what has no time of its own."""
+    """Act at the beginning of every episode; so does what has no time of its own.
+
+    Args:
+        part: What acts: a part, or an intervention.
+
+    Raises:
+        UnknownOption: It is neither.
+
+    Example:
+        >>> at_reset({"floor_friction": 0.4}).step
+        0
+    """
     return AtStep(0, part)
 
 
 def at_step(step: int, part: Any) -> AtStep:
-    """Act after so many control steps of every episode."""
+    """Act after so many control steps of every episode.
+
+    Args:
+        step: How many; 0 is the reset.
+        part: What acts: a part, or an intervention. A part of it with a time of its own has
+            that one.
+
+    Raises:
+        UnknownOption: The number is none, or the part.
+    """
     return AtStep(step, part)
 
 
 def every(steps: int, part: Any, *, first: int = 0) -> Every:
-    """Act every so many control steps, beginning at the step ``first``."""
+    """Act again and again within every episode.
+
+    Args:
+        steps: Control steps from one time to the next.
+        part: What acts: a part, or an intervention.
+        first: The first control step at which it acts; 0 is the reset.
+
+    Raises:
+        UnknownOption: A number is none, or the part.
+    """
     return Every(steps, part, first=first)
 
 
 def during(episodes: range, part: Any) -> During:
-    """Act in a range of episodes; its step is the period.
+    """Act in some episodes only; they count from 0.
+
+    Args:
+        episodes: The range of them; its step is the period.
+        part: What acts: a part, or an intervention.
+
+    Raises:
+        UnknownOption: It is no range of whole numbers that are not negative, or no part.
 
     Example:
         >>> during(range(10, 20, 5), {"floor_friction": 0.4}).period

@@ -7,13 +7,14 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
+from numpy.typing import NDArray
 
-from scm_world.curricula.choices import Stages
+from scm_world.curricula.choices import count
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.situations import Memory
-from scm_world.curricula.wrapper import CurriculumEnv
-from scm_world.errors import UnknownOption
+from scm_world.curricula.wrapper import CurriculumEnv, place
+from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.world.start import whole_number
 
 MODES = ("sync", "async")
@@ -35,7 +36,7 @@ def make_vec(
         num_envs: How many.
         curriculum: What is done in each of them; see ``CurriculumEnv``.
         vectorization_mode: ``"sync"``: in this process; ``"async"``: each in one of its own.
-        autoreset_mode: As in Gymnasium.
+        autoreset_mode: When a member that is done begins anew, as in Gymnasium.
         options: Of the environments.
 
     Raises:
@@ -49,11 +50,11 @@ def make_vec(
     """
     if vectorization_mode not in MODES:
         raise UnknownOption("vectorization_mode", vectorization_mode, MODES)
-    count = whole_number("num_envs", num_envs, least=1)
+    n = whole_number("num_envs", num_envs, least=1)
     made = as_curriculum(curriculum)
     one = partial(_one, env_id, made, options)
     kind: Any = SyncVectorEnv if vectorization_mode == "sync" else AsyncVectorEnv
-    return CurriculumVectorEnv(kind([one] * count, autoreset_mode=autoreset_mode), made)
+    return CurriculumVectorEnv(kind([one] * n, autoreset_mode=autoreset_mode), made)
 
 
 def _one(env_id: str, curriculum: Curriculum, options: dict[str, Any]) -> CurriculumEnv:
@@ -67,8 +68,9 @@ class CurriculumVectorEnv(VectorWrapper):
     Episode numbers are handed out in the order in which episodes begin, within one step in the
     order of the environments; so ``during(range(1_000), …)`` means a thousand episodes of
     training, however many environments there are. A stage that is reached holds in each of them
-    from its next episode on. In the autoreset mode ``SAME_STEP`` an episode begins in the step that
-    ends the last one: then its number was handed out when that one began.
+    from its next episode on. In the autoreset mode ``SAME_STEP`` an episode begins in the very
+    step that ends the last one, before that is known here: its number was handed out when that
+    one began, and its stage is the one of before.
 
     Args:
         env: A vector environment whose members are each in a ``CurriculumEnv``.
@@ -78,30 +80,58 @@ class CurriculumVectorEnv(VectorWrapper):
         UnknownOption: A member is in no ``CurriculumEnv``.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], curriculum: Any) -> None:
+    def __init__(self, env: Any, curriculum: Any) -> None:
         super().__init__(env)
         self.curriculum = as_curriculum(curriculum)
         self.memory = Memory()
-        self._stages = [p for p in self.curriculum.part.walk() if isinstance(p, Stages)]
+        self._members = env  # Gymnasium declares get_attr for its own kinds only
         try:
-            env.get_attr("memory")  # type: ignore[attr-defined]
+            self._members.get_attr("turn")
         except AttributeError:
             allowed = ("members in a CurriculumEnv; make_vec makes them",)
             raise UnknownOption("vector environment", type(env).__name__, allowed) from None
-        mode = env.metadata.get("autoreset_mode")
-        self._ahead = mode is AutoresetMode.SAME_STEP
+        self._ahead = env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
+        self._again: list[int] = []
+        self._forget()
+
+    def _forget(self) -> None:
+        """Know of no episode."""
+        self._present: list[int | None] = [None] * self.num_envs
+        self._waiting: list[int | None] = [None] * self.num_envs
+        self._stepped = np.zeros(self.num_envs, bool)
+        self._success = np.zeros(self.num_envs, bool)
 
     def state(self) -> dict[str, Any]:
-        """Give what decides how the curriculum goes on, as plain data."""
-        return self.memory.as_dict()
+        """Give what decides how the curriculum goes on, as plain data.
+
+        Episodes that are not over begin again.
+        """
+        numbers = (*self._present, *self._waiting, *self._again)
+        again = sorted({number for number in numbers if number is not None})
+        places = [None if where is None else [*where] for where in self._members.get_attr("where")]
+        return {**self.memory.as_dict(), "again": again, "noises": places}
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Go on where ``state`` was taken, with the next reset.
+        """Go on where ``state`` was taken, with the next reset of all members.
+
+        Args:
+            state: What ``state`` gave, of as many environments.
 
         Raises:
-            UnreadableFile: It is none.
+            UnreadableFile: It is something else.
         """
-        self.memory = Memory.from_dict(state)
+        memory = Memory.from_dict(state)
+        try:
+            again = [whole_number("episode", number, least=0) for number in state["again"]]
+            places = [place(noise) for noise in state["noises"]]
+            if len(places) != self.num_envs:
+                raise ValueError(f"it is of {len(places)} environments")
+        except (KeyError, TypeError, ValueError) as error:
+            advice = f"give what state() gave, of {self.num_envs} environments"
+            raise UnreadableFile("the state of a curriculum", repr(error), advice) from None
+        self._members.set_attr("where", places)
+        self.memory, self._again = memory, again
+        self._forget()
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -109,30 +139,62 @@ class CurriculumVectorEnv(VectorWrapper):
         """Begin an episode in all of them, or in those of ``options["reset_mask"]``."""
         mask = (options or {}).get("reset_mask")
         begun = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool)
+        for index in np.flatnonzero(begun):
+            self._ended(index, counts=bool(self._stepped[index]))
         self._hand_out(begun)
         found = self.env.reset(seed=seed, options=options)
-        if self._ahead:
-            self._hand_out(begun)
+        self._begin(begun)
         return found
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance all of them one control step."""
+        waited = np.array([number is not None for number in self._waiting])
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         ended = np.logical_or(terminated, truncated)
+        if not self._ahead and waited.any():
+            self._begin(waited)
+        self._stepped |= self._ahead | ~waited
+        present = info["is_success"]
+        final = info["final_info"]["is_success"] if "final_info" in info else present
+        self._success = np.where(ended, final, present).astype(bool)
         if ended.any():
-            final = info.get("final_info", info)
+            levels = self._levels()
             for index in np.flatnonzero(ended):
-                success = bool(final["is_success"][index])
-                for part in self._stages:
-                    part.ended(self.memory, success=success)
-            self._hand_out(ended)
+                self._ended(index)
+            if self._ahead:
+                self._begin(ended)
+                if levels != self._levels():
+                    self._hand_out(np.ones(self.num_envs, bool))
+            else:
+                self._hand_out(ended)
         return observations, rewards, terminated, truncated, info
 
-    def _hand_out(self, which: Any) -> None:
-        """Give the next numbers to some environments, for their next episodes."""
+    def _levels(self) -> dict[str, int]:
+        return {key: kept.level for key, kept in self.memory.stages.items()}
+
+    def _ended(self, index: Any, *, counts: bool = True) -> None:
+        """Take into account how the present episode of a member ended."""
+        number, self._present[index] = self._present[index], None
+        if number is not None and counts:
+            live = self.curriculum.part.live(self.memory, number)
+            count(live, self.memory, success=bool(self._success[index]))
+
+    def _begin(self, which: NDArray[np.bool_]) -> None:
+        """Note which members have begun their next episode."""
+        for index in np.flatnonzero(which):
+            self._present[index], self._waiting[index] = self._waiting[index], None
+            self._stepped[index] = self._success[index] = False
+        if self._ahead:
+            self._hand_out(which)
+
+    def _hand_out(self, which: NDArray[np.bool_]) -> None:
+        """Tell some members the number of their next episode, and the stages."""
         turns: list[Any] = [None] * self.num_envs
         for index in np.flatnonzero(which):
-            stages = Memory.from_dict(self.memory.as_dict()).stages
-            turns[index] = (self.memory.episode, Memory(self.memory.episode, stages))
-            self.memory.episode += 1
-        self.env.set_attr("turn", turns)  # type: ignore[attr-defined]
+            number = self._waiting[index]
+            if number is None:
+                number = self._again.pop(0) if self._again else self.memory.episode
+                self.memory.episode += number == self.memory.episode
+            self._waiting[index] = number
+            turns[index] = (number, Memory.from_dict(self.memory.as_dict()))
+        self._members.set_attr("turn", turns)

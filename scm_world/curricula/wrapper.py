@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, final
 
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from scm_world.curricula.curriculum import Curriculum, Turn, as_curriculum
+from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.situations import Memory
+from scm_world.curricula.turns import Turn
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
+from scm_world.graph import flatten
+from scm_world.world.start import whole_number
 
 
 def environment(env: Any, wrapper: str) -> ScmWorldEnv:
     """Give the environment of this package inside of wrappers.
+
+    Args:
+        env: In any wrappers.
+        wrapper: Who asks, for the error.
 
     Raises:
         UnknownOption: There is another one.
@@ -32,15 +40,20 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     What the caller of ``reset`` asks for in ``options["do"]`` counts more than the curriculum. All
     draws come from noises of their own, so that another part of a curriculum changes none of them.
     Observation and info are those after the interventions; an intervention is no progress, so it
-    gives no reward.
+    gives no reward, and the terms of the reward are those of the step. A reset that is refused is
+    no episode: the next one has its number.
 
     Args:
-        env: Of this package, in any wrappers that do not change what ``do`` means.
+        env: Of this package, in any wrappers that do not change what ``do`` means. Of those that
+            change observations, an ``ObservationWrapper`` may be inside; one that remembers
+            earlier observations belongs around this one.
         curriculum: A ``Curriculum``, a part of one, plain data, or an intervention.
 
     Raises:
-        UnknownOption: It is no environment of this package, or no curriculum.
-        InterventionError: The curriculum names something that does not exist.
+        UnknownOption: It is no environment of this package, or no curriculum; or a wrapper inside
+            would not know of interventions.
+        InterventionError: The curriculum names something that does not exist. Where bodies come
+            and go, that is said at a reset.
 
     Example:
         >>> from scm_world.curricula import goals
@@ -53,14 +66,32 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Any) -> None:
         made = as_curriculum(curriculum)
-        RecordConstructorArgs.__init__(self, curriculum=made)
+        RecordConstructorArgs.__init__(self, curriculum=_plain(made))
         super().__init__(env)
         self._inner = environment(env, "CurriculumEnv")
-        made.check(self._inner.world)
+        _refuse_forgetful(self._layers())
+        self._checked = self._check(made)
         self._turn = Turn(made)
-        self._running = False
-        self._success = False
+        self._begun = self._running = self._stepped = self._success = False
         self._next: tuple[int, Memory] | None = None
+        self._place: tuple[int, int] | None = None
+
+    def _check(self, curriculum: Curriculum) -> bool:
+        """Look for what is wrong; tell whether all names are known already."""
+        try:
+            curriculum.check(self._inner.world)
+        except UnknownVariable:
+            if not len(self._inner.world.family.head):
+                raise
+            return False
+        return True
+
+    def _layers(self) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
+        """List the wrappers inside of this one, from the outermost on."""
+        env: Any = self.env
+        while isinstance(env, gymnasium.Wrapper):
+            yield env
+            env = env.env
 
     @property
     def curriculum(self) -> Curriculum:
@@ -72,18 +103,41 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """How many episodes there were, and how far the learner has come."""
         return self._turn.memory
 
+    @property
+    def where(self) -> tuple[int, int] | None:
+        """Seed and episode, within the noise, of the next episode; of the present one in mid-way.
+
+        None before the first reset.
+        """
+        world = self._inner.world
+        if self._place is not None or not self._begun:
+            return self._place
+        return world.noise.seed, world.episode + (not self._running)
+
+    @where.setter
+    def where(self, where: tuple[int, int] | None) -> None:
+        self._place, self._running = where, False
+
     def state(self) -> dict[str, Any]:
-        """Give what decides how the curriculum goes on, as plain data."""
-        return self.memory.as_dict()
+        """Give what decides how the curriculum goes on, as plain data.
+
+        An episode that is not over begins again.
+        """
+        return {**self.memory.as_dict(), "noise": None if self.where is None else [*self.where]}
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Go on where ``state`` was taken, with the next reset.
+        """Go on where ``state`` was taken, with the next reset, in any process.
+
+        A seed, or an episode, that the reset is given counts more than that of the state.
+
+        Args:
+            state: What ``state`` gave.
 
         Raises:
-            UnreadableFile: It is none.
+            UnreadableFile: It is something else.
         """
-        self._turn.memory = Memory.from_dict(state)
-        self._running = False
+        memory, where = Memory.from_dict(state), place(state.get("noise"))
+        self._turn.memory, self.where = memory, where
 
     @property
     def turn(self) -> tuple[int, Memory] | None:
@@ -99,50 +153,96 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode, with what is due.
 
+        Args:
+            seed: Of the noise.
+            options: As without this wrapper; what ``"do"`` sets, the curriculum leaves alone.
+
         Raises:
             InterventionError: An intervention was refused.
         """
-        self._count()
-        observation, info = self.env.reset(seed=seed, options=options)
-        if self._turn.begin(self._inner):
-            asked = (options or {}).get("do")
-            if asked:
-                self._inner.do(asked)
-            observation, info = self._seen(observation, info)
-        return observation, info
-
-    def _count(self) -> None:
-        """Count the episode that ends, unless somebody else does."""
+        self._close()
         if self._next is not None:
             episode, memory = self._next
-            self._turn.memory, self._next = memory, None
-            self._turn.memory.episode = episode
-        elif self._running:
+            self._turn.memory = Memory(episode, memory.stages)
+        if self._place is not None and seed is None:
+            seed, number = self._place
+            options = {"episode": number, **(options or {})}
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._next = self._place = None
+        self._begun = True
+        if not self._checked:
+            self.curriculum.check(self._inner.world)
+            self._checked = True
+        if self._turn.begin(self._inner, besides=flatten((options or {}).get("do") or {})):
+            observation, info = self._seen(info)
+        self._running = True
+        return observation, info
+
+    def _close(self) -> None:
+        """Count the episode that ends."""
+        if self._running and self._stepped:
             self._turn.ended(success=self._success)
-        self._running, self._success = True, False
+        elif self._running:
+            self.memory.episode += 1
+        self._running = self._stepped = self._success = False
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step, then do what is due.
 
         Raises:
-            InterventionError: An intervention was refused.
+            InterventionError: An intervention was refused; the control step is over.
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._success = bool(info["is_success"])
-        if not (terminated or truncated) and self._turn.step(self._inner):
-            observation, info = self._seen(observation, info)
+        self._stepped, self._success = True, bool(info["is_success"])
+        if terminated or truncated:
+            self._close()
+        elif self._turn.step(self._inner):
+            terms = info["reward_terms"]  # of the step: an intervention earns nothing
+            observation, info = self._seen(info)
+            info["reward_terms"] = terms
         return observation, reward, terminated, truncated, info
 
-    def _seen(self, observation: Any, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    def _seen(self, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Look again, through the wrappers inside of this one."""
         seen, known = self._inner.present()
-        env = self.env
-        layers = []
-        while env is not self._inner:
-            layers.append(env)
-            env = env.env  # type: ignore[attr-defined]
-        for layer in reversed(layers):
-            change = getattr(layer, "observation", None)
-            if isinstance(layer, gymnasium.ObservationWrapper) and change is not None:
-                seen = change(seen)
+        for layer in reversed([*self._layers()]):
+            if isinstance(layer, gymnasium.ObservationWrapper):
+                seen = layer.observation(seen)
         return seen, {**info, **known}
+
+
+def place(given: Any) -> tuple[int, int] | None:
+    """Read a seed and an episode.
+
+    Raises:
+        UnreadableFile: It is something else.
+    """
+    if given is None:
+        return None
+    try:
+        seed, episode = given
+        return whole_number("seed", seed, least=0), whole_number("episode", episode, least=0)
+    except (TypeError, ValueError) as error:
+        advice = "give what state() gave"
+        raise UnreadableFile("the state of a curriculum", repr(error), advice) from None
+
+
+def _plain(curriculum: Curriculum) -> Any:
+    """Give plain data from which it can be made, so that a specification can be written down."""
+    try:
+        data = curriculum.as_dict()
+        Curriculum.from_dict(data)
+    except ModelError:  # it calls a function of the user's
+        return curriculum
+    return data
+
+
+def _refuse_forgetful(layers: Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]) -> None:
+    """Refuse wrappers inside whose observations cannot be made again after an intervention."""
+    for layer in layers:
+        if isinstance(layer, gymnasium.ObservationWrapper):
+            continue
+        if layer.observation_space != layer.env.observation_space:
+            name = type(layer).__name__
+            allowed = (f"ObservationWrapper; put {name} around the curriculum",)
+            raise UnknownOption("wrapper inside of CurriculumEnv", name, allowed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +11,14 @@ from typing import Any, final
 import numpy as np
 
 from scm_world.errors import SnapshotMismatch, UnknownOption
-from scm_world.evaluation.arena import METRICS, Arena
+from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.policies import Player, as_player, player_from
 from scm_world.evaluation.protocols import Protocol
-from scm_world.evaluation.results import KEYS, Evaluation
-from scm_world.evaluation.setups import Place, Seat, Setup, Shard
+from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.seats import Seat, listed
+from scm_world.evaluation.setups import Place, Setup, Shard
+from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.tasks import TASKS
@@ -108,10 +111,10 @@ def _given(policy: Any, agents: Sequence[Mapping[str, Any]]) -> dict[tuple[str, 
         if len(names) > 1:
             raise UnknownOption("policy", policy, (f"one by the name of each of {names}",))
         policy = {names[0]: policy}
-    found: dict[tuple[str, int], Any] = {}
-    for name, runs in policy.items():
-        listed = runs if isinstance(runs, list) else [runs]
-        found |= {(name, run): one for run, one in enumerate(listed)}
+    known = {(one["agent"], one["run"]) for one in agents}
+    found = {(str(agent), run): one for agent, run, one in listed(policy)}
+    for agent, run in found.keys() - known:
+        raise UnknownOption("policy", f"{agent}, run {run}", [f"{a}, run {r}" for a, r in known])
     return found
 
 
@@ -171,12 +174,21 @@ def _compared(bench: Bench, evaluation: Evaluation, place: int) -> list[str]:
     seat, protocol = seats.index((row["agent"], row["run"])), names.index(row["protocol"])
     episode = row["episode"]
     shard = Shard(seat, row["engine"], protocol, row["seed"], episode, episode + 1)
-    again = bench.play(shard, episode)
+    found = Evaluation.of({}, [bench.play(shard, episode)])
+    again = {name: column[0].item() for name, column in found.columns.items()}
     where = ", ".join(f"{key} {row[key]}" for key in KEYS)
-    if again.hash != row["hash"]:
-        return [f"{where}: other states or actions"]
+    if again["hash"] != row["hash"]:
+        noisy = setup.seats[seat].about.get("repeats") == "no"
+        why = "; the policy gives two actions for one observation" if noisy else ""
+        return [f"{where}: other states or actions{why}"]
     return [
-        f"{where}: {metric} is {again.scores[metric]!r}, not {row[metric]!r}"
-        for metric in METRICS
-        if again.scores[metric] != row[metric]
+        f"{where}: {name} is {again.get(name)!r}, not {value!r}"
+        for name, value in row.items()
+        if not _same(again.get(name, math.nan), value)
     ]
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Compare two entries of a table; NaN says in both that a variable was not drawn."""
+    absent = [isinstance(value, float) and math.isnan(value) for value in (one, other)]
+    return all(absent) or bool(one == other)

@@ -13,10 +13,10 @@ import numpy as np
 from scm_world.curricula import Memory, Turn
 from scm_world.curricula.choices import Stages
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption
+from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
 from scm_world.evaluation.policies import Player
 from scm_world.evaluation.protocols import Protocol
-from scm_world.variables import Null
+from scm_world.variables import Null, Subset
 
 LAST = 20
 """Control steps over which the end of an episode is averaged."""
@@ -101,15 +101,21 @@ def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
     """Prepare a protocol for an environment.
 
     Raises:
-        UnknownOption: It depends on what happened in other episodes.
+        UnknownOption: It depends on what happened in other episodes, or acts after their end.
         EvaluationError: It names something that does not exist, or a region that is impossible.
     """
+    if protocol.step >= env.world.max_episode_length:
+        allowed = (f"control steps from 0 to {env.world.max_episode_length - 1}",)
+        raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
     if any(isinstance(part, Stages) for part in protocol.part.walk()):
         allowed = ("parts without stages: an episode must not depend on others",)
         raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
     turn = Turn(protocol.curriculum())
     try:
         turn.curriculum.check(env.world)
+        if isinstance(protocol.space, Subset) and not env.world.family.head:
+            for pattern in protocol.space.unused(env.world.model):
+                raise UnknownVariable(pattern, env.world.model)
     except ScmWorldError as error:
         place = {"protocol": protocol.name, "task": env.world.task.name}
         raise EvaluationError(place, str(error)) from error
@@ -161,10 +167,7 @@ class Arena:
             "episode": episode,
         }
         with _placed(place, env):
-            turn = self._turn(protocol)
-            observation, info = env.reset(seed=seed, options={"episode": episode})
-            if turn.begin(env, episode):
-                observation, info = env.present()
+            turn, observation = self.begin(protocol, seed=seed, episode=episode)
             drawn = _drawn(env, 0)
             player.begin(env)
             mark = Fingerprint(env)
@@ -177,7 +180,7 @@ class Arena:
                 mark.act(action)
                 observation, reward, _, truncated, info = env.step(action)
                 fractions.append(info["fractional_success"])
-                total += reward
+                total += float(reward)
                 if not truncated and turn.step(env):
                     observation, info = env.present()
                     drawn |= _drawn(env, env.world.index)
@@ -188,6 +191,36 @@ class Arena:
         return Row(
             *who, engine, protocol.name, seed, episode, len(fractions), scores, drawn, str(mark)
         )
+
+    def try_out(self, protocol: Protocol, *, seed: int) -> None:
+        """See whether a protocol fits: begin the first episode with it.
+
+        Raises:
+            UnknownOption: It depends on what happened in other episodes, or acts after their end.
+            EvaluationError: What it does is impossible, with the place.
+        """
+        self._turn(protocol)
+        place = {"engine": self.env.world.backend.name, "protocol": protocol.name}
+        with _placed({**place, "seed": seed, "episode": 0}, self.env):
+            self.begin(protocol, seed=seed, episode=0)
+
+    def begin(self, protocol: Protocol, *, seed: int, episode: int) -> tuple[Turn, Any]:
+        """Begin an episode, with what a protocol does at its reset.
+
+        Returns:
+            What acts within the episode, and the observation.
+
+        Raises:
+            UnknownOption: The protocol does not fit; see ``turn_of``.
+            EvaluationError: It names something that does not exist, or a region that is
+                impossible.
+            InterventionError: What it does was refused.
+        """
+        turn = self._turn(protocol)
+        observation, _ = self.env.reset(seed=seed, options={"episode": episode})
+        if turn.begin(self.env, episode):
+            observation = self.env.observe()
+        return turn, observation
 
     def _turn(self, protocol: Protocol) -> Turn:
         kept, found = self._turns.get(protocol.name, (None, None))

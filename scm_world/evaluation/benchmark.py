@@ -11,7 +11,7 @@ Source:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 from scm_world.curricula import together
@@ -35,6 +35,7 @@ class Roles:
         tool: Where it begins.
         goal: Where it should be. None: the goals are a shape that the task draws.
         kept: Causes of the shape that are not varied with it.
+        words: What the parts are called, where that is not what they are mostly called.
     """
 
     mass: str
@@ -42,7 +43,11 @@ class Roles:
     tool: str
     goal: str | None
     kept: tuple[str, ...] = ()
+    words: Mapping[str, str] = field(default_factory=dict)
 
+
+WORDS = {"mass": "mass", "size": "size", "tool": "start", "goal": "goal", "friction": "friction"}
+"""What the parts are mostly called."""
 
 _WALL = Roles(
     "blocks_mass",
@@ -64,6 +69,7 @@ ROLES: Mapping[str, Roles] = {
         "number_of_obstacles",
         "joint_positions",
         "goal_*.cylindrical_position",
+        words={"mass": "masses of the fingers", "size": "obstacles", "tool": "joints"},
     ),
     "pushing": _BLOCK,
     "picking": _BLOCK,
@@ -106,8 +112,6 @@ ROWS: tuple[tuple[str, str, SpaceName], ...] = (
 REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
 """Reaching has one more."""
 
-WORDS = {"mass": "mass", "size": "size", "tool": "start", "goal": "goal", "friction": "friction"}
-
 
 def protocols_of(task: str) -> tuple[Protocol, ...]:
     """Give the protocols of a task.
@@ -135,11 +139,12 @@ def protocols_of(task: str) -> tuple[Protocol, ...]:
 def _protocol(roles: Roles, name: str, what: str, space: SpaceName) -> Protocol:
     words = what.split()
     if not words:
-        return Protocol(name, doc="the default task")
+        return Protocol(name, space=space, doc="the default task")
     if words == ["all"]:
         act = Resample("@published", space=space, exclusive=True)
         return Protocol(name, space=space, act=act, doc=f"everything from {space}")
-    doc = f"{', '.join(WORDS[word] for word in words)} from {space}"
+    called = {**WORDS, **roles.words}
+    doc = f"{', '.join(called[word] for word in words)} from {space}"
     named = [FRICTION if w == "friction" else getattr(roles, w) for w in words]
     if None not in named:
         return Protocol(name, named, space, doc=doc)

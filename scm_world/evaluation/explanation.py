@@ -10,6 +10,7 @@ import numpy as np
 
 from scm_world.curricula.parts import Acts, AnyPart, Part
 from scm_world.curricula.situations import Situation
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.again import bench_of
 from scm_world.evaluation.arena import Arena, Row
@@ -17,10 +18,12 @@ from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.evaluation.setups import Shard
+from scm_world.evaluation.tables import known
 from scm_world.queries.progress import Progress
 from scm_world.variables import Draw
 
 VERSUS = ("A", "default")
+SAME = "it would have been the same"
 
 
 @final
@@ -163,6 +166,7 @@ def why(
     one = evaluation.only(**where, episode=episode)
     if versus not in (None, *VERSUS):
         raise UnknownOption("versus", versus, VERSUS)
+    known(metric)
     bench = bench_of(evaluation, policy=policy, trusted=trusted)
     try:
         setup = bench.setup
@@ -191,24 +195,46 @@ def _others(
         raise UnknownOption("episode", f"{row.protocol}, {row.episode}", allowed)
     arena = bench.arena(shard.engine)
     where: Any = {"seed": shard.seed, "episode": row.episode, "who": (row.agent, row.run)}
+    usual = _natural(arena, shard, row)
+    against: dict[str, Any] = {n: versus or _versus(arena, usual, n, row) for n in row.drawn}
     found, left_out = [], {}
-    for done, name in enumerate(row.drawn):
-        usual = _natural(arena, shard, row)
-        how: Any = versus or _versus(arena, usual, name, row)
+    for done, (name, how) in enumerate(against.items()):
         part = Instead(of=protocol.part, name=name, versus=how)
         other = Protocol(f"{protocol.name} without {name}", act=part)
+        look = _Look(name, protocol.step)
         try:
-            then = arena.play(bench.player(shard.seat), other, **where)
+            then = arena.play(bench.player(shard.seat), other, **where, watch=look)
         except EvaluationError as error:
             left_out[name] = error.reason
         else:
-            value = then.drawn.get(name, np.ravel(usual[name]).astype(float).tolist())
             scores = row.scores[metric], then.scores[metric], bool(then.scores["success"])
-            found.append(Otherwise(name, tuple(row.drawn[name]), tuple(value), *scores))
+            found.append(Otherwise(name, tuple(row.drawn[name]), look.value, *scores))
+            if found[-1].was == found[-1].would_be:
+                left_out[found.pop().variable] = SAME
         if progress is not None:
             progress(done + 1, len(row.drawn))
     best_first = tuple(sorted(found, key=lambda one: -one.gain))
     return Explanation(row.scores[metric], best_first, left_out)
+
+
+@dataclass
+class _Look:
+    """Looks at a variable at one control step.
+
+    Attributes:
+        name: Of the variable.
+        step: The control step.
+        value: What it was; empty if it did not exist.
+    """
+
+    name: str
+    step: int
+    value: tuple[float, ...] = ()
+
+    def __call__(self, env: ScmWorldEnv) -> None:
+        world = env.world
+        if world.index == self.step and self.name in world.model:
+            self.value = tuple(np.ravel(world[self.name]).astype(float).tolist())
 
 
 def _natural(arena: Arena, shard: Shard, row: Row) -> dict[str, Any]:

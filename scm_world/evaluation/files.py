@@ -13,13 +13,17 @@ import numpy as np
 
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.arena import METRICS
-from scm_world.evaluation.results import KEYS, TEXTS, WHOLE, Columns, Evaluation, merged_rows
+from scm_world.evaluation.parts import made
+from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.seats import what_it_is
+from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
 from scm_world.graph.exchange.libraries import load as load_library
 from scm_world.output.durable import write_durably, write_whole
 
 FORMAT = "scm_world/evaluation/1"
 RESULTS = "results.json"
 TABLE = "episodes"
+ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
 
 
@@ -27,7 +31,7 @@ def save(evaluation: Evaluation, folder: Path, form: str) -> tuple[Path, Path]:
     """Write the table, then the summary that names it; see ``Evaluation.save``."""
     if form not in CODECS:
         raise UnknownOption("format", form, CODECS)
-    folder.mkdir(parents=True, exist_ok=True)
+    made(folder)
     table, summary = folder / f"{TABLE}.{form}", folder / RESULTS
     write_durably(table, CODECS[form][0](evaluation.columns))
     data = {
@@ -66,12 +70,14 @@ def load(path: Path) -> Evaluation:
         data = json.loads(file.read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
             raise ValueError("it is no evaluation")
+        for name in ABOUT:
+            data["about"][name]
         table = file.parent / Path(data["table"]["file"]).name
         decode = CODECS[table.suffix.removeprefix(".")][1]
         found = Evaluation(data["about"], decode(table.read_bytes()))
         if found.digest != data["table"]["digest"]:
             raise ValueError(f"{table.name} is not the table that was written with it")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UnreadableFile(str(file), _said(error), ADVICE) from None
     return found
 
@@ -94,7 +100,7 @@ def merge(evaluations: Iterable[Evaluation]) -> Evaluation:
         raise ModelError(["there is no evaluation to merge"])
     problems = [why for other in listed[1:] for why in _differences(listed[0], other)]
     problems += _clashes(listed)
-    columns = merged_rows(listed)
+    columns = joined(evaluation.columns for evaluation in listed)
     identity = list(zip(*(columns[key].tolist() for key in KEYS), strict=True))
     first: dict[Any, int] = {}
     for place, who in enumerate(identity):
@@ -131,7 +137,10 @@ def _clashes(listed: Sequence[Evaluation]) -> list[str]:
     found = []
     for evaluation in listed:
         named = [(("protocol", p["name"]), p) for p in evaluation.about["protocols"]]
-        named += [((f"agent {a['agent']}", a["run"]), a) for a in evaluation.about["agents"]]
+        named += [
+            ((f"agent {one['agent']}, run", one["run"]), what_it_is(one["policy"]))
+            for one in evaluation.about["agents"]
+        ]
         for key, content in named:
             if known.setdefault(key, content) != content:
                 found.append(f"{key[0]} {key[1]} is not the same in two of them")
@@ -155,9 +164,9 @@ def _about(listed: Sequence[Evaluation]) -> dict[str, Any]:
 def _to_parquet(columns: Columns) -> bytes:
     arrow = load_library("pyarrow", "pyarrow", "data")
     parquet = load_library("pyarrow.parquet", "pyarrow", "data")
-    made = arrow.table({n: arrow.array(c, from_pandas=False) for n, c in columns.items()})
+    table = arrow.table({n: arrow.array(c, from_pandas=False) for n, c in columns.items()})
     sink = arrow.BufferOutputStream()
-    parquet.write_table(made, sink, compression="zstd", use_dictionary=list(TEXTS))
+    parquet.write_table(table, sink, compression="zstd", use_dictionary=list(TEXTS))
     return bytes(sink.getvalue())
 
 
@@ -165,10 +174,10 @@ def _from_parquet(data: bytes) -> Columns:
     arrow = load_library("pyarrow", "pyarrow", "data")
     parquet = load_library("pyarrow.parquet", "pyarrow", "data")
     try:
-        table = parquet.read_table(arrow.BufferReader(data))
+        table = parquet.read_table(arrow.BufferReader(data), use_threads=False)
     except (arrow.ArrowException, OSError) as error:
         raise ValueError(f"the table is no whole Parquet file ({error})") from None
-    return _typed({name: table[name].to_pylist() for name in table.column_names})
+    return _typed({name: table[name].to_numpy() for name in table.column_names})
 
 
 def _to_csv(columns: Columns) -> bytes:
@@ -184,11 +193,14 @@ def _word(value: Any) -> str:
 
 
 def _from_csv(data: bytes) -> Columns:
-    head, *rows = list(csv.reader(io.StringIO(data.decode(), newline="")))
+    try:
+        head, *rows = list(csv.reader(io.StringIO(data.decode(), newline="")))
+    except csv.Error as error:
+        raise ValueError(f"the table is no CSV ({error})") from None
     return _typed(dict(zip(head, zip(*rows, strict=True), strict=True)))
 
 
-def _typed(columns: Mapping[str, Sequence[Any]]) -> Columns:
+def _typed(columns: Mapping[str, Any]) -> Columns:
     """Give columns the types that they had."""
     missing = [name for name in (*KEYS, "steps", *METRICS, "hash") if name not in columns]
     if missing:

@@ -9,12 +9,25 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from scm_world.errors import UnreadableFile
+from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation.arena import Row
 from scm_world.output.durable import write_whole
 
 FORMAT = "scm_world/evaluation-part/1"
 FOLDER = "parts"
+
+
+def made(folder: Path) -> Path:
+    """Make a folder, if there is none.
+
+    Raises:
+        UnwritableFolder: There is no permission, or a file in its place.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnwritableFolder(str(folder), error.strerror or str(error)) from None
+    return folder
 
 
 def part_path(folder: Path, key: str) -> Path:
@@ -34,7 +47,7 @@ def write_part(folder: Path, key: str, rows: Sequence[Row]) -> None:
         UnwritableFolder: There is no room, or no permission.
     """
     path = part_path(folder, key)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    made(path.parent)
     plain = [asdict(row) for row in rows]
     text = json.dumps({"format": FORMAT, "key": key, "sum": _sum(plain), "rows": plain})
     write_whole(text + "\n", path)

@@ -18,6 +18,7 @@ from scm_world.output.durable import locked
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.work.pool import Pool
+from scm_world.work.processes import pickled
 
 
 @final
@@ -177,8 +178,13 @@ def _bench(
 ) -> Iterator[Pool[Shard, list[Row]]]:
     """Open a pool of processes, or work in this one."""
     inline = workers == 1
+    if not inline:
+        for seat in setup.seats:
+            pickled(f"policy {seat.agent!r} with several workers", seat.policy)
     bench = Bench(setup, trusted)
     make = (lambda: bench) if inline else partial(Bench, setup, trusted)
-    with Pool(make, workers, inline=inline) as pool:
-        yield pool
-    bench.close()
+    try:
+        with Pool(make, workers, inline=inline) as pool:
+            yield pool
+    finally:
+        bench.close()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, final
@@ -11,12 +9,13 @@ from typing import Any, final
 from pydantic import ValidationError
 
 from scm_world.curricula import Curriculum, as_curriculum, at_step
+from scm_world.curricula.base import words
 from scm_world.curricula.parts import AnyPart, Part, Resample, as_part
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.queries.plans import PACKAGE
-from scm_world.variables import Subset
+from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.spaces import Frozen, Space
+from scm_world.variables.spaces import Frozen
 from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/protocol/1"
@@ -44,18 +43,20 @@ class Protocol(Frozen):
 
     name: str
     varies: tuple[str, ...] = ()
-    space: SpaceName | Subset | Space = "A"
+    space: SpaceName | Subset | Distribution = "A"
     step: int = 0
     act: AnyPart | None = None
     doc: str = ""
 
     def __init__(self, name: str, varies: Any = (), space: Any = "A", **fields: Any) -> None:
-        several = (varies,) if isinstance(varies, str) else tuple(varies)
-        if not isinstance(name, str) or not name or any(c in name for c in "/\\,\0"):
-            allowed = ("a text without slashes and commas",)
-            raise UnknownOption("name of a protocol", name, allowed)
-        if isinstance(space, str) and space not in SPACES:
-            raise UnknownOption(f"space of protocol {name}", space, SPACES)
+        named("name of a protocol", name)
+        if not isinstance(varies, Iterable):
+            names = ("names and patterns of variables",)
+            raise UnknownOption(f"varies of protocol {name}", varies, names)
+        several = words(f"varies of protocol {name}", varies)
+        if not (isinstance(space, Frozen | dict) or (isinstance(space, str) and space in SPACES)):
+            allowed = (*SPACES, "a Subset", "a distribution")
+            raise UnknownOption(f"space of protocol {name}", space, allowed)
         act = fields.pop("act", None)
         if act is not None and several:
             raise UnknownOption(f"varies of protocol {name}", varies, ("nothing, beside act",))
@@ -114,11 +115,17 @@ class Protocol(Frozen):
             raise ModelError(problems)
         return made
 
-    @property
-    def digest(self) -> str:
-        """A word that sums up what is done, whatever the protocol is called."""
-        text = json.dumps(self.part.model_dump(mode="json"), sort_keys=True)
-        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+def named(what: str, name: Any) -> str:
+    """Check that something can stand in tables, in lists with commas, and in the names of files.
+
+    Raises:
+        UnknownOption: It cannot.
+    """
+    is_word = isinstance(name, str) and name.isprintable() and name.strip() == name != ""
+    if not is_word or any(letter in name for letter in "/\\,"):
+        raise UnknownOption(what, name, ("a word or several, without slashes and commas",))
+    return str(name)
 
 
 def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
@@ -164,6 +171,6 @@ def _meant(given: Any, known: Sequence[Protocol]) -> Iterable[Protocol]:
         raise UnknownOption("protocol", given, names)
     if not at:
         return found
-    if not step.isdigit():
+    if not (step.isascii() and step.isdecimal()):
         raise UnknownOption("control step of a protocol", given, (f"{name}@100",))
     return [protocol.at(int(step)) for protocol in found]

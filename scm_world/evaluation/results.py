@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
@@ -23,19 +22,10 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
-
-TEXTS = ("agent", "engine", "protocol", "hash")
-WHOLE = ("run", "seed", "episode", "steps")
-KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
-"""The columns that say which episode a row is of."""
+from scm_world.evaluation.tables import DRAWN, KEYS, Columns, columns_of, known, means
 
 SCORE = "last_fractional_success"
 """The metric of the published figures."""
-
-DRAWN = "drawn "
-"""First word of the columns with the values that were drawn."""
-
-Columns = dict[str, NDArray[Any]]
 
 
 @final
@@ -55,14 +45,7 @@ class Evaluation:
     @classmethod
     def of(cls, about: Mapping[str, Any], rows: Sequence[Row]) -> Evaluation:
         """Make the table of some rows."""
-        columns: Columns = {}
-        for name in (*KEYS, "steps"):
-            kind: Any = str if name in TEXTS else np.int64
-            columns[name] = np.array([getattr(row, name) for row in rows], dtype=kind)
-        for metric in METRICS:
-            columns[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
-        columns["hash"] = np.array([row.hash for row in rows], dtype=str)
-        return cls(about, {**columns, **_drawn(rows)})
+        return cls(about, columns_of(rows))
 
     def __len__(self) -> int:
         return len(self.columns["episode"])
@@ -157,7 +140,7 @@ class Evaluation:
             UnknownOption: There is no such metric, agent or engine, or protocols do not have the
                 same episodes.
         """
-        _known(metric)
+        known(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine)
         parts = [
@@ -189,7 +172,7 @@ class Evaluation:
         Raises:
             UnknownOption: There is no such protocol, metric, agent or engine.
         """
-        _known(metric)
+        known(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine, protocol=protocol)
         proportion = None if metric != "return" else False
@@ -215,7 +198,7 @@ class Evaluation:
         """
         engine = self.the("engine", engine)
         here = self.only(engine=engine, protocol=protocol)
-        return _paired(here.only(agent=one), here.only(agent=other), _known(metric))
+        return _paired(here.only(agent=one), here.only(agent=other), known(metric))
 
     def gap(
         self,
@@ -232,7 +215,7 @@ class Evaluation:
             UnknownOption: It did not play the same episodes on both.
         """
         here = self.only(agent=self.the("agent", agent), protocol=protocol)
-        return _paired(here.only(engine=one), here.only(engine=other), _known(metric))
+        return _paired(here.only(engine=one), here.only(engine=other), known(metric))
 
     def overall(
         self, metric: str = SCORE, *, agent: str | None = None, engine: str | None = None
@@ -268,15 +251,10 @@ class Evaluation:
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine, protocol=protocol)
         first = mine.only(run=mine._listed("run")[0])
-        units = first._units()
-        scores = np.array([_means(mine, _known(metric))[unit] for unit in units])
+        score_of = means(mine.columns, known(metric))
+        units = zip(first.columns["seed"].tolist(), first.columns["episode"].tolist(), strict=True)
         varied = {n: v for n, v in first.drawn().items() if not np.isnan(v).all()}
-        return find_causes(varied, scores)
-
-    def _units(self) -> list[tuple[int, int]]:
-        return list(
-            zip(self.columns["seed"].tolist(), self.columns["episode"].tolist(), strict=True)
-        )
+        return find_causes(varied, np.array([score_of[unit] for unit in units]))
 
     def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
         """Give means and standard deviations under the predecessor's names, by protocol."""
@@ -316,39 +294,8 @@ class Evaluation:
         return load(Path(path))
 
 
-def _drawn(rows: Sequence[Row]) -> Columns:
-    """Give a column for each number of each variable that was drawn."""
-    sizes: dict[str, int] = {}
-    for row in rows:
-        for name, values in row.drawn.items():
-            sizes[name] = max(sizes.get(name, 0), len(values))
-    found: Columns = {}
-    for name, size in sizes.items():
-        table = np.full((len(rows), size), np.nan)
-        for place, row in enumerate(rows):
-            values = row.drawn.get(name, [])
-            table[place, : len(values)] = values
-        labels = [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
-        found |= {DRAWN + label: table[:, k].copy() for k, label in enumerate(labels)}
-    return found
-
-
-def _known(metric: str) -> str:
-    if metric not in METRICS:
-        raise UnknownOption("metric", metric, METRICS)
-    return metric
-
-
-def _means(table: Evaluation, metric: str) -> dict[tuple[int, int], float]:
-    """Give the mean over runs of each episode."""
-    found: dict[tuple[int, int], list[float]] = {}
-    for unit, score in zip(table._units(), table.columns[metric].tolist(), strict=True):
-        found.setdefault(unit, []).append(score)
-    return {unit: sum(scores) / len(scores) for unit, scores in found.items()}
-
-
 def _paired(one: Evaluation, other: Evaluation, metric: str) -> Interval:
-    mine, its = _means(one, metric), _means(other, metric)
+    mine, its = means(one.columns, metric), means(other.columns, metric)
     if mine.keys() != its.keys():
         differ = sorted(mine.keys() ^ its.keys())[0]
         allowed = ("episodes that both have played",)
@@ -357,13 +304,4 @@ def _paired(one: Evaluation, other: Evaluation, metric: str) -> Interval:
     return difference_interval([mine[u] for u in units], [its[u] for u in units])
 
 
-def merged_rows(tables: Iterable[Evaluation]) -> Columns:
-    """Put the rows of tables under one another."""
-    listed = list(tables)
-    names = dict.fromkeys(name for table in listed for name in table.columns)
-    return {
-        name: np.concatenate(
-            [table.columns.get(name, np.full(len(table), np.nan)) for table in listed]
-        )
-        for name in names
-    }
+__all__ = ["DRAWN", "KEYS", "SCORE", "Columns", "Evaluation"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, final
@@ -14,12 +14,12 @@ import numpy as np
 from scm_world.backends import BACKENDS
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.evaluation.arena import Arena, turn_of
+from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import ROLES, protocols_of
-from scm_world.evaluation.policies import Player, as_player
 from scm_world.evaluation.protocols import Protocol, chosen
+from scm_world.evaluation.seats import Seat, seats_of
 from scm_world.queries.experiments.versions import versions
-from scm_world.tasks import Task
+from scm_world.tasks import TASKS, Task
 from scm_world.world.start import whole_number
 
 SHARD = 25
@@ -27,26 +27,6 @@ SHARD = 25
 
 _MINE = ("task", "backend", "render_mode")
 """Options of the environment that an evaluation sets by itself."""
-
-_TRIES = 25  # observations on which a policy without a file is tried out
-
-
-@final
-@dataclass(frozen=True)
-class Seat:
-    """A policy and what it is called.
-
-    Attributes:
-        agent: Name of the agent.
-        run: Number of its training run.
-        policy: What a user gave.
-        about: What it is, as plain data.
-    """
-
-    agent: str
-    run: int
-    policy: Any
-    about: Mapping[str, Any]
 
 
 @final
@@ -151,7 +131,7 @@ class Setup:
         seat = self.seats[shard.seat]
         content = {
             "place": self.place.about(),
-            "agent": [seat.agent, seat.run, dict(seat.about)],
+            "agent": seat.identity(),
             "engine": dict(self.versions[shard.engine]),
             "protocol": self.protocols[shard.protocol].as_dict(),
             "episodes": [shard.engine, shard.seed, shard.first, shard.stop],
@@ -202,17 +182,12 @@ def prepare(
     Raises:
         ScmWorldError: What is wrong, by name.
     """
-    options = dict(env or {})
-    allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]
-    for name in options:
-        if name not in allowed:
-            raise UnknownOption("option of the environment", name, allowed)
-    place = Place(task, options)
+    place = _place(task, dict(env or {}))
     engines = _several("backend", backend)
     for engine in engines:
-        if engine not in BACKENDS:
+        if not isinstance(engine, str) or engine not in BACKENDS:
             raise UnknownOption("backend", engine, BACKENDS)
-    known = protocols_of(place.name) if place.name in ROLES else ()
+    known = protocols_of(place.name) if place.name in ROLES or protocols is None else ()
     wanted = chosen(protocols, known)
     count = whole_number("n", n, least=1)
     noises = tuple(whole_number("seed", seed, least=0) for seed in _several("seeds", seeds))
@@ -222,73 +197,33 @@ def prepare(
         arena = Arena(place.env(engine))
         try:
             for protocol in wanted:
-                turn_of(protocol, arena.env)
+                arena.try_out(protocol, seed=noises[0])
             found[engine] = versions(arena.env.world.engine)
-            seats = seats or _seats(policy, arena, trusted)
+            seats = seats or seats_of(policy, arena.env, trusted)
         finally:
             arena.close()
-    return Setup(place, seats, engines, wanted, noises, count, found)
+    setup = Setup(place, seats, engines, wanted, noises, count, found)
+    setup.about()  # refuses what cannot be written down, before any time is spent
+    return setup
+
+
+def _place(task: Task | str, options: dict[str, Any]) -> Place:
+    if not isinstance(task, Task) and (not isinstance(task, str) or task not in TASKS):
+        raise UnknownOption("task", task, TASKS)
+    allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]
+    for name in options:
+        if name not in allowed:
+            raise UnknownOption("option of the environment", name, allowed)
+    return Place(task, options)
 
 
 def _several(option: str, given: Any) -> tuple[Any, ...]:
     if isinstance(given, str):
         given = [word.strip() for word in given.split(",")]
-    listed = (given,) if isinstance(given, int | np.integer) else tuple(given)
-    if not listed or len(set(listed)) != len(listed):
+    found = tuple(given) if isinstance(given, Iterable) else (given,)
+    if not found or any(one in found[:place] for place, one in enumerate(found)):
         raise UnknownOption(option, given, ("one or several, each once",))
-    return listed
-
-
-def _seats(policy: Any, arena: Arena, trusted: Sequence[str] | None) -> tuple[Seat, ...]:
-    """Read who acts, and try the policies out."""
-    named = policy if isinstance(policy, Mapping) else {None: policy}
-    seats: list[Seat] = []
-    for name, given in named.items():
-        runs = given if _is_several(given) else [given]
-        if not runs:
-            raise UnknownOption(f"policies of {name}", given, ("one policy or more",))
-        for run, one in enumerate(runs):
-            player = as_player(one, trusted=trusted)
-            agent = str(name) if name is not None else str(player.about["name"])
-            about = {**player.about, **_traits(player, arena)}
-            seats.append(Seat(agent if name is not None else _short(agent), run, one, about))
-    names = [(seat.agent, seat.run) for seat in seats]
-    if len(set(names)) != len(names):
-        raise UnknownOption("agents", [name for name, _ in names], ("each name once",))
-    return tuple(seats)
-
-
-def _is_several(given: Any) -> bool:
-    """Tell a list of policies from a list of numbers, which are actions."""
-    return isinstance(given, list) and not (given and isinstance(given[0], list | float | int))
-
-
-def _short(name: str) -> str:
-    """Name an agent by the last part of a path, without what cannot stand in a file name."""
-    last = name.replace("\\", "/").rstrip("/").rpartition("/")[2]
-    return last.replace(",", " ") or name
-
-
-def _traits(player: Player, arena: Arena) -> dict[str, str]:
-    """Tell policies of one name apart by what they do, where no file says what they are.
-
-    It also shows at once that a policy does not fit the environment.
-    """
-    env: Any = arena.env
-    observation, _ = env.reset(seed=0)
-    player.begin(env)
-    action = player.act(observation)
-    if "sha256" in player.about or player.about.get("kind") == "named":
-        return {}
-    found = blake2b(np.ascontiguousarray(action).tobytes(), digest_size=8)
-    walk = np.random.default_rng(0)
-    low, high = np.clip(env.action_space.low, -1e3, 1e3), np.clip(env.action_space.high, -1e3, 1e3)
-    for _ in range(_TRIES):
-        observation, *_, truncated, _ = env.step(walk.uniform(low, high).astype(np.float32))
-        if truncated:
-            break
-        found.update(np.ascontiguousarray(player.act(observation)).tobytes())
-    return {"traits": found.hexdigest()}
+    return found
 
 
 def _plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from scm_world.errors import (
     NotFinite,
     OutOfBounds,
     OutOfSpace,
+    UnknownVariable,
     WrongShape,
     WrongType,
 )
@@ -131,6 +133,29 @@ def check_region(variable: Variable, region: SpaceName | Space) -> None:
     for corner in (0.0, np.nextafter(1.0, 0.0)):
         drawn = region.transform(np.full((1, n), corner), variable.shape, {})
         check_bounds(variable, drawn[0], {})
+
+
+def check_subset(subset: Subset, variables: Iterable[Variable], *, may_come: bool = False) -> None:
+    """Refuse patterns that name nothing, and regions that variables cannot lie in.
+
+    Args:
+        subset: Of the parameter space.
+        variables: That there are.
+        may_come: Whether others may come, which patterns may name.
+
+    Raises:
+        UnknownVariable: A pattern names nothing.
+        InterventionError: A region is none of the variable, or beyond its bounds.
+    """
+    known = {variable.name: variable for variable in variables}
+    if not may_come:
+        for pattern in subset.unused(known):
+            raise UnknownVariable(pattern, known)
+    exact = {pattern for pattern, _ in subset.parts}
+    for name, variable in known.items():
+        region = subset.region(name)
+        if region is not None and (name in exact or not isinstance(region, str)):
+            check_region(variable, region)
 
 
 def check_space(

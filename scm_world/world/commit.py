@@ -95,14 +95,16 @@ def feasible(
     """
     draws = any(isinstance(act, Draw) for act in flatten(request).values())
     kept: frozenset[str] = frozenset()
+    last: Proposal | None = None
     for attempt in range(ATTEMPTS if draws else 1):
-        proposal = propose(world, instant, request, space, attempt=attempt, kept=kept)
+        proposal = propose(world, instant, request, space, attempt=attempt, kept=kept, last=last)
         change = difference(world, proposal)
         problems = _new_overlaps(world, instant, proposal, change)
         if draws and not problems:
             problems = _buried(proposal, flatten(request))
         if not problems:
             return proposal, change
+        last = proposal
         if draws and not attempt:
             kept = _immaterial(world, proposal.declaration, flatten(request))
     tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""

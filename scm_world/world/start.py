@@ -13,11 +13,13 @@ from scm_world.graph import Moment
 from scm_world.scene import PhysicalState
 from scm_world.scene.feasibility import TOLERANCE, overlaps
 from scm_world.tasks import TASKS, Task, make_task
-from scm_world.variables import Measured
-from scm_world.variables.checks import check_bounds
+from scm_world.variables import Measured, Subset
+from scm_world.variables.checks import check_bounds, check_subset
+from scm_world.variables.subsets import AnyRegion
 
 if TYPE_CHECKING:
     from scm_world.world.declaration import Declaration
+    from scm_world.world.family import Family
 
 
 def beginning(
@@ -100,6 +102,19 @@ def the_backend(backend: Any) -> Backend:
     if isinstance(backend, str):
         return make_backend(backend)
     raise UnknownOption("backend", backend, (*BACKENDS, "a backend that is made"))
+
+
+def check_held(region: AnyRegion | None, family: Family) -> None:
+    """Refuse what no intervention can be held against: names and regions that do not exist.
+
+    Where variables decide which bodies there are, a pattern may name some that are not there.
+
+    Raises:
+        InterventionError: With the name.
+    """
+    if isinstance(region, Subset):
+        variables = family.natural(None).model.variables
+        check_subset(region, variables, may_come=len(family.head) > 0)
 
 
 def whole_number(option: str, value: Any, *, least: int) -> int:

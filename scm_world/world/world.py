@@ -31,7 +31,7 @@ from scm_world.world.following import policy_inputs
 from scm_world.world.proposal import Instant, Proposal
 from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
-from scm_world.world.start import beginning, the_backend, the_task, whole_number
+from scm_world.world.start import beginning, check_held, the_backend, the_task, whole_number
 
 
 class World(Declared):
@@ -101,6 +101,7 @@ class World(Declared):
         self._reached = np.zeros(3, dtype=np.bool_)
         self._enter(self.family.natural(None))
         self._held = self.model
+        check_held(self.variables_space, self.family)
         self.structure = self.declaration.structure(self.model.solve(only=(PRESET,)))
 
     @property

@@ -72,7 +72,7 @@ def decoded(data: bytes, path: str, trusted: Sequence[str]) -> tuple[Header, lis
     """
     arrow, parquet = _libraries()
     try:
-        table = parquet.read_table(arrow.BufferReader(data)).combine_chunks()
+        table = parquet.read_table(arrow.BufferReader(data), use_threads=False).combine_chunks()
     except (arrow.ArrowException, OSError, ValueError) as error:
         raise UnreadableFile(path, f"it is no whole Parquet file ({error})", ADVICE) from None
     about = table.schema.metadata or {}

@@ -1,0 +1,125 @@
+"""``scm-world evaluate --check`` and ``scm-world explain``: what is done with results."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from rich.text import Text
+
+from scm_world.cli.console import console, keep_whole, show, table
+from scm_world.cli.evaluation import policies_of
+from scm_world.cli.questions import shown_episodes
+from scm_world.evaluation import Causes, Evaluation, check, why
+
+SHOWN = 8  # variables that are listed
+NOTHING = "nothing is varied in it"
+
+
+def _policy(text: str | None) -> Any:
+    return None if text is None else policies_of(text)
+
+
+def check_again(path: Path, episodes: int, policy: str | None) -> int:
+    """Play a part of some results again; return the exit code."""
+    sys.path.insert(0, str(Path.cwd()))
+    results = Evaluation.load(path)
+    trusted = _own(results)
+    with shown_episodes() as progress:
+        found = check(
+            results, episodes=episodes, policy=_policy(policy), trusted=trusted, progress=progress
+        )
+    terminal = console()
+    for line in found.wrong:
+        terminal.print(Text(line), soft_wrap=True)
+    said = "the same bits in all of them" if found else f"{len(found.wrong)} differ"
+    chosen = f"{found.episodes} of {len(results)} episodes, chosen with seed {found.seed}"
+    terminal.print(f"played again: {chosen}: {said}", soft_wrap=True)
+    return 0 if found else 1
+
+
+def _own(results: Evaluation) -> tuple[str, ...]:
+    """Name the packages of policies that are functions: who checks results has them at hand."""
+    policies = [agent["policy"] for agent in results.about["agents"]]
+    names = [str(one["name"]) for one in policies if one.get("kind") == "function"]
+    return tuple({name.partition(":")[0].partition(".")[0] for name in names})
+
+
+@final
+@dataclass(frozen=True)
+class Where:
+    """Which results are explained.
+
+    Attributes:
+        path: Folder or file.
+        agent: Who acted, if there are several.
+        engine: On which engine, if there are several.
+        metric: Score that is explained.
+    """
+
+    path: Path
+    agent: str | None
+    engine: str | None
+    metric: str
+
+
+def show_causes(where: Where, protocol: str | None) -> int:
+    """Print for each protocol what its variables did to the score; return the exit code."""
+    results = Evaluation.load(where.path)
+    agent, engine = results.the("agent", where.agent), results.the("engine", where.engine)
+    terminal = console()
+    for name in results.protocols if protocol is None else (protocol,):
+        found = results.causes(name, where.metric, agent=agent, engine=engine)
+        score = results.score(name, where.metric, agent=agent, engine=engine)
+        title = f"{name}: {agent} on {engine}, {where.metric.replace('_', ' ')} {score}"
+        if found.causes:
+            terminal.print(keep_whole(_causes(found, title), terminal, 0))
+        elif protocol is not None:
+            terminal.print(Text(f"{title}\n{found if found.left_out else NOTHING}"), soft_wrap=True)
+    return 0
+
+
+def _causes(found: Causes, title: str) -> Any:
+    made = table("variable", "share of variance", "p (Holm)", "upper - lower third", title=title)
+    for cause in found.ranked()[:SHOWN]:
+        column = cause.column
+        of = "" if column.name == cause.variable else f" ({column.name})"
+        contrast = Text(f"{column.contrast}{of}")
+        made.add_row(cause.variable, Text(str(cause.share)), f"{cause.p_holm:.3g}", contrast)
+    if len(found.causes) > SHOWN:
+        made.add_row(f"and {len(found.causes) - SHOWN} more", "", "", "")
+    return made
+
+
+def show_otherwise(where: Where, protocol: str, episode: int, versus: str | None) -> int:
+    """Print what an episode would have been; return the exit code."""
+    sys.path.insert(0, str(Path.cwd()))
+    results = Evaluation.load(where.path)
+    with shown_episodes() as progress:
+        found = why(
+            results,
+            protocol,
+            episode,
+            agent=where.agent,
+            engine=where.engine,
+            metric=where.metric,
+            versus=versus,
+            trusted=_own(results),
+            progress=progress,
+        )
+    title = f"{protocol}, episode {episode}: {where.metric.replace('_', ' ')} {found.score:.3g}"
+    made = table("had it been", "instead of", "score", "success", title=title)
+    for other in found.others:
+        made.add_row(
+            Text(f"{other.variable} = {show(other.would_be)}"),
+            show(other.was),
+            f"{other.would_score:.3g} ({other.gain:+.3g})",
+            "yes" if other.would_succeed else "no",
+        )
+    for name, reason in found.left_out.items():
+        made.add_row(Text(name), "", "left out", Text(reason))
+    terminal = console()
+    terminal.print(made)
+    return 0

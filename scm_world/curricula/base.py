@@ -1,0 +1,190 @@
+"""What a curriculum is made of: values that say what is done in a situation."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal, final
+
+from pydantic import PlainSerializer, PlainValidator, ValidationError
+
+from scm_world.curricula.situations import Memory, Situation
+from scm_world.errors import UnknownOption
+from scm_world.graph import flatten
+from scm_world.queries.timed import as_act
+from scm_world.variables import Function, Intervention
+from scm_world.variables.spaces import Frozen
+from scm_world.world.declaration import Declaration
+
+Acts = dict[str, Any]
+"""An intervention: acts by the name of the variable."""
+
+
+class Part(Frozen):
+    """A rule that says what is done in a situation. It is a value, with JSON without loss.
+
+    Attributes:
+        kind: Its name in a file.
+    """
+
+    KINDS: ClassVar[dict[str, type[Part]]] = {}
+
+    kind: str
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        """Know the part by its kind, so that it can be read from a file."""
+        super().__pydantic_init_subclass__(**options)
+        default = cls.model_fields["kind"].default
+        if isinstance(default, str):
+            Part.KINDS[default] = cls
+
+    def acts(self, situation: Situation) -> Acts:
+        """Say what is done now; nothing, mostly."""
+        return {}
+
+    def parts(self) -> tuple[Part, ...]:
+        """List what it is made of."""
+        return ()
+
+    def walk(self) -> Iterator[Part]:
+        """List it and everything that it is made of."""
+        yield self
+        for part in self.parts():
+            yield from part.walk()
+
+    def live(self, memory: Memory, episode: int) -> Iterator[Part]:
+        """List it and what may act in an episode, as far as its number and the stages say."""
+        yield self
+        for part in self.parts():
+            yield from part.live(memory, episode)
+
+    def declared(self, declaration: Declaration) -> None:
+        """Look for names that do not exist and values that are impossible, in a structure.
+
+        Raises:
+            UnknownVariable: A name stands for nothing.
+            InterventionError: A region or a value is impossible.
+        """
+
+    def names(self) -> Iterator[str]:
+        """List the names and patterns of what it sets, as far as they are known beforehand."""
+        yield from ()
+
+    @cached_property
+    def key(self) -> str:
+        """A word that sums up its content: two parts with one key have the same noise."""
+        text = f"{self.kind}/{self.model_dump_json()}"
+        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+    def functions(self) -> Iterator[Function]:
+        """List the functions of the user's that it calls."""
+        yield from ()
+
+
+def as_part(given: Any) -> Part:
+    """Take a part, the plain data of one, or an intervention that is always done.
+
+    Raises:
+        UnknownOption: It is none of these.
+    """
+    if isinstance(given, Part):
+        return given
+    if isinstance(given, Mapping):
+        kind = given.get("kind")
+        if isinstance(kind, str):
+            return _from_file(kind, given)
+        return Do(given)
+    raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
+
+
+def _from_file(kind: str, given: Mapping[str, Any]) -> Part:
+    if kind not in Part.KINDS:
+        raise UnknownOption("part of a curriculum", kind, Part.KINDS)
+    try:
+        return Part.KINDS[kind].model_validate(dict(given))
+    except (ValidationError, TypeError) as error:
+        allowed = (f"the data of one, which this is not: {error}",)
+        raise UnknownOption("part of a curriculum", kind, allowed) from None
+
+
+AnyPart = Annotated[
+    Part,
+    PlainValidator(as_part),
+    PlainSerializer(lambda part: part.model_dump(mode="json"), return_type=dict),
+]
+"""A part of any kind, told apart by its ``kind``."""
+
+
+def words(option: str, given: Any) -> tuple[str, ...]:
+    """Read names and patterns: one, or several.
+
+    Raises:
+        UnknownOption: One of them is no word.
+    """
+    names = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
+    if not all(isinstance(name, str) for name in names):
+        raise UnknownOption(option, given, ("a name or a pattern", "several of them"))
+    return names
+
+
+def acts_of(request: Mapping[str, Any]) -> Acts:
+    """Read an intervention, as a user writes it or as a file has it.
+
+    Args:
+        request: Values and acts by name, dotted or nested; an act may be plain data.
+
+    Raises:
+        UnknownOption: It is no mapping, or something in it is no intervention.
+    """
+    if not isinstance(request, Mapping):
+        return flatten(request)  # which says what is wrong
+    data = {n: act for n, act in request.items() if _is_data(act)}
+    nested = flatten({n: act for n, act in request.items() if n not in data})
+    return {name: as_act(value) for name, value in {**nested, **data}.items()}
+
+
+def _is_data(act: Any) -> bool:
+    """Tell an act that was written down from the quantities of an entity."""
+    return isinstance(act, Mapping) and isinstance(act.get("kind"), str)
+
+
+@final
+class Do(Part):
+    """Do always the same.
+
+    Attributes:
+        request: Interventions, by the name of the variable.
+
+    Example:
+        >>> Do({"tool_block": {"mass": 0.08}}).request["tool_block.mass"].value
+        0.08
+    """
+
+    kind: Literal["do"] = "do"
+    request: dict[str, Intervention]
+
+    def __init__(self, request: Mapping[str, Any], **fields: Any) -> None:
+        super().__init__(request=acts_of(request), **fields)  # type: ignore[call-arg]
+
+    def acts(self, situation: Situation) -> Acts:
+        """Give the intervention."""
+        return dict(self.request) if situation.due else {}
+
+    def names(self) -> Iterator[str]:
+        """List what it sets."""
+        yield from self.request
+
+    def declared(self, declaration: Declaration) -> None:
+        """Look for names that do not exist and values that are impossible."""
+        for name, act in self.request.items():
+            if name not in declaration.entity_names:
+                declaration.model.accept(name, act)
+
+    def functions(self) -> Iterator[Function]:
+        """List the functions of mechanisms."""
+        for act in self.request.values():
+            function = getattr(act, "function", None)
+            if isinstance(function, Function):
+                yield function

@@ -1,0 +1,124 @@
+"""What runs a curriculum: it counts episodes, remembers successes, and intervenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol, final
+
+from scm_world.curricula.base import Acts
+from scm_world.curricula.choices import count
+from scm_world.curricula.curriculum import Curriculum, as_curriculum
+from scm_world.curricula.situations import Memory, Situation
+from scm_world.world import World
+
+
+class Doable(Protocol):
+    """An environment that can be intervened on."""
+
+    world: World
+
+    def do(self, request: Mapping[str, Any], *, space: Any = None) -> Any:
+        """Intervene now."""
+
+    def snapshot(self) -> Any:
+        """Save this instant."""
+
+    def restore(self, snapshot: Any) -> None:
+        """Go back to it."""
+
+
+@final
+class Turn:
+    """A curriculum at work.
+
+    Args:
+        curriculum: What is done.
+        memory: Where it goes on; at the beginning if None.
+
+    Attributes:
+        curriculum: What is done.
+        memory: The state that decides how it goes on.
+    """
+
+    def __init__(self, curriculum: Any, memory: Memory | None = None) -> None:
+        self.curriculum: Curriculum = as_curriculum(curriculum)
+        self.memory = Memory() if memory is None else memory
+        self._waits = self.curriculum.steps_matter
+
+    def begin(
+        self, env: Doable, episode: int | None = None, *, besides: Iterable[str] = ()
+    ) -> bool:
+        """Do what is due at a reset, just after it.
+
+        Args:
+            env: At the beginning of an episode.
+            episode: Its number; as many as have ended if None.
+            besides: Variables that are left as they are, in whatever coordinates.
+
+        Returns:
+            Whether anything was done.
+
+        Raises:
+            InterventionError: It was refused; nothing has changed.
+        """
+        if episode is not None:
+            self.memory.episode = episode
+        return self._act(env, 0, frozenset(besides))
+
+    def step(self, env: Doable) -> bool:
+        """Do what is due after a control step; tell whether that was anything.
+
+        Raises:
+            InterventionError: It was refused; nothing has changed.
+        """
+        step = env.world.index
+        return self._waits and self.curriculum.may_act(step) and self._act(env, step)
+
+    def ended(self, *, success: bool) -> None:
+        """Take an episode into account that has ended, and count it."""
+        count(
+            self.curriculum.part.live(self.memory, self.memory.episode),
+            self.memory,
+            success=success,
+        )
+        self.memory.episode += 1
+
+    def _act(self, env: Doable, step: int, besides: frozenset[str] = frozenset()) -> bool:
+        """Intervene; first on what decides which bodies there are, for others have their names."""
+        head = frozenset(env.world.family.head)
+        space = self.curriculum.space
+        first = self._asked(env.world, step, besides, head) if head else {}
+        if not first:
+            acts = self._asked(env.world, step, besides)
+            if acts:
+                env.do(acts, space=space)
+            return bool(acts)
+        before = env.snapshot()
+        env.do(first, space=space)
+        try:
+            rest = self._asked(env.world, step, besides | head)
+            if rest:
+                env.do(rest, space=space)
+        except BaseException:
+            env.restore(before)
+            raise
+        return True
+
+    def _asked(
+        self,
+        world: World,
+        step: int,
+        besides: frozenset[str],
+        first: frozenset[str] | None = None,
+    ) -> Acts:
+        memory, model = self.memory, world.model
+        situation = Situation(world, memory.episode, step, memory, due=step == 0, first=first)
+        acts = self.curriculum.part.acts(situation)
+        if first is not None:
+            acts = {name: act for name, act in acts.items() if name in first}
+        taken = {model.target(name) if name in model else name for name in besides}
+        return {
+            name: act
+            for name, act in acts.items()
+            if not taken or (model.target(name) if name in model else name) not in taken
+        }

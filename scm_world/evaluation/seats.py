@@ -1,0 +1,154 @@
+"""Who acts in an evaluation: policies, what they are called, and how they are told apart."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.env import ScmWorldEnv
+from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption
+from scm_world.evaluation.policies import Player, WorldPolicy, as_player
+from scm_world.evaluation.protocols import named
+
+_TRIES = 25  # observations on which a policy without a file is tried out
+_PLACE = ("path",)  # where a policy lies does not say which one it is
+
+
+@final
+@dataclass(frozen=True)
+class Seat:
+    """A policy and what it is called.
+
+    Attributes:
+        agent: Name of the agent.
+        run: Number of its training run.
+        policy: What a user gave.
+        about: What it is, as plain data.
+    """
+
+    agent: str
+    run: int
+    policy: Any
+    about: Mapping[str, Any]
+
+    def identity(self) -> list[Any]:
+        """Say who it is, as plain data: the same wherever its file lies."""
+        return [self.agent, self.run, what_it_is(self.about)]
+
+
+def what_it_is(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out of what a policy is where its file lies.
+
+    Example:
+        >>> what_it_is({"kind": "file", "path": "runs/a.onnx", "sha256": "5f52"})
+        {'kind': 'file', 'sha256': '5f52'}
+    """
+    return {name: value for name, value in about.items() if name not in _PLACE}
+
+
+def seats_of(policy: Any, env: ScmWorldEnv, trusted: Sequence[str] | None) -> tuple[Seat, ...]:
+    """Read who acts, and try the policies out.
+
+    Args:
+        policy: A policy; a list of them, one for each training run; or either by the name of the
+            agent.
+        env: Where they are tried out.
+        trusted: Packages whose functions may be policies, if named by a text.
+
+    Raises:
+        UnknownOption: There is none, or two have one name.
+        EvaluationError: One does not fit the environment; with its name.
+    """
+    seats = []
+    for agent, run, one in listed(policy):
+        player = as_player(one, trusted=trusted)
+        name = _short(str(player.about["name"])) if agent is None else agent
+        try:
+            traits = _traits(one, player, env)
+        except ScmWorldError as error:
+            raise EvaluationError({"agent": name, "run": run}, str(error)) from error
+        seats.append(Seat(named("name of an agent", name), run, one, {**player.about, **traits}))
+    if not seats:
+        raise UnknownOption("policy", policy, ("one or several",))
+    return tuple(seats)
+
+
+def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
+    """List policies with agent and training run; the agent is None if it was not named.
+
+    Raises:
+        UnknownOption: The list of an agent is empty, or two agents have one name.
+
+    Example:
+        >>> list(listed({"mine": ["a.onnx", "b.onnx"], "other": "still"}))
+        [('mine', 0, 'a.onnx'), ('mine', 1, 'b.onnx'), ('other', 0, 'still')]
+    """
+    agents = policy if isinstance(policy, Mapping) else {None: policy}
+    for agent, given in agents.items():
+        runs = given if _is_several(given) else [given]
+        if not runs:
+            raise UnknownOption(f"policies of {agent}", given, ("one policy or more",))
+        if agent is not None:
+            named("name of an agent", agent)
+        for run, one in enumerate(runs):
+            yield agent, run, one
+
+
+def _is_several(given: Any) -> bool:
+    """Tell a list of policies from a list of numbers, which are actions."""
+    return isinstance(given, list) and not (given and isinstance(given[0], list | float | int))
+
+
+def _short(name: str) -> str:
+    """Name an agent by the last part of a path, without what cannot stand in a table."""
+    last = name.replace("\\", "/").rstrip("/").rpartition("/")[2]
+    return last.replace(",", " ").strip() or "policy"
+
+
+def _traits(policy: Any, player: Player, env: ScmWorldEnv) -> dict[str, str]:
+    """Tell policies of one name apart by what they do, where no file says what they are.
+
+    It also shows at once that a policy does not fit the environment. One that gives two actions
+    for one observation draws from a noise of its own: what it does then says nothing.
+    """
+    is_known = "sha256" in player.about or player.about.get("kind") == "named"
+    actions = _walked(player, env, 1 if is_known else _TRIES)
+    if is_known:
+        return {}
+    found = blake2b(_source(policy), digest_size=8)
+    if actions != _walked(player, env, _TRIES):
+        return {"traits": found.hexdigest(), "repeats": "no"}
+    found.update(b"".join(actions))
+    return {"traits": found.hexdigest()}
+
+
+def _walked(player: Player, env: Any, steps: int) -> list[bytes]:
+    """Ask a player on a walk that is always the same one."""
+    observation, _ = env.reset(seed=0)
+    player.begin(env)
+    walk = np.random.default_rng(0)
+    low, high = np.clip(env.action_space.low, -1e3, 1e3), np.clip(env.action_space.high, -1e3, 1e3)
+    found = []
+    for _ in range(steps):
+        action: NDArray[Any] = player.act(observation)
+        found.append(np.ascontiguousarray(action).tobytes())
+        observation, *_, truncated, _ = env.step(walk.uniform(low, high).astype(np.float32))
+        if truncated:
+            break
+    return found
+
+
+def _source(policy: Any) -> bytes:
+    """Give the text of a function or class, where there is one."""
+    inside = policy.policy if isinstance(policy, WorldPolicy) else policy
+    inside = inside if inspect.isroutine(inside) or isinstance(inside, type) else type(inside)
+    try:
+        return inspect.getsource(inside).encode()
+    except (OSError, TypeError):
+        return b""

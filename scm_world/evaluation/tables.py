@@ -1,0 +1,83 @@
+"""Tables of episodes: a column for everything that is kept of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.errors import UnknownOption
+from scm_world.evaluation.arena import METRICS, Row
+
+TEXTS = ("agent", "engine", "protocol", "hash")
+WHOLE = ("run", "seed", "episode", "steps")
+KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
+"""The columns that say which episode a row is of."""
+
+DRAWN = "drawn "
+"""First word of the columns with the values that were drawn."""
+
+Columns = dict[str, NDArray[Any]]
+
+
+def columns_of(rows: Sequence[Row]) -> Columns:
+    """Make the table of some episodes: a column for each field of ``Row``, of shape ``(n,)``."""
+    found: Columns = {}
+    for name in (*KEYS, "steps"):
+        kind: Any = str if name in TEXTS else np.int64
+        found[name] = np.array([getattr(row, name) for row in rows], dtype=kind)
+    for metric in METRICS:
+        found[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
+    found["hash"] = np.array([row.hash for row in rows], dtype=str)
+    return {**found, **_drawn(rows)}
+
+
+def _drawn(rows: Sequence[Row]) -> Columns:
+    """Give a column for each number of each variable that was drawn; NaN where it was not."""
+    sizes: dict[str, int] = {}
+    for row in rows:
+        for name, values in row.drawn.items():
+            sizes[name] = max(sizes.get(name, 0), len(values))
+    found: Columns = {}
+    for name, size in sizes.items():
+        table = np.full((len(rows), size), np.nan)
+        for place, row in enumerate(rows):
+            values = row.drawn.get(name, [])
+            table[place, : len(values)] = values
+        labels = [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
+        found |= {DRAWN + label: table[:, k].copy() for k, label in enumerate(labels)}
+    return found
+
+
+def joined(tables: Iterable[Columns]) -> Columns:
+    """Put tables under one another."""
+    listed = list(tables)
+    names = dict.fromkeys(name for table in listed for name in table)
+    return {
+        name: np.concatenate(
+            [table.get(name, np.full(len(table["episode"]), np.nan)) for table in listed]
+        )
+        for name in names
+    }
+
+
+def known(metric: str) -> str:
+    """Check the name of a metric.
+
+    Raises:
+        UnknownOption: There is none of this name.
+    """
+    if metric not in METRICS:
+        raise UnknownOption("metric", metric, METRICS)
+    return metric
+
+
+def means(columns: Columns, metric: str) -> dict[tuple[int, int], float]:
+    """Give the mean score of each episode over the training runs, by seed and number."""
+    found: dict[tuple[int, int], list[float]] = {}
+    seeds, episodes = columns["seed"].tolist(), columns["episode"].tolist()
+    for seed, episode, score in zip(seeds, episodes, columns[metric].tolist(), strict=True):
+        found.setdefault((seed, episode), []).append(score)
+    return {unit: sum(scores) / len(scores) for unit, scores in found.items()}

@@ -1,0 +1,302 @@
+"""A world on paper: what the values would be after an intervention."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from scm_world._types import Value, Values
+from scm_world.entities import CONTROL_INDEX
+from scm_world.errors import InterventionError, WrongShape
+from scm_world.graph import Moment
+from scm_world.variables import (
+    SOFT,
+    Draw,
+    Hard,
+    Intervention,
+    Measured,
+    Mechanism,
+    Natural,
+    Null,
+    Rotations,
+    Shift,
+)
+from scm_world.variables.checks import check_bounds, check_space
+from scm_world.variables.subsets import AnyRegion
+from scm_world.world.compare import same
+from scm_world.world.following import followed, refuse_continuous, what_follows
+
+if TYPE_CHECKING:
+    from scm_world.world.proposal import Instant
+
+Requests = dict[str, tuple[str, Intervention]]
+"""By target: the name that was asked for (the target, or coordinates of it) and the act."""
+
+
+@final
+class Draft:
+    """A world on paper.
+
+    Args:
+        instant: From where.
+        accepted: What is asked for now.
+        requests: What has been asked for at this instant, for what there is.
+        moment: Where to draw.
+        earlier: Another attempt at the same, if there was one.
+    """
+
+    def __init__(
+        self,
+        instant: Instant,
+        accepted: Requests,
+        requests: Requests,
+        moment: Moment,
+        earlier: Draft | None,
+    ) -> None:
+        self._world, self._requests = instant.declaration, requests
+        self.instant = instant
+        self.accepted = accepted
+        self._earlier = earlier
+        self._fixed: dict[str, Hard] = {}
+        self._order: tuple[str, ...] = ()
+        self._unchanged: frozenset[str] | None = None
+        self.static: dict[str, Value] = dict(instant.static)
+        self.model = self.drawn = instant.model
+        self.state = instant.state
+        self.index = instant.index
+        self._moment = moment
+        self._problems: list[InterventionError] = []
+
+    def _is_state(self, target: str) -> bool:
+        return self._world.model.declared(target).role == "state"
+
+    @property
+    def is_impossible(self) -> bool:
+        """Whether a parameter cannot have the value that it would get."""
+        return bool(self._problems)
+
+    def solve_parameters(self) -> None:
+        """Mutilate the model and recompute the descendants of the targets."""
+        acts = {t: na for t, na in self._requests.items() if not self._is_state(t)}
+        if not acts:
+            return
+        targets = tuple(target for target in acts if target in self.static)
+        draws = [t for t in targets if isinstance(acts[t][1], Draw)]
+        if self._earlier is None:
+            refuse_continuous(acts, self.static)
+            self.model = self.instant.model.with_interventions(dict(acts.values()))
+            self._order = tuple(what_follows(self._world, self.model, self.static, targets))
+            if any(self._follows_others(*acts[target]) for target in draws):
+                follow = frozenset(self._order)
+                self._order = tuple(n for n in self.model.structure.order if n in follow)
+        else:
+            self.model, self._order = self._earlier.drawn, self._earlier._order
+            self._unchanged = self._same_again(self._earlier)
+        self.drawn = self.model
+        known = dict(self.static)
+        for target in targets:
+            del known[target]
+        if draws:  # and states among them
+            known |= self._world.states(self.instant.state)
+        self._solve(self._order, known)
+        if draws:
+            self._fixed = {target: self._as_drawn(target) for target in draws}
+            self.model = self.model.with_interventions(self._fixed)
+        self._earlier = None  # attempts are no chain
+
+    def _follows_others(self, name: str, act: Intervention) -> bool:
+        """Tell whether what a variable is drawn from depends on other variables."""
+        requested: Any = self._world.model.declared(name)
+        source = act.source if isinstance(act, Draw) else None
+        found = requested.space(source) if isinstance(source, str) else source
+        return found is not None and bool(found.parents())
+
+    def _same_again(self, earlier: Draft) -> frozenset[str]:
+        """Name what does not follow from anything that is drawn anew."""
+        if earlier._unchanged is not None:
+            return earlier._unchanged
+        anew = {
+            target
+            for target, (name, act) in self._requests.items()
+            if isinstance(act, Draw) and name not in self._moment.kept
+        }
+        for name in self._order:
+            bounds = self._world.model.declared(name).bounds
+            is_bound = bounds is not None and bounds.parents()
+            if is_bound or not anew.isdisjoint(earlier.drawn.structure.parents(name)):
+                anew.add(name)
+        return frozenset(self._order) - anew
+
+    def _as_drawn(self, target: str) -> Hard:
+        """Hold what came out of a draw."""
+        if self._earlier is not None and target in (self._unchanged or ()):
+            return self._earlier._fixed[target]
+        return Hard(self.static[target].tolist())
+
+    def _solve(self, order: Iterable[str], known: dict[str, Value]) -> None:
+        """Compute variables one after another, and stop where one is impossible.
+
+        A mechanism never meets values that its parents cannot have.
+        """
+        impossible: set[str] = set()
+        earlier, unchanged = self._earlier, self._unchanged or ()
+        for name in order:
+            if earlier is not None and name in unchanged:
+                known[name] = self.static[name] = earlier.static[name]
+                continue
+            variable = self._world.model.declared(name)
+            if impossible and not impossible.isdisjoint(p.name for p in variable.all_parents):
+                impossible.add(name)
+                continue
+            known[name] = value = self.model.evaluate(name, known, self._moment)
+            if np.shape(value) != variable.shape:  # of a mechanism that a user gave
+                raise WrongShape(name, value, variable.shape, np.shape(value))
+            follows = variable.bounds is not None and variable.bounds.parents()
+            try:
+                check_bounds(variable, value, self._context() if follows else {})
+            except InterventionError as problem:
+                self._problems.append(problem)
+                impossible.add(name)
+            else:
+                self.static[name] = value
+
+    def _coordinates(self, target: str, name: str) -> Value:
+        """Give the value of a target in the coordinates that were asked for."""
+        value = self._value(target)
+        if name == target:
+            return np.asarray(value)
+        return self._world.in_coordinates(name, value)
+
+    def _value(self, target: str) -> Value:
+        if target == CONTROL_INDEX:
+            return np.asarray(self.index)
+        where = self._world.slices.get(target)
+        return self.static[target] if where is None else self.state.vector[where]
+
+    def set_states(self) -> list[InterventionError]:
+        """Set states, and carry along those whose parents were set.
+
+        States that others follow come first; a shift or scale starts from where its state was
+        carried to.
+        """
+        self.state = self.instant.state.copy()
+        problems: list[InterventionError] = []
+        followed = {variable.name for variable in self._world.carried}
+        acts = [t for t in self._requests if self._is_state(t)]
+        for target in sorted(acts, key=lambda name: name in followed):
+            if target not in followed:
+                problems += self._set(target)
+        for variable in self._world.carried:
+            name, act = self._requests.get(variable.name, (None, None))
+            if name is None or isinstance(act, SOFT):
+                self._carry(variable)
+            if name is not None:
+                problems += self._set(variable.name)
+        return problems
+
+    def _set(self, target: str) -> list[InterventionError]:
+        value = self._wish(target, *self._requests[target])
+        where = self._world.slices.get(target)
+        if where is not None and same(value, self.instant.state.vector[where]):
+            self.state.vector[where] = value
+            return []
+        try:
+            check_bounds(self._world.model.declared(target), value, self.static)
+        except InterventionError as problem:
+            return [problem]
+        if where is None:
+            self.index = int(value)
+        else:
+            self.state.vector[where] = self._exact(target, value)
+        return []
+
+    def _exact(self, target: str, value: Value) -> Value:
+        """Make a quaternion one of norm 1; other values are as exact as they were given."""
+        bounds = self._world.model.declared(target).bounds
+        return bounds.nearest(value) if isinstance(bounds, Rotations) else value
+
+    def _wish(self, target: str, name: str, act: Intervention) -> Value:
+        requested: Any = self._world.model.declared(name)
+        if isinstance(act, Hard):
+            value = requested.array(act.value)
+        elif isinstance(act, Mechanism):
+            values = {**self.static, **self._world.states(self.instant.state)}
+            value = followed(requested, act, values)
+        elif isinstance(act, Natural | Null):
+            value = self._coordinates(target, name)
+        elif isinstance(act, Draw):
+            source = requested.space(act.source) if isinstance(act.source, str) else act.source
+            values = {**self.static, **self._world.states(self.state)}
+            value = self._moment.draw(source, name, requested.shape, values, act.stream)
+        else:
+            present = self._coordinates(target, name)
+            by = np.asarray(act.by)
+            value = present + by if isinstance(act, Shift) else present * by
+        return np.asarray(value if name == target else requested.inverse.bind()(value))
+
+    def _carry(self, variable: Measured) -> None:
+        """Let a state follow the parents that act on it when set (a block that grows)."""
+        parents = variable.set_parents()
+        new = [self._value(parent) for parent in parents]
+        where = self._world.slices[variable.name]
+        if variable.name in self.instant.fresh:
+            if variable.start is not None:
+                self.state.vector[where] = variable.start.bind()(*new)
+            return
+        old = [self._before(parent) for parent in parents]
+        moved = {p for p, a, b in zip(parents, old, new, strict=True) if not same(a, b)}
+        if moved:
+            again = self.instant.at_start or not moved.isdisjoint(variable.restart)
+            self.state.vector[where] = self._moved(variable, where, old, new, again=again)
+
+    def _moved(
+        self, variable: Measured, where: slice, old: list[Value], new: list[Value], *, again: bool
+    ) -> Value:
+        if again and variable.start is not None:
+            return np.asarray(variable.start.bind()(*new))
+        if variable.carry is None:
+            return self.instant.state.vector[where]
+        present = self.instant.state.vector[where]
+        return np.asarray(variable.carry.bind()(present, *old, *new))
+
+    def _before(self, name: str) -> Value:
+        where = self._world.slices.get(name)
+        return self.instant.static[name] if where is None else self.instant.state.vector[where]
+
+    def check(self, accepted: Requests, space: AnyRegion | None) -> list[InterventionError]:
+        """Check bounds and the asked space, now that all other values are known."""
+        problems = self._problems
+        if space is None or problems:
+            return problems
+        context = self._context()
+        for target, (name, act) in accepted.items():
+            requested = self._world.model.declared(name)
+            try:
+                value = self._held(act) if target == "action" else self._coordinates(target, name)
+                check_space(requested, value, space, context)
+            except InterventionError as problem:
+                problems.append(problem)
+        return problems
+
+    def _context(self) -> Values:
+        return {**self.static, **self._world.states(self.state)}
+
+    def _held(self, act: Intervention) -> Value:
+        if isinstance(act, Hard):
+            return np.array(act.value)
+        raise InterventionError(
+            f"do(action): {act!r} is another action at every step, so it cannot be held against a "
+            "space; leave out `space`, or give one action as nine numbers",
+            variable="action",
+        )
+
+    def frozen(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:
+        """Replace a draw, or a change of a state, by the value that came out."""
+        keeps = isinstance(act, (*SOFT, Mechanism, Natural)) and not self._is_state(target)
+        if isinstance(act, Hard) or target == "action" or keeps:
+            return name, act
+        if target in self._fixed:
+            return target, self._fixed[target]
+        return target, Hard(self._value(target).tolist())

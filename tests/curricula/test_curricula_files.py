@@ -1,0 +1,213 @@
+"""Curricula are values: they go to JSON, to files and to other processes, and come back."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from curriculum_envs import PUSHING, STILL, follow_mass, series, under, value
+from gymnasium.envs.registration import EnvSpec
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scm_world import Draw, Scale, Shift
+from scm_world.curricula import (
+    A,
+    B,
+    Curriculum,
+    InterveningAgent,
+    as_curriculum,
+    at_reset,
+    at_step,
+    during,
+    every,
+    everything,
+    follow,
+    goals,
+    in_turn,
+    interpolate,
+    published_curriculum,
+    resample,
+    stages,
+    together,
+    weighted,
+)
+from scm_world.curricula.base import Part
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.graph import SCM
+from scm_world.variables import Box, Either, Function, Mechanism, Natural, Normal
+
+LEAVES: list[Any] = [
+    {},
+    {"floor_friction": 0.4},
+    {"block": {"size": [0.05, 0.06, 0.07]}, "tool_block.mass": Draw("B"), "gravity": Scale(0.5)},
+    {"floor_friction": Mechanism(Function("numpy:mean"), ["floor_color"]), "x": Natural()},
+    resample(["*.mass", "@looks"], "A|B", besides="robot_*"),
+    resample("tool_block.mass", Normal(0.03, 0.001)),
+    resample("*.mass", Either(Box(0.01, 0.02), Box(0.03, 0.04))),
+    everything(A["tool_block.*"] * B["*.mass"] - "joint_positions"),
+    goals("B", besides="goal_block.euler_orientation"),
+    interpolate({"block.size": [0.09] * 3, "gravity": [0, 0, 1]}, episodes=9, first=3),
+    interpolate({"floor_friction": 0.9}, start={"floor_friction": 0.1}, episodes=2),
+    follow("scm_world.curricula.phrases:poses"),
+    published_curriculum(["goal_actor", "random_actor"], [(0, 1e9, 1, 0), (3, 9, 2, 5)]),
+]
+
+
+def wrapped(inner: Any) -> Any:
+    """Put parts into others."""
+    numbers = st.integers(0, 50)
+    several = st.lists(inner, min_size=1, max_size=3)
+    return st.one_of(
+        st.builds(at_step, numbers, inner),
+        st.builds(at_reset, inner),
+        st.builds(lambda n, first, part: every(n + 1, part, first=first), numbers, numbers, inner),
+        st.builds(lambda a, n, k, p: during(range(a, a + n, k + 1), p), *[numbers] * 3, inner),
+        st.builds(lambda parts: together(*parts), several),
+        st.builds(lambda parts, n: in_turn(*parts, each=n + 1), several, numbers),
+        st.builds(lambda parts: weighted(*[(1.5, part) for part in parts]), several),
+        st.builds(lambda parts: stages(*parts, up=0.75, down=0.25, window=7), several),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.recursive(st.sampled_from(LEAVES), wrapped, max_leaves=5))
+def test_every_curriculum_survives_json_and_pickle(given_part: Any) -> None:
+    """Whatever is put together is the same afterwards, with the same noise."""
+    for space in (None, A["tool_block.*"] * B["*.mass"]):
+        one = Curriculum(given_part, space=space)
+        text = one.to_json()
+        again = Curriculum.from_json(text, trusted=["numpy"])
+        assert again == one
+        assert again.to_json() == text
+        assert [p.key for p in again.part.walk()] == [p.key for p in one.part.walk()]
+        assert pickle.loads(pickle.dumps(one)) == one == copy.deepcopy(one)  # noqa: S301 # our own
+
+
+def test_every_kind_is_tried() -> None:
+    """The leaves above and what wraps them are all kinds there are."""
+    text = Curriculum(
+        together(
+            *LEAVES, at_step(1, {}), every(1, {}), in_turn({}), weighted((1.0, {})), stages({})
+        )
+    )
+    assert {part.kind for part in text.part.walk()} == set(Part.KINDS)
+
+
+def test_a_file_makes_the_same_episodes(tmp_path: Path) -> None:
+    """What was written down and read again draws the same."""
+    one = Curriculum(together(goals("A"), resample("*.mass", "B"), at_step(3, {"gravity": "A"})))
+    file = tmp_path / "curriculum.json"
+    file.write_text(one.to_json(indent=2))
+    again = Curriculum.load(file)
+    mass = "tool_block.mass"
+    assert series(under(one), mass, 4) == series(under(again), mass, 4)
+    assert as_curriculum(json.loads(one.to_json())) == one
+
+
+def test_functions_of_others_are_called_only_if_trusted() -> None:
+    """A file with a function needs a reader who trusts its package; a lambda has no file."""
+    text = Curriculum(together({}, follow(follow_mass))).to_json()
+    with pytest.raises(ModelError, match="curriculum_envs:follow_mass"):
+        Curriculum.from_json(text)
+    env = under(Curriculum.from_json(text, trusted=["curriculum_envs"]))
+    env.reset(seed=0)
+    assert value(env, "tool_block.mass") == 0.02
+    with pytest.raises(ModelError, match="top level"):
+        Curriculum(follow(lambda _: {})).to_json()
+    mechanism = Mechanism(Function("os:getcwd"), [])
+    with pytest.raises(ModelError, match="os:getcwd"):
+        Curriculum.from_json(Curriculum({"floor_friction": mechanism}).to_json())
+
+
+WRONG = [
+    ("[1, 2", "not a curriculum"),
+    ("[]", "expected the format"),
+    ('{"format": "scm_world/curriculum/2"}', "expected the format"),
+    ('{"format": "scm_world/curriculum/1", "part": {"kind": "sing"}}', "sing"),
+    ('{"format": "scm_world/curriculum/1", "part": {"kind": "do"}}', "request"),
+    ('{"format": "scm_world/curriculum/1", "part": {"kind": "every", "part": {}}}', "steps"),
+    ('{"format": "scm_world/curriculum/1", "part": {"kind": "goal", "space": "C"}}', "C"),
+    ('{"format": "scm_world/curriculum/1", "part": {}, "more": 1}', "more"),
+    (
+        '{"format": "scm_world/curriculum/1", "part": {"kind": "during", "period": 0, "part": {}}}',
+        "period",
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "says"), WRONG)
+def test_what_is_no_curriculum_is_refused(text: str, says: str, tmp_path: Path) -> None:
+    """A wrong text says what is wrong; a wrong file, too."""
+    with pytest.raises(ModelError, match=says):
+        Curriculum.from_json(text)
+    file = tmp_path / "wrong.json"
+    file.write_text(text)
+    with pytest.raises(UnreadableFile, match=says):
+        Curriculum.load(file)
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    """No file, or one that is no text."""
+    with pytest.raises(UnreadableFile, match="absent"):
+        Curriculum.load(tmp_path / "absent.json")
+    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UnreadableFile, match="binary"):
+        Curriculum.load(tmp_path / "binary")
+    with pytest.raises(UnknownOption, match="part of a curriculum"):
+        as_curriculum(5)
+
+
+def test_wrapped_environments_can_be_written_down() -> None:
+    """The specification of an environment under a curriculum is JSON, and makes the same one."""
+    one = together(goals("A"), at_step(2, resample("*.mass", A["*"] * B["tool*"])))
+    env = InterveningAgent(under(one), "floor_friction", space=A["floor_*"], flat=True)
+    assert env.spec is not None
+    again: Any = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    np.testing.assert_array_equal(env.reset(seed=4)[0], again.reset(seed=4)[0])
+    assert again.get_wrapper_attr("curriculum") == Curriculum(one)
+    assert again.action_space == env.action_space
+    called = under(follow(follow_mass))
+    assert isinstance(called.spec.additional_wrappers[-1].kwargs["curriculum"], Curriculum)
+    same = gymnasium.make(called.spec)
+    np.testing.assert_array_equal(same.reset(seed=0)[0], called.reset(seed=0)[0])
+
+
+@pytest.mark.parametrize("how", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])  # noqa: S301 # our own
+def test_copies_go_on_alike(how: Any) -> None:
+    """A copy in the middle of an episode goes through the same episodes as the original."""
+    part = stages({"tool_block.mass": 0.02}, {"tool_block.mass": 0.03}, window=1, up=1.0)
+    env = InterveningAgent(
+        under(together(everything(besides="joint_positions"), every(2, resample("*.mass")), part)),
+        "floor_friction",
+        most=3,
+    )
+    env.reset(seed=3)
+    act = {"action": STILL, "which": np.ones(1, np.int8), "values": np.zeros(1, np.float32)}
+    env.step(act)
+    twin = how(env)
+    for _ in range(2):
+        for _ in range(5):
+            one, other = env.step(act), twin.step(act)
+            np.testing.assert_array_equal(one[0], other[0])
+            assert one[4]["interventions_left"] == other[4]["interventions_left"]
+        np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
+
+
+def test_a_model_is_no_curriculum() -> None:
+    """The text of a graph is refused by its format."""
+    with pytest.raises(ModelError, match="format"):
+        Curriculum.from_json(SCM([]).to_json() if hasattr(SCM, "to_json") else "{}")
+
+
+def test_the_plain_data_of_an_environment_is_short() -> None:
+    """What is written down is the curriculum, once."""
+    env = under({"floor_friction": Shift(0.1)}, PUSHING)
+    (wrapper,) = [w for w in env.spec.additional_wrappers if w.name == "CurriculumEnv"]
+    assert json.loads(json.dumps(wrapper.kwargs))["curriculum"]["part"]["kind"] == "do"

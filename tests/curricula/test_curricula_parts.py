@@ -1,0 +1,353 @@
+"""What parts of curricula do, when, and which of them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from curriculum_envs import STILL, along, follow_mass, series, under, value
+
+from scm_world import Draw, Shift
+from scm_world.curricula import (
+    A,
+    B,
+    Curriculum,
+    Do,
+    Follow,
+    Goal,
+    Resample,
+    as_curriculum,
+    at_reset,
+    at_step,
+    during,
+    every,
+    everything,
+    follow,
+    goals,
+    in_turn,
+    interpolate,
+    joints,
+    looks,
+    physics,
+    poses,
+    resample,
+    stages,
+    together,
+    weighted,
+)
+from scm_world.curricula.targets import GROUPS, matching
+from scm_world.errors import (
+    InterventionError,
+    OutOfBounds,
+    ScmWorldError,
+    UnknownOption,
+    UnknownVariable,
+    WrongShape,
+)
+from scm_world.geometry.rotations import angle_between, from_rotation_vector
+from scm_world.tasks import TASKS
+from scm_world.variables import Box, Categories, Cylinder, Integers, Normal
+from scm_world.world import World
+
+MASS, FRICTION = "tool_block.mass", "floor_friction"
+
+
+def test_do_does_the_same_in_every_episode() -> None:
+    """Values, nested names, draws and shifts are done at every reset."""
+    env = under({"tool_block": {"mass": 0.05}, FRICTION: "B", "gravity": Shift([0.0, 0.0, 1.0])})
+    frictions = []
+    for _ in range(3):
+        env.reset()
+        assert value(env, MASS) == 0.05
+        assert value(env, "gravity")[2] == pytest.approx(-8.81)
+        frictions.append(value(env, FRICTION))
+    assert len(set(frictions)) == 3
+    assert all(0.6 < friction <= 0.8 for friction in frictions)
+
+
+def test_resample_draws_from_the_space_that_is_named() -> None:
+    """Draws lie in A, in B, in a set of one's own or in the region of a part of the space."""
+    regions = [("A", 0.015, 0.045), ("B", 0.045, 0.1), (Box(0.2, 0.3), 0.2, 0.3)]
+    regions += [(A["*"] * B["*.mass"], 0.045, 0.1), (Cylinder(Box((0.05,), (0.06,))), 0.05, 0.06)]
+    for space, low, high in regions[:4]:
+        drawn = series(under(resample(MASS, space)), MASS, 20)
+        assert len(set(drawn)) == 20
+        assert low <= min(drawn) < max(drawn) <= high
+    drawn = series(under(resample(MASS, Normal(0.05, 0.001))), MASS, 20)
+    assert np.mean(drawn) == pytest.approx(0.05, abs=0.001)
+
+
+def test_resample_knows_patterns_groups_and_exceptions() -> None:
+    """Patterns and groups name variables; ``besides`` takes some out."""
+    world = World("pushing", backend="fake")
+    found = resample(["*.mass", FRICTION], besides="robot_*").targets(world.declaration)
+    assert found == {MASS: "A", FRICTION: "A"}
+    assert MASS in physics().targets(world.declaration)
+    assert set(joints().targets(world.declaration)) == {"joint_positions"}
+    assert set(poses().targets(world.declaration)) == {
+        "tool_block.cylindrical_position",
+        "tool_block.euler_orientation",
+    }
+    assert "tool_block.color" in looks().targets(world.declaration)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_groups_fit_every_task(task: str) -> None:
+    """No group is refused anywhere; what is a look is no physics, and everything has all."""
+    world = World(task, backend="fake")
+    found = {group: set(matching(world.declaration, [f"@{group}"])) for group in GROUPS}
+    assert not found["looks"] & found["physics"]
+    assert not (found["looks"] | found["poses"]) - found["everything"]
+    for group in GROUPS:
+        as_curriculum(resample(f"@{group}")).check(world)
+    as_curriculum(goals("A|B")).check(world)
+
+
+def test_goal_draws_what_the_task_draws() -> None:
+    """A new goal leaves everything else as it is; causes that are left out stay."""
+    env = under(goals("A"))
+    env.reset(seed=0)
+    names = env.unwrapped.world.model
+    first = {name: value(env, name) for name in names}
+    env.reset()
+    moved = {name for name in names if value(env, name) != first[name]}
+    assert moved
+    assert all("goal" in n or n in ("reward", "fractional_success") for n in moved), moved
+    kept = under(Goal("A", besides="goal_block.euler_orientation"))
+    turns = series(kept, "goal_block.euler_orientation", 3)
+    assert turns[0] == turns[1] == turns[2]
+
+
+def test_interpolate_goes_in_equal_steps() -> None:
+    """From the default or a given start to the end, and there it stays."""
+    env = under(interpolate({MASS: 0.1}, start={MASS: 0.02}, episodes=4, first=1))
+    np.testing.assert_allclose(series(env, MASS, 7), [0.02, 0.02, 0.04, 0.06, 0.08, 0.1, 0.1])
+    world = World("pushing", backend="fake")
+    world.reset(seed=0)
+    default = float(world[FRICTION])
+    found = series(under(interpolate({FRICTION: 1.0}, episodes=2)), FRICTION, 3)
+    np.testing.assert_allclose(found, [default, (default + 1.0) / 2.0, 1.0])
+
+
+def test_interpolate_turns_by_equal_angles_the_shorter_way_round() -> None:
+    """A quaternion turns about one axis, and its sign means nothing."""
+    one, other = (from_rotation_vector([0.0, 0.0, angle]) for angle in (0.2, 2.2))
+    for sign in (1.0, -1.0):
+        ends: dict[str, Any] = {"stop": {"tool_block.orientation": sign * other}}
+        part = interpolate(**ends, start={"tool_block.orientation": one}, episodes=4)
+        found = series(under(part), "tool_block.orientation", 5)
+        angles = [float(angle_between(np.array(a), np.array(b))) for a, b in pairwise(found)]
+        np.testing.assert_allclose(angles, 0.5, atol=1e-9)
+
+
+def test_interpolate_rounds_whole_numbers() -> None:
+    """Numbers of blocks are whole, all the way."""
+    name = "number_of_blocks_in_tower"
+    part = interpolate({name: [2, 1, 4]}, start={name: [1, 1, 1]}, episodes=3)
+    found = series(under(part, "scm_world/Towers-v0"), name, 4)
+    assert found == [[1, 1, 1], [1, 1, 2], [2, 1, 3], [2, 1, 4]]
+
+
+def test_follow_asks_a_function() -> None:
+    """What the function gives is done; None is nothing."""
+    env = under(follow(follow_mass))
+    default = value_of_default(MASS)
+    np.testing.assert_allclose(series(env, MASS, 4), [0.02, 0.03, default, 0.05])
+    noisy = under(follow(lambda s: {MASS: s.generator("mass").uniform(0.02, 0.03)}))
+    drawn = series(noisy, MASS, 5)
+    assert drawn == series(noisy, MASS, 5)
+    assert len(set(drawn)) == 5
+    wrong: Any = under(follow(lambda _: 5))
+    with pytest.raises(UnknownOption, match="intervention of a function"):
+        wrong.reset(seed=0)
+
+
+def value_of_default(name: str) -> Any:
+    """Give what a variable is without intervention."""
+    world = World("pushing", backend="fake")
+    world.reset(seed=0)
+    return world[name].tolist()
+
+
+def test_parts_act_at_their_steps_in_every_episode() -> None:
+    """A part within an episode acts in each of them (D10), and then only."""
+    env = under(together({MASS: 0.02}, at_step(2, {MASS: 0.05}), at_step(4, {MASS: 0.06})))
+    for _ in range(3):
+        env.reset()
+        assert value(env, MASS) == 0.02
+        assert along(env, MASS, 5) == [0.02, 0.05, 0.05, 0.06, 0.06]
+
+
+def test_every_acts_again_and_again() -> None:
+    """Beginning at its first step; at the reset, too, if that is 0."""
+    env = under(every(2, resample(FRICTION)))
+    env.reset(seed=0)
+    found = [value(env, FRICTION), *along(env, FRICTION, 5)]
+    assert [a == b for a, b in pairwise(found)] == [True, False, True, False, True]
+    late = under(every(2, resample(FRICTION), first=1))
+    late.reset(seed=0)
+    assert value(late, FRICTION) == value_of_default(FRICTION)
+    found = along(late, FRICTION, 4)
+    assert [a == b for a, b in pairwise(found)] == [True, False, True]
+
+
+def test_during_acts_in_a_range_of_episodes() -> None:
+    """First, stop and period are those of the range; a part at a step may be within."""
+    env = under(during(range(1, 6, 2), {MASS: 0.05}))
+    assert [mass == 0.05 for mass in series(env, MASS, 8)] == [False, True] * 3 + [False] * 2
+    inner = under(during(range(1, 2), at_step(1, {MASS: 0.05})))
+    for episode in range(3):
+        inner.reset(seed=0)
+        assert (along(inner, MASS, 1) == [0.05]) is (episode == 1)
+
+
+def test_the_inner_time_counts() -> None:
+    """A part with a time of its own keeps it."""
+    env = under(at_step(3, at_reset({MASS: 0.05})))
+    env.reset(seed=0)
+    assert value(env, MASS) == 0.05
+
+
+def test_together_the_later_part_counts() -> None:
+    """Of two names of one quantity the later one is done, in whatever coordinates."""
+    polar, cartesian = "tool_block.cylindrical_position", "tool_block.cartesian_position"
+    env = under(together(poses("A"), {cartesian: [0.05, 0.0, 0.0325]}))
+    env.reset(seed=0)
+    np.testing.assert_allclose(value(env, cartesian), [0.05, 0.0, 0.0325])
+    env = under(together({cartesian: [0.05, 0.0, 0.0325]}, {polar: [0.1, 0.0, 0.0325]}))
+    env.reset(seed=0)
+    np.testing.assert_allclose(value(env, cartesian), [0.1, 0.0, 0.0325])
+
+
+def test_in_turn_each_has_its_episodes() -> None:
+    """One after another, each for some episodes, and again from the first one."""
+    env = under(in_turn({MASS: 0.02}, {MASS: 0.03}, {}, each=2))
+    found = series(env, MASS, 8)
+    assert found[:4] == [0.02, 0.02, 0.03, 0.03]
+    assert found[4:] == [*[value_of_default(MASS)] * 2, 0.02, 0.02]
+
+
+def test_weighted_draws_by_weight() -> None:
+    """Frequencies are the weights; at another step the same one acts."""
+    env = under(weighted((3.0, every(1, {MASS: 0.02})), (1, every(1, {MASS: 0.03}))))
+    found = series(env, MASS, 400)
+    assert set(found) == {0.02, 0.03}
+    assert abs(found.count(0.02) - 300) < 4 * np.sqrt(400 * 0.75 * 0.25)
+    for _ in range(5):
+        env.reset()
+        first = value(env, MASS)
+        assert along(env, MASS, 3) == [first] * 3
+
+
+def test_stages_go_up_and_down_with_success() -> None:
+    """A window of successes leads up, one of failures down; then a new window begins."""
+    part = stages({MASS: 0.02}, {MASS: 0.03}, {MASS: 0.04}, up=0.5, down=0.25, window=2)
+    env = under(part, max_episode_length=1)
+    done = {"goal_block.cartesian_position": [0.0, 0.0, 0.0325]}
+    done["tool_block.cartesian_position"] = done["goal_block.cartesian_position"]
+    found = []
+    for success in (1, 1, 0, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0):
+        env.reset(options={"do": done} if success else None)
+        found.append(value(env, MASS))
+        assert env.step(STILL)[4]["is_success"] is bool(success)
+    expected = [2, 2, 3, 3, 4, 4, 4, 4, 4, 3, 3, 2, 2]
+    np.testing.assert_allclose(found, [mass / 100 for mass in expected])
+
+
+def test_stages_count_the_episodes_in_which_they_act() -> None:
+    """Successes of other episodes are not theirs; a part that is there twice counts once."""
+    part = stages({MASS: 0.02}, {MASS: 0.03}, up=1.0, window=2)
+    env = under(together(during(range(2, 9), part), during(range(2, 9), part)))
+    for success in (True, True, True):
+        env.reset(seed=0)
+        env._turn.ended(success=success)
+        env._running = False
+    (progress,) = env.memory.stages.values()
+    assert (progress.level, list(progress.recent)) == (0, [True])
+
+
+WRONG: list[Any] = [
+    lambda: at_step(-1, {}),
+    lambda: at_step(1.5, {}),  # type: ignore[arg-type]
+    lambda: every(0, {}),
+    lambda: during(range(5, 0, -1), {}),
+    lambda: during((1, 2), {}),  # type: ignore[arg-type]
+    together,
+    lambda: together(5),
+    lambda: in_turn({}, each=0),
+    lambda: weighted((0.0, {})),
+    lambda: weighted((True, {})),
+    weighted,
+    lambda: weighted({}),  # type: ignore[arg-type]
+    lambda: stages({}, up=0.0),
+    lambda: stages({}, up=0.5, down=0.5),
+    lambda: stages({}, window=0),
+    lambda: resample("*.mass", "C"),
+    lambda: resample(5),
+    lambda: goals("D"),  # type: ignore[arg-type]
+    lambda: interpolate({MASS: 0.1}, episodes=0),
+    lambda: interpolate({MASS: 0.1}, episodes=2.5),  # type: ignore[arg-type]
+    lambda: interpolate({MASS: "A"}, episodes=2),
+    lambda: interpolate({MASS: Draw("A")}, episodes=2),
+    lambda: interpolate({MASS: 0.1}, start={FRICTION: 0.3}, episodes=2),
+    lambda: follow(5),
+    lambda: Follow({"kind": "linear", "weights": [1.0]}),
+    lambda: Do({MASS: "C"}),
+    lambda: Do(5),  # type: ignore[arg-type]
+]
+
+
+@pytest.mark.parametrize("make", WRONG)
+def test_nonsense_is_refused_with_what_is_allowed(make: Any) -> None:
+    """Every wrong number, name or part is refused when it is written."""
+    with pytest.raises(UnknownOption):
+        make()
+
+
+IMPOSSIBLE: list[tuple[Any, type[ScmWorldError]]] = [
+    ({"tool_blok.mass": 0.05}, UnknownVariable),
+    ({MASS: -1.0}, OutOfBounds),
+    ({MASS: [0.1, 0.2]}, WrongShape),
+    (resample("*.mas"), UnknownVariable),
+    (resample("@weights"), UnknownVariable),
+    (resample("*.mass", besides="*.mas"), UnknownVariable),
+    (resample(MASS, Box(-0.1, 0.1)), OutOfBounds),
+    (resample(MASS, Box((0.1, 0.2), (0.2, 0.3))), InterventionError),
+    (resample("*.cartesian_position", "A"), InterventionError),
+    (resample("solver_preset", Normal(0.0, 1.0)), InterventionError),
+    (Goal("A", besides=["gravity"]), UnknownVariable),
+    (interpolate({"tool_blok.mass": 0.1}, episodes=5), UnknownVariable),
+    (interpolate({MASS: -0.1}, episodes=5), OutOfBounds),
+    (interpolate({"gravity": [0.0, 0.0]}, episodes=5), WrongShape),
+    (during(range(9, 10), at_step(3, resample("nothing"))), UnknownVariable),
+]
+
+
+@pytest.mark.parametrize(("part", "error"), IMPOSSIBLE)
+def test_what_cannot_be_is_refused_before_the_first_episode(
+    part: Any, error: type[ScmWorldError]
+) -> None:
+    """Unknown names and impossible regions are found when an environment is wrapped."""
+    with pytest.raises(error):
+        under(part)
+
+
+def test_whole_numbers_are_drawn_from_whole_numbers() -> None:
+    """A box of fractions is no region of a number of blocks; a set of integers is."""
+    name = "number_of_blocks_in_tower"
+    with pytest.raises(InterventionError, match="whole number"):
+        under(resample(name, Box(1.0, 3.0)), "scm_world/Towers-v0")
+    for space in (Integers(1, 2), Categories((1, 2))):
+        env = under(resample(name, space), "scm_world/Towers-v0")
+        assert {n for ns in series(env, name, 6) for n in ns} == {1, 2}
+
+
+def test_a_curriculum_knows_whether_it_acts_within_episodes() -> None:
+    """What acts at resets only costs nothing afterwards."""
+    assert not Curriculum(together(at_reset({}), everything())).steps_matter
+    assert Curriculum(together(at_reset({}), during(range(3), at_step(1, {})))).steps_matter
+    found = Curriculum(together(at_step(4, {}), in_turn(every(3, {}, first=5), {}), physics()))
+    assert [step for step in range(12) if found.may_act(step)] == [0, 4, 5, 8, 11]
+    assert Curriculum(Resample("*.mass")).part.kind == "resample"

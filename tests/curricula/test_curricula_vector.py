@@ -1,0 +1,200 @@
+"""A curriculum for many environments at once."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from curriculum_envs import PUSHING
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from scm_world.curricula import (
+    CurriculumEnv,
+    CurriculumVectorEnv,
+    as_curriculum,
+    at_step,
+    during,
+    goals,
+    interpolate,
+    make_vec,
+    resample,
+    stages,
+    together,
+)
+from scm_world.errors import UnknownOption, UnreadableFile
+
+MODES = list(AutoresetMode)
+FRICTION, MASS = "floor_friction", "tool_block.mass"
+COUNTER = interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100)
+"""Shows the number of the episode in hundredths."""
+
+
+def made(part: Any, mode: AutoresetMode, n: int = 3, kind: str = "sync", length: int = 3) -> Any:
+    """Make environments without physics whose episodes are short."""
+    return make_vec(
+        PUSHING,
+        n,
+        part,
+        vectorization_mode=kind,
+        autoreset_mode=mode,
+        backend="fake",
+        max_episode_length=length,
+        observation_mode="custom",
+        observe=[FRICTION, MASS],
+        normalize_observations=False,
+        disable_env_checker=True,
+    )
+
+
+def numbers(observations: Any) -> list[int]:
+    """Read the numbers of the episodes from what is observed."""
+    return [round(100 * friction) for friction in observations[:, 0].tolist()]
+
+
+def roll(envs: Any, steps: int, mode: AutoresetMode, seed: int | None = 0) -> list[list[int]]:
+    """Give the numbers of the episodes after a reset and after each of some steps."""
+    found = [numbers(envs.reset(seed=seed)[0])]
+    actions = np.zeros((envs.num_envs, 9), np.float32)
+    for _ in range(steps):
+        observations, _, terminated, truncated, _ = envs.step(actions)
+        ended = terminated | truncated
+        if mode is AutoresetMode.DISABLED and ended.any():
+            observations, _ = envs.reset(options={"reset_mask": ended})
+        found.append(numbers(observations))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("mode", MODES)
+def test_every_number_is_handed_out_once(mode: AutoresetMode, kind: str) -> None:
+    """Episodes have the numbers of one series, in the order in which they begin."""
+    envs = made(COUNTER, mode, kind=kind)
+    rows = roll(envs, 8, mode)
+    envs.close()
+    begun = [rows[0], *(b for a, b in pairwise(rows) if a != b)]
+    assert begun == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_some_may_begin_anew_alone(mode: AutoresetMode) -> None:
+    """A reset of some members hands out numbers to these; the others go on."""
+    envs = made(COUNTER, mode)
+    assert numbers(envs.reset(seed=0)[0]) == [0, 1, 2]
+    some = np.array([False, True, False])
+    envs.step(np.zeros((3, 9), np.float32))
+    observations, _ = envs.reset(options={"reset_mask": some})
+    begun = numbers(observations)[1]
+    assert begun == (4 if mode is AutoresetMode.SAME_STEP else 3)  # its number was 4 already
+    seen = {0, 1, 2, begun}
+    for _ in range(12):
+        observations, _, terminated, truncated, _ = envs.step(np.zeros((3, 9), np.float32))
+        ended = terminated | truncated
+        if mode is AutoresetMode.DISABLED and ended.any():
+            observations, _ = envs.reset(options={"reset_mask": ended})
+        seen |= set(numbers(observations))
+    assert seen == set(range(max(seen) + 1))
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("mode", MODES)
+def test_stages_are_shared(mode: AutoresetMode, kind: str) -> None:
+    """Successes of all members count together; the next stage holds in each of them."""
+    solved = at_step(1, {"goal_block.cartesian_position": [0.0, 0.0, 0.0325]})
+    solved = together(solved, at_step(1, {"tool_block.cartesian_position": [0.0, 0.0, 0.0325]}))
+    part = together(stages({MASS: 0.02}, {MASS: 0.03}, up=1.0, window=3), during(range(3), solved))
+    envs = made(part, mode, kind=kind)
+    observations, _ = envs.reset(seed=0)
+    masses = [sorted({round(mass, 3) for mass in observations[:, 1].tolist()})]
+    for _ in range(12):
+        observations, _, terminated, truncated, _ = envs.step(np.zeros((3, 9), np.float32))
+        ended = terminated | truncated
+        if mode is AutoresetMode.DISABLED and ended.any():
+            observations, _ = envs.reset(options={"reset_mask": ended})
+        masses.append(sorted({round(mass, 3) for mass in observations[:, 1].tolist()}))
+    (progress,) = envs.memory.stages.values()
+    envs.close()
+    assert progress.level == 1
+    assert masses[0] == [0.02]
+    assert masses[-1] == [0.03]
+    late = 7 if mode is AutoresetMode.SAME_STEP else 5
+    assert [0.03] in masses[3 : late + 1]
+
+
+def test_a_single_member_is_like_an_environment() -> None:
+    """One member goes through the episodes of a wrapped environment, draw for draw."""
+    part = together(COUNTER, resample(MASS), at_step(1, resample(MASS, "B")))
+    envs = made(part, AutoresetMode.NEXT_STEP, n=1)
+    one = envs.env.envs[0]
+    alone = CurriculumEnv(gymnasium.make(one.spec).unwrapped, part)
+    found = [envs.reset(seed=4)[0][0]]
+    action = np.zeros((1, 9), np.float32)
+    found += [envs.step(action)[0][0] for _ in range(7)]
+    expected = []
+    for number in range(2):
+        expected.append(alone.reset(seed=None if number else 4)[0])
+        expected += [alone.step(action[0])[0] for _ in range(3)]
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_state_goes_on(mode: AutoresetMode) -> None:
+    """Episodes that were cut off begin again in another vector, with the same draws."""
+    part = together(COUNTER, resample(MASS), stages({}, {}, window=2))
+    envs, others = made(part, mode), made(part, mode)
+    roll(envs, 4, mode)
+    state = envs.state()
+    others.resume(state)
+    assert others.state() == state
+    before = envs.env.call("where")
+    first = numbers(others.reset()[0])
+    assert first == [3, 4, 5]
+    assert others.env.call("where") == before
+    assert [env.unwrapped.world.noise.seed for env in others.env.envs] == [0, 1, 2]
+    if mode is not AutoresetMode.DISABLED:
+        for _ in range(3):
+            observations, *_ = others.step(np.zeros((3, 9), np.float32))
+        if mode is AutoresetMode.NEXT_STEP:
+            observations, *_ = others.step(np.zeros((3, 9), np.float32))
+        assert numbers(observations) == [6, 7, 8]
+
+
+def test_wrong_vectors_are_refused() -> None:
+    """Members without a curriculum, states of another number, unknown modes."""
+    bare: Any = partial(gymnasium.make, PUSHING, backend="fake")
+    with pytest.raises(UnknownOption, match="make_vec"):
+        CurriculumVectorEnv(SyncVectorEnv([bare, bare]), goals())
+    for options in ({"vectorization_mode": "threads"}, {"num_envs": 0}):
+        with pytest.raises(UnknownOption):
+            make_vec(PUSHING, **{"num_envs": 1, "curriculum": {}, **options}, backend="fake")
+    envs = made(COUNTER, AutoresetMode.NEXT_STEP, n=2)
+    envs.reset(seed=0)
+    before = envs.state()
+    wrong = [
+        {},
+        {**before, "noises": [[0, 0]]},
+        {**before, "again": [-1]},
+        {**before, "noises": [1, 2]},
+    ]
+    for state in wrong:
+        with pytest.raises(UnreadableFile, match="state"):
+            envs.resume(state)
+    assert envs.state() == before
+
+
+def test_members_may_be_wrapped_further() -> None:
+    """Wrappers around the members change nothing in how numbers are handed out."""
+    part = as_curriculum(COUNTER)
+
+    def one() -> Any:
+        options = {"backend": "fake", "max_episode_length": 2, "observation_mode": "custom"}
+        options |= {"observe": [FRICTION, MASS], "normalize_observations": False}
+        env = CurriculumEnv(gymnasium.make(PUSHING, **options), part)
+        return gymnasium.wrappers.RecordEpisodeStatistics(env)
+
+    envs = CurriculumVectorEnv(SyncVectorEnv([one, one]), part)
+    rows = roll(envs, 6, AutoresetMode.NEXT_STEP)
+    assert [rows[0], rows[3], rows[6]] == [[0, 1], [2, 3], [4, 5]]

@@ -1,0 +1,333 @@
+"""A curriculum at work in an environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from curriculum_envs import ENGINES, PUSHING, STILL, follow_mass, series, under, value
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import (
+    FlattenObservation,
+    FrameStackObservation,
+    RescaleObservation,
+    TimeLimit,
+    TransformObservation,
+)
+
+from scm_world.curricula import (
+    Curriculum,
+    CurriculumEnv,
+    at_step,
+    during,
+    every,
+    everything,
+    follow,
+    goals,
+    interpolate,
+    looks,
+    physics,
+    poses,
+    resample,
+    stages,
+    together,
+)
+from scm_world.env.wrappers import DeltaAction, ObjectSelector
+from scm_world.errors import Infeasible, OutOfSpace, UnknownOption, UnreadableFile
+from scm_world.scene.feasibility import TOLERANCE, overlaps
+
+MASS, POSITION = "tool_block.mass", "tool_block.cartesian_position"
+
+
+def test_observations_are_those_after_the_intervention() -> None:
+    """At a reset and within an episode, observation and info are of the world as it is then."""
+    env = under(together(poses("A"), goals("A"), at_step(2, poses("A"))), info_state=True)
+    observation, info = env.reset(seed=0)
+    np.testing.assert_array_equal(observation, env.unwrapped.observe())
+    assert info["state"][POSITION].tolist() == value(env, POSITION)
+    env.step(STILL)
+    before = value(env, POSITION)
+    observation, _, _, _, info = env.step(STILL)
+    assert value(env, POSITION) != before
+    np.testing.assert_array_equal(observation, env.unwrapped.observe())
+    assert info["state"][POSITION].tolist() == value(env, POSITION)
+
+
+def test_the_goal_dictionary_keeps_its_form() -> None:
+    """After an intervention a goal-conditioned view is a dictionary of its space (D44)."""
+    env = under(together(goals("A"), every(1, goals("B"))), goal_env=True)
+    for number in range(3):
+        observation = env.step(STILL)[0] if number else env.reset(seed=0)[0]
+        assert env.observation_space.contains(observation)
+        desired = env.unwrapped.present()[1]["desired_goal"]
+        np.testing.assert_allclose(observation["desired_goal"], np.ravel(desired), atol=1e-6)
+
+
+def test_pictures_keep_their_form() -> None:
+    """After an intervention a picture is a picture, of the other color."""
+    blue, red = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+    part = together({"floor_color": blue}, at_step(1, {"floor_color": red}))
+    env = under(part, observation_mode="pixel", image_size=16)
+    first, _ = env.reset(seed=0)
+    second = env.step(STILL)[0]
+    assert env.observation_space.contains(first)
+    assert env.observation_space.contains(second)
+    assert (first != second).any()
+
+
+@pytest.mark.parametrize("backend", ["fake", *ENGINES])
+def test_an_intervention_gives_no_reward(backend: str) -> None:
+    """A goal that moves to the block is success, and no progress of the robot."""
+    still, env = (
+        under({}, backend=backend),
+        under(at_step(1, follow(_goal_to_block)), backend=backend),
+    )
+    still.reset(seed=0)
+    env.reset(seed=0)
+    before, after = still.step(STILL), env.step(STILL)
+    assert (after[1], after[4]["reward_terms"]) == (before[1], before[4]["reward_terms"])
+    assert (before[4]["is_success"], after[4]["is_success"]) == (False, True)
+    terms = env.step(STILL)[4]["reward_terms"]
+    assert abs(terms["reward.block_to_goal"]) < 1e-3  # [m], though the goal came 8 cm nearer
+    assert terms["fractional_success"] == pytest.approx(1.0, abs=0.01)
+
+
+def _goal_to_block(situation: Any) -> dict[str, Any]:
+    """Put the goal where the block is."""
+    where = situation.values()
+    names = ("cartesian_position", "orientation")
+    model = situation.world.model
+    return {
+        f"goal_block.{name}": where[f"tool_block.{name}"]
+        for name in names
+        if f"goal_block.{name}" in model
+    }
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+def test_engines_take_what_is_drawn(backend: str) -> None:
+    """On each engine the world is as drawn, apart, and goes on."""
+    env = under(
+        together(physics("A"), poses("A|B"), goals("A"), looks(), every(3, poses("B"))),
+        backend=backend,
+    )
+    for seed in range(3):
+        env.reset(seed=seed)
+        assert overlaps(env.unwrapped.world.scene(), tolerance=TOLERANCE) == ()
+        for _ in range(6):
+            assert np.isfinite(env.step(STILL)[0]).all()
+    fake = under(physics("A"))
+    names = (MASS, "floor_friction")
+    np.testing.assert_allclose(
+        [series(under(physics("A"), backend=backend), name, 2) for name in names],
+        [series(fake, name, 2) for name in names],
+    )
+
+
+def test_what_the_caller_asks_for_counts_more() -> None:
+    """``options['do']`` replaces what the curriculum would set, in any coordinates."""
+    env = under(together(everything(besides="joint_positions"), {MASS: 0.02}))
+    place = [0.05, 0.02, 0.0325]
+    asked = {"tool_block": {"mass": 0.07, "cartesian_position": place}, "block.size": [0.065] * 3}
+    for _ in range(5):
+        env.reset(options={"do": asked})
+        assert value(env, MASS) == 0.07
+        np.testing.assert_allclose(value(env, POSITION), place)
+    env.reset(options={"do": {MASS: "B"}})
+    assert 0.045 < value(env, MASS) <= 0.1
+
+
+def test_what_was_done_is_known() -> None:
+    """The environment lists the interventions of an episode, with their steps."""
+    env = under(together({MASS: 0.05}, at_step(2, {"floor_friction": 0.4})))
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(STILL)
+    assert [(step, [*acts]) for step, acts in env.unwrapped.interventions] == [
+        (0, [MASS]),
+        (2, ["floor_friction"]),
+    ]
+
+
+def test_a_refused_intervention_leaves_the_environment_usable() -> None:
+    """The episode goes on, and so do others; a refused reset is no episode."""
+    inside = {"tool_block.cartesian_position": [0.0, 0.0, 0.0]}
+    env = under(together({MASS: 0.05}, at_step(2, inside)))
+    env.reset(seed=0)
+    env.step(STILL)
+    with pytest.raises(Infeasible):
+        env.step(STILL)
+    assert value(env, MASS) == 0.05
+    assert env.step(STILL)[0].shape == (56,)
+    refused = under(
+        together(
+            interpolate({MASS: 0.1}, start={MASS: 0.02}, episodes=8), during(range(1, 2), inside)
+        )
+    )
+    refused.reset(seed=0)
+    for _ in range(2):
+        with pytest.raises(Infeasible):
+            refused.reset()
+        assert refused.memory.episode == 1
+    assert value(refused, MASS) != 0.03  # all of it or nothing
+    assert refused.step(STILL)[0].shape == (56,)
+
+
+def test_a_curriculum_can_be_held_against_a_space() -> None:
+    """What lies outside is refused, at the reset and within the episode."""
+    env = under(Curriculum({MASS: 0.09}, space={"parts": [("*.mass", "A")]}))
+    with pytest.raises(OutOfSpace):
+        env.reset(seed=0)
+    later = under(
+        Curriculum(at_step(1, {"floor_friction": 0.4}), space={"parts": [("*.mass", "A")]})
+    )
+    later.reset(seed=0)
+    with pytest.raises(OutOfSpace, match="not to be set"):
+        later.step(STILL)
+
+
+def test_two_wrappers_act_one_after_the_other() -> None:
+    """The outer one counts; both count episodes."""
+    inner = under(together({MASS: 0.02}, at_step(1, {"floor_friction": 0.3}), goals("A")))
+    env = CurriculumEnv(
+        inner, together(during(range(1, 9), {MASS: 0.03}), at_step(1, {MASS: 0.04}))
+    )
+    found = []
+    for _ in range(3):
+        observation, _ = env.reset()
+        found.append(value(env, MASS))
+        np.testing.assert_array_equal(observation, env.unwrapped.observe())
+        env.step(STILL)
+        assert (value(env, MASS), value(env, "floor_friction")) == (0.04, 0.3)
+    assert found == [0.02, 0.03, 0.03]
+    assert env.memory.episode == inner.memory.episode == 2
+
+
+def test_wrappers_may_be_inside_and_outside() -> None:
+    """Observation wrappers inside see the intervention; those that remember go outside."""
+    base: Any = gymnasium.make(PUSHING, backend="fake", disable_env_checker=True)
+    halved = TransformObservation(DeltaAction(base), lambda seen: seen / 2, base.observation_space)
+    env: Any = CurriculumEnv(halved, together(poses("A"), at_step(1, poses("B"))))
+    np.testing.assert_array_equal(env.reset(seed=0)[0], base.unwrapped.observe() / 2)
+    np.testing.assert_array_equal(env.step(STILL)[0], base.unwrapped.observe() / 2)
+    flat: Any = FlattenObservation(gymnasium.make(PUSHING, backend="fake", goal_env=True))
+    assert CurriculumEnv(flat, goals("A")).reset(seed=0)[0].shape == flat.observation_space.shape
+    low = RescaleObservation(base, np.float32(0.0), np.float32(1.0))
+    assert low.observation_space.contains(CurriculumEnv(low, poses("A")).reset(seed=0)[0])
+    for outside in (FrameStackObservation(base, 2), ObjectSelector(base)):
+        with pytest.raises(UnknownOption, match=f"put {type(outside).__name__} around"):
+            CurriculumEnv(outside, goals("A"))
+    stacked: Any = FrameStackObservation(CurriculumEnv(base, goals("A")), 2)
+    assert stacked.reset(seed=0)[0].shape == (2, 56)
+    moved: Any = ObjectSelector(CurriculumEnv(base, poses("A")))
+    assert moved.reset(seed=0)[0].shape == moved.observation_space.shape
+
+
+def test_other_environments_are_refused() -> None:
+    """A curriculum needs a world with variables."""
+    with pytest.raises(UnknownOption, match="ScmWorldEnv"):
+        CurriculumEnv(gymnasium.make("CartPole-v1"), goals("A"))
+
+
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
+def test_gymnasium_accepts_it() -> None:
+    """The checker of Gymnasium finds nothing."""
+    check_env(under(together(goals(), every(7, physics()))), skip_render_check=True)
+
+
+def test_episodes_are_counted_when_they_end() -> None:
+    """At the end, at a reset in mid-episode, and at one before any step."""
+    part = stages({}, {MASS: 0.02}, window=2, up=1.0)
+    env = under(part, max_episode_length=2)
+    env.reset(seed=0)
+    assert env.memory.episode == 0
+    for _ in range(4):  # truncated after two
+        env.step(STILL)
+    assert env.memory.episode == 1
+    env.reset()
+    env.step(STILL)
+    env.reset()
+    assert env.memory.episode == 2
+    env.reset()
+    assert env.memory.episode == 3
+    (progress,) = env.memory.stages.values()
+    assert list(progress.recent) == [False, False]  # one without a step tells nothing
+    around = TimeLimit(under(part), 1)
+    around.reset(seed=0)
+    around.step(STILL)
+    around.reset()
+    assert around.get_wrapper_attr("memory").episode == 1
+
+
+@pytest.mark.parametrize("when", ["before", "between", "within"])
+def test_a_state_goes_on_exactly(when: str) -> None:
+    """In another environment the next episodes are those that would have come."""
+    part = together(
+        everything(besides="joint_positions"),
+        interpolate({"floor_friction": 0.9}, episodes=9),
+        stages({}, {"gravity": [0.0, 0.0, -5.0]}, window=2, up=0.01),
+        every(1, resample("*.mass")),
+    )
+    env, other = under(part, max_episode_length=2), under(part, max_episode_length=2)
+    if when != "before":
+        env.reset(seed=7)
+        for _ in range(3):
+            env.step(STILL)
+            env.step(STILL)
+            env.reset()
+        env.step(STILL)
+    if when == "between":
+        env.step(STILL)
+    state = env.state()
+    other.resume(state)
+    assert other.state() == state
+    env.resume(state)  # goes on itself, too: the episode that was cut off begins again
+    seed = 7 if when == "before" else None
+    for episode in range(3):
+        one, two = (e.reset(seed=None if episode else seed)[0] for e in (env, other))
+        np.testing.assert_array_equal(one, two)
+        assert (
+            env.unwrapped.world.episode
+            == (3 if when == "within" else 4) * (when != "before") + episode
+        )
+        for _ in range(2):
+            np.testing.assert_array_equal(env.step(STILL)[0], other.step(STILL)[0])
+        assert env.state() == other.state()
+
+
+def test_what_is_no_state_is_refused() -> None:
+    """And nothing has changed then."""
+    env = under(goals())
+    env.reset(seed=0)
+    env.step(STILL)
+    before = env.state()
+    for wrong in (
+        5,
+        {},
+        {"episode": "x", "stages": {}},
+        {**before, "noise": 5},
+        {**before, "noise": [1, -1]},
+    ):
+        with pytest.raises(UnreadableFile, match="state"):
+            env.resume(wrong)
+    assert env.state() == before
+
+
+def test_functions_see_the_situation() -> None:
+    """A function is told the episode, the step, the world and its values."""
+    seen: list[Any] = []
+
+    def watch(situation: Any) -> None:
+        mass = float(situation.values()[MASS])
+        seen.append((situation.episode, situation.step, situation.due, mass))
+
+    env = under(together(every(2, follow(watch))))
+    for _ in range(2):
+        env.reset(options={"do": {MASS: 0.05}})
+        for _ in range(3):
+            env.step(STILL)
+    assert seen == [(0, 0, True, 0.05), (0, 2, True, 0.05), (1, 0, True, 0.05), (1, 2, True, 0.05)]
+    masses = series(under(follow(follow_mass)), MASS, 2)
+    np.testing.assert_allclose(masses, [0.02, 0.03])

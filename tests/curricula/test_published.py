@@ -1,0 +1,219 @@
+"""The predecessor's actors and their 4-tuples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from curriculum_envs import STILL, series, under, value
+
+from scm_world.curricula import (
+    ACTORS,
+    CurriculumEnv,
+    active,
+    as_curriculum,
+    joints,
+    published_actor,
+    published_curriculum,
+    resample,
+)
+from scm_world.curricula.published import ALWAYS
+from scm_world.env import IDS
+from scm_world.errors import UnknownOption
+from scm_world.scene.feasibility import TOLERANCE, overlaps
+from scm_world.variables.checks import check_space
+from scm_world.world import World
+
+CONVENTIONS = ["scm_world", "causal_world"]
+MASS = "tool_block.mass"
+LINKS = tuple(
+    f"robot_finger_{finger}_link_{link}" for finger in (60, 120, 300) for link in range(4)
+)
+COLORS = {
+    *(f"{link}.color" for link in LINKS),
+    "floor_color",
+    "stage_color",
+    "tool_block.color",
+    "goal_block.color",
+}
+POSES = {"tool_block.cylindrical_position", "tool_block.euler_orientation"}
+GOAL = {"goal_block.polar", "goal_block.euler_orientation"}
+ALL = {
+    *COLORS,
+    *POSES,
+    *(f"{link}.mass" for link in LINKS),
+    "block.size",
+    "floor_friction",
+    "goal_block.cylindrical_position",
+    "goal_block.euler_orientation",
+    "stage_friction",
+    MASS,
+}
+MOVES: list[tuple[str, dict[str, Any], set[str]]] = [
+    ("base_actor", {}, set()),
+    ("goal_actor", {}, GOAL),
+    ("joints_actor", {}, {"joint_positions"}),
+    ("physical_properties_actor", {"group": "tool"}, {MASS}),
+    ("physical_properties_actor", {"group": "floor"}, {"floor_friction"}),
+    ("physical_properties_actor", {"group": "stage"}, {"stage_friction"}),
+    ("physical_properties_actor", {"group": "robot"}, {f"{link}.mass" for link in LINKS}),
+    ("rigid_pose_actor", {}, POSES),
+    ("rigid_pose_actor", {"orientations": False}, {"tool_block.cylindrical_position"}),
+    ("rigid_pose_actor", {"positions": False}, {"tool_block.euler_orientation"}),
+    ("rigid_pose_actor", {"positions": False, "orientations": False}, set()),
+    ("visual_actor", {}, COLORS),
+]
+
+
+@pytest.mark.parametrize("conventions", CONVENTIONS)
+@pytest.mark.parametrize("space", ["A", "B", "A|B"])
+@pytest.mark.parametrize(("name", "options", "targets"), MOVES)
+def test_each_actor_moves_its_variables_inside_the_space(
+    name: str, options: dict[str, Any], targets: set[str], space: Any, conventions: str
+) -> None:
+    """What it sets are these variables and no others, and their values lie in the space."""
+    env = under(published_actor(name, space=space, **options), conventions=conventions)
+    env.reset(seed=0)
+    world = env.unwrapped.world
+    done = {target for _, acts in env.unwrapped.interventions for target in acts}
+    assert done == targets
+    values = world.values()
+    for target in done:
+        check_space(world.model.declared(target), values[target], space, values)
+
+
+@pytest.mark.parametrize("conventions", CONVENTIONS)
+def test_the_random_actor_leaves_sizes_or_positions_to_a_coin(conventions: str) -> None:
+    """Everything is drawn but the joints; of sizes and positions one kind, half of the time."""
+    env = under(published_actor("random_actor", space="A"), conventions=conventions)
+    sizes = 0
+    for number in range(60):
+        env.reset(seed=0 if number == 0 else None)
+        ((_, acts),) = env.unwrapped.interventions
+        has_sizes = "block.size" in acts
+        sizes += has_sizes
+        positions = {name for name in ALL if name.endswith(".cylindrical_position")}
+        assert set(acts) == ALL - (positions if has_sizes else {"block.size"})
+    assert 15 < sizes < 45
+
+
+@pytest.mark.parametrize("id_", IDS)
+@pytest.mark.parametrize("name", ["random_actor", "goal_actor", "visual_actor"])
+def test_actors_act_on_every_task(name: str, id_: str) -> None:
+    """Numbers of blocks are whole (D25)."""
+    env = under(published_actor(name, space="A"), id_, conventions="causal_world")
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == env.observation_space.shape
+
+
+def test_d26_the_pose_actor_takes_no_size_for_a_block() -> None:
+    """On the general task the size of the blocks begins like a block, and is left alone."""
+    env = under(published_actor("rigid_pose_actor", space="A"), "scm_world/General-v0")
+    targets = env.curriculum.part.targets(env.unwrapped.world.declaration)
+    assert "tool_block_size" in env.unwrapped.world.model
+    assert len(targets) == 2 * len(env.unwrapped.world.composition.blocks)
+    assert {name.partition(".")[2] for name in targets} == {
+        "cylindrical_position",
+        "euler_orientation",
+    }
+
+
+def test_d51_the_joints_actor_draws_from_the_space() -> None:
+    """Every draw is in the space and leaves the fingers apart; none is refused."""
+    env = under(published_actor("joints_actor", space="A"))
+    for seed in range(10):
+        env.reset(seed=seed)
+        world = env.unwrapped.world
+        values = world.values()
+        check_space(world.model.declared("joint_positions"), values["joint_positions"], "A", values)
+        assert overlaps(world.scene(), tolerance=TOLERANCE) == ()
+    assert published_actor("joints_actor", space="A") == joints("A")
+
+
+def test_d10_an_actor_within_the_episode_acts_in_every_episode() -> None:
+    """With a control step that is not 0, it acts at that step of each episode."""
+    env = under(published_curriculum(["physical_properties_actor"], [(0, 1e9, 1, 3)], space="B"))
+    for _ in range(3):
+        env.reset()
+        light = value(env, MASS)
+        masses = []
+        for _ in range(4):
+            env.step(STILL)
+            masses.append(value(env, MASS))
+        assert masses[:2] == [light] * 2
+        assert masses[2] == masses[3] > 0.045 >= light
+
+
+def test_d43_every_actor_of_a_kind_is_written_down() -> None:
+    """Two actors of one kind, with their times, come back from a file."""
+    part = published_curriculum(
+        [published_actor("physical_properties_actor", group=g) for g in ("tool", "floor")],
+        [(0, 5, 1, 0), (6, 9, 2, 4)],
+    )
+    again: Any = as_curriculum(as_curriculum(part).as_dict()).part
+    assert again == part
+    assert [p.part.part.what for p in again.of] == [("tool_*.mass",), ("floor_friction",)]
+
+
+def test_a_4_tuple_says_when() -> None:
+    """First and last episode count both; the period counts from the first; the step is exact."""
+    env = under(active({MASS: 0.05}, (2, 6, 2, 0)))
+    found = [mass == 0.05 for mass in series(env, MASS, 10)]
+    assert [episode for episode, acted in enumerate(found) if acted] == [2, 4, 6]
+    later = under(active({MASS: 0.05}, (1, 1, 1, 2)))
+    acted = []
+    for _ in range(3):
+        later.reset()
+        for step in range(1, 4):
+            later.step(STILL)
+            if value(later, MASS) == 0.05:
+                acted.append((later.memory.episode, step))
+    assert acted == [(1, 2), (1, 3)]
+
+
+def test_later_actors_count_more() -> None:
+    """Of two that set one quantity at one time the later one is done."""
+    actors = [resample(MASS, "A"), {MASS: 0.09}]
+    for order, heavy in ((actors, True), (actors[::-1], False)):
+        env = under(published_curriculum(order, [ALWAYS, ALWAYS]))
+        env.reset(seed=0)
+        assert (value(env, MASS) == 0.09) is heavy
+
+
+def test_the_published_curricula() -> None:
+    """Nothing, a new goal at each reset, everything at each reset."""
+    for actors, moved in (([], 0), (["goal_actor"], 2), (["random_actor"], 30)):
+        part = published_curriculum(actors, [ALWAYS] * len(actors)) if actors else {}
+        env: CurriculumEnv = under(part, conventions="causal_world")
+        env.reset(seed=0)
+        done: Any = env.unwrapped
+        assert sum(len(acts) for _, acts in done.interventions) >= moved
+
+
+WRONG: list[Any] = [
+    lambda: published_actor("sad_actor"),
+    lambda: published_actor("goal_actor", space="C"),  # type: ignore[arg-type]
+    lambda: published_actor("physical_properties_actor", group="hands"),
+    lambda: active({}, (0, 1, 1)),
+    lambda: active({}, (5, 1, 1, 0)),
+    lambda: active({}, (0, 1, 0, 0)),
+    lambda: active({}, (0, 1.5, 1, 0)),
+    lambda: active({}, (0, float("inf"), 1, 0)),
+    lambda: active({}, ("0", 1, 1, 0)),  # type: ignore[arg-type]
+    lambda: active({}, (-1, 1, 1, 0)),
+    lambda: published_curriculum(["goal_actor"], []),
+]
+
+
+@pytest.mark.parametrize("make", WRONG)
+def test_wrong_actors_and_times_are_refused(make: Any) -> None:
+    """With what is allowed."""
+    with pytest.raises(UnknownOption):
+        make()
+
+
+def test_every_name_of_an_actor_is_one() -> None:
+    """All published names make a part that fits a task."""
+    world = World("pushing", backend="fake", conventions="causal_world")
+    for name in ACTORS:
+        as_curriculum(published_actor(name)).check(world)

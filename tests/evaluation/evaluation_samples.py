@@ -1,0 +1,73 @@
+"""Policies that other processes can import."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+rng = np.random.default_rng(0)
+WEIGHTS = rng.normal(size=(56, 9)).astype(np.float32)
+
+
+def linear(observation: Any) -> NDArray[np.float32]:
+    """Act by a fixed network of one layer."""
+    return np.tanh(observation @ WEIGHTS)
+
+
+def opposite(observation: Any) -> NDArray[np.float32]:
+    """Do the opposite."""
+    return -linear(observation)
+
+
+class Waning:
+    """Goes wrong in mid-episode: at the twelfth control step after so many episodes."""
+
+    def __init__(self, how: str, after: int) -> None:
+        self.how, self.after, self.episodes, self.steps = how, after, 0, 0
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.episodes += 1
+        self.steps = 0
+
+    def __call__(self, observation: Any) -> Any:
+        """Act, or go wrong."""
+        self.steps += 1
+        if self.episodes <= self.after or self.steps <= 12:
+            return np.zeros(9)
+        if self.how == "nan":
+            return np.array([np.nan] * 9)
+        if self.how == "shape":
+            return np.zeros(8)
+        raise ZeroDivisionError("by the policy")
+
+
+class Counting:
+    """Notes in a file how often it has begun an episode."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        with self.path.open("a") as stream:
+            stream.write(f"{os.getpid()}\n")
+
+    def __call__(self, observation: Any) -> Any:
+        """Stay."""
+        return np.zeros(9)
+
+
+class Noisy:
+    """Draws from a noise that no reset makes anew."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(0)
+
+    def __call__(self, observation: Any) -> Any:
+        """Act at random."""
+        return self.rng.uniform(-1, 1, 9)

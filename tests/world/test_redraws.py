@@ -1,0 +1,90 @@
+"""What is drawn again takes over what is the same again, and nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world import Draw, Mechanism, Shift, World
+from scm_world.variables import Box, Function
+from scm_world.world import commit
+from scm_world.world.proposal import Proposal, propose
+
+
+def mean(color: Any) -> float:
+    """Make a friction of a color."""
+    return 0.3 + 0.1 * float(np.mean(color))
+
+
+CROWDED: dict[str, Any] = {
+    "joint_positions": Draw("A"),
+    "tool_block.cylindrical_position": Draw("A|B", stream="one"),
+    "goal_block.polar": Draw("B"),
+    "block.size": Draw(Box((0.05, 0.05, 0.05), (0.08, 0.08, 0.08))),
+    "tool_block.mass": Draw("A"),
+    "floor_color": Draw("A"),
+    "floor_friction": Mechanism(Function(mean), ["floor_color"]),
+    "gravity": Shift([0.0, 0.0, 0.1]),
+    "stage_friction": 0.5,
+}
+KEPT = frozenset({"goal_block.polar", "tool_block.mass", "floor_color"})
+CASES: list[tuple[str, dict[str, Any], frozenset[str]]] = [
+    ("pushing", CROWDED, KEPT),
+    ("pushing", CROWDED, frozenset()),
+    ("stacking2", {n: act for n, act in CROWDED.items() if "_block." not in n}, frozenset()),
+    ("reaching", {"number_of_obstacles": 2, "joint_positions": Draw("A")}, frozenset()),
+    ("reaching", {"number_of_obstacles": Draw("A|B"), "floor_color": Draw("A")}, frozenset()),
+    ("towers", {"tower_dims": Draw("A"), "tool_level_1_col_0_row_0.mass": 0.05}, frozenset()),
+]
+
+
+@pytest.mark.parametrize(("task", "request_", "kept"), CASES)
+def test_another_attempt_is_the_same_with_and_without_the_one_before(
+    task: str, request_: dict[str, Any], kept: frozenset[str]
+) -> None:
+    """Values, state, model and what is remembered of the request agree, bit for bit."""
+    world = World(task, backend="fake")
+    world.reset(seed=1)
+    world.do({"light_intensity": 0.4} if "light_intensity" in world.model else {})
+    instant = world._instant or world._present()
+    last: Proposal | None = None
+    seen = set()
+    for attempt in range(6):
+        fresh = propose(world, instant, request_, None, attempt=attempt, kept=kept)
+        again = propose(world, instant, request_, None, attempt=attempt, kept=kept, last=last)
+        assert fresh.declaration is again.declaration
+        assert fresh.static.keys() == again.static.keys()
+        for name, value in fresh.static.items():
+            np.testing.assert_array_equal(again.static[name], value, err_msg=name)
+        np.testing.assert_array_equal(fresh.state.vector, again.state.vector)
+        assert (fresh.requests, fresh.asked) == (again.requests, again.asked)
+        assert fresh.model == again.model
+        seen.add(str(fresh.requests))
+        last = again
+    assert len(seen) > 1 or task == "towers"
+
+
+def test_a_crowded_draw_is_made_with_few_computations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dozens of attempts at the joints compute the masses of all links once only."""
+    world = World("pushing", backend="fake")
+    world.reset(seed=0)
+    masses = [name for name in world.model if name.startswith("robot") and name.endswith(".mass")]
+    attempts: list[int] = []
+    computed: list[str] = []
+    evaluate = type(world.model).evaluate
+
+    def counted(model: Any, name: str, *rest: Any) -> Any:
+        computed.append(name)
+        return evaluate(model, name, *rest)
+
+    def noted(*given: Any, **options: Any) -> Proposal:
+        attempts.append(options["attempt"])
+        return propose(*given, **options)
+
+    monkeypatch.setattr(type(world.model), "evaluate", counted)
+    monkeypatch.setattr(commit, "propose", noted)
+    world.do({"joint_positions": Draw("A"), **{name: Draw("A") for name in masses}})
+    assert len(attempts) > 5
+    assert [computed.count(name) for name in masses] == [1] * len(masses)
