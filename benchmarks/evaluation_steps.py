@@ -1,0 +1,91 @@
+"""Where the time of a control step goes in an evaluation, for ``evaluation.py``."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from evaluation_policy import Mlp
+
+from scm_world.env import ScmWorldEnv
+from scm_world.evaluation.arena import Arena, Fingerprint
+from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.policies import as_player
+from scm_world.evaluation.protocols import Protocol
+from scm_world.world import WorldSnapshot
+
+
+class Recorder:
+    """A policy that remembers what it saw and did."""
+
+    def __init__(self) -> None:
+        self._policy = Mlp()
+        self.observations: list[Any] = []
+        self.actions: list[Any] = []
+
+    def __call__(self, observation: Any) -> Any:
+        """Act as the network does."""
+        self.observations.append(observation)
+        self.actions.append(self._policy(observation))
+        return self.actions[-1]
+
+
+def shares(task: str, episodes: int) -> dict[str, float]:
+    """Split the time of a control step, on average over all protocols [µs of the processor].
+
+    Args:
+        task: Name of a task.
+        episodes: Of each protocol; one more is played before, which warms up.
+    """
+    arena = Arena(ScmWorldEnv(task))
+    total: Counter[str] = Counter()
+    for number in range(episodes + 1):
+        for protocol in protocols_of(task):
+            found = split(arena, protocol, number)
+            if number > 0:
+                total.update(found)
+    arena.close()
+    mean = {name: value / total["steps"] * 1e6 for name, value in total.items() if name != "steps"}
+    rest = mean["episode"] - mean["env.step"] - mean["policy"] - mean["fingerprint"]
+    return {**mean, "reset, interventions, the rest": rest}
+
+
+def split(arena: Arena, protocol: Protocol, episode: int) -> dict[str, float]:
+    """Play an episode, and then its parts alone, from the same beginning."""
+    recorder, beginning = Recorder(), list[WorldSnapshot]()
+
+    def watch(env: ScmWorldEnv) -> None:
+        if not beginning:
+            beginning.append(env.world.snapshot())
+
+    arena.play(as_player(recorder), protocol, seed=0, episode=episode, watch=watch)
+    env, world, actions = arena.env, arena.env.world, recorder.actions
+    commands = [env._command(action) for action in actions]
+    player = as_player(Mlp())
+
+    def raw(command: Any) -> None:
+        world.backend.step(world._mode, command, world._substeps)
+
+    found = {
+        "steps": float(len(actions)),
+        "episode": busy(lambda _: arena.play(player, protocol, seed=0, episode=episode), [None]),
+        "policy": busy(player.act, recorder.observations),
+    }
+    world.restore(beginning[0])
+    found["env.step"] = busy(env.step, actions)
+    world.restore(beginning[0])
+    found["physics, in env.step"] = busy(raw, commands)
+    world.restore(beginning[0])
+    mark = Fingerprint(env)
+    found["fingerprint"] = busy(mark.act, actions) + busy(lambda _: mark.look(), actions)
+    return found
+
+
+def busy(function: Callable[[Any], Any], given: Iterable[Any]) -> float:
+    """Call a function with one thing after another; give the seconds of the processor."""
+    started = time.process_time()
+    for one in given:
+        function(one)
+    return time.process_time() - started
