@@ -46,9 +46,11 @@ EXAMPLES = (
     "curricula",
     "discovery",
     "environments",
+    "evaluation",
     "learners",
     "new_family",
     "own_learner",
+    "recording",
 )
 
 

@@ -122,7 +122,9 @@ def discover(
     ] = None,
     policy: Annotated[
         str,
-        typer.Option(help="random, sweep, across, grasp, still; sweep or, by step, random if usual."),
+        typer.Option(
+            help="random, sweep, across, grasp, still; sweep or, by step, random if usual."
+        ),
     ] = "usual",
     steps: Steps = 25,
     sensor_noise: Annotated[

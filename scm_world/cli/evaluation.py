@@ -26,8 +26,8 @@ from scm_world.cli.tasks import build, suffix
 from scm_world.errors import UnknownOption
 from scm_world.evaluation import METRICS, Evaluation, evaluate
 from scm_world.evaluation.files import CODECS
-from scm_world.evaluation.reporting import write_outputs
 from scm_world.evaluation.parts import FOLDER
+from scm_world.evaluation.reporting import write_outputs
 
 INTERRUPTED = 130
 _WORDS = {"true": True, "false": False, "none": None}
@@ -92,12 +92,17 @@ def policies_of(text: str) -> dict[str, list[str]]:
     for word in (part.strip() for part in text.split(",")):
         name, equals, given = word.partition("=")
         runs = (given if equals else word).split("+")
-        label = name.strip() if equals else Path(runs[0]).stem.replace(":", ".")
+        label = name.strip() if equals else _label(runs[0])
         if not word or not all(runs) or not label or label in found:
             allowed = ("names or files, each once; NAME=POLICY gives a name",)
             raise UnknownOption("policy", text, allowed)
         found[label] = runs
     return found
+
+
+def _label(policy: str) -> str:
+    """Name an agent after a file, or after a function."""
+    return policy.replace(":", ".") if ":" in policy else Path(policy).stem
 
 
 def run(options: Options, *, out: Path | None) -> int:

@@ -11,6 +11,7 @@ from scm_world.discovery.learners import Learner, learners
 from scm_world.entities import ACTIONS
 from scm_world.env import IDS
 from scm_world.errors import EngineError
+from scm_world.evaluation import protocols_of
 from scm_world.scene.presets import PRESETS
 from scm_world.tasks import CONVENTIONS, TASKS
 
@@ -37,6 +38,14 @@ def _learner(chosen: Learner) -> Text:
     return Text(f"{chosen.doc} ({', '.join(chosen.takes)}{missing})")
 
 
+def _protocols() -> dict[str, str | Text]:
+    """Say what each protocol varies, where tasks differ in the words of pushing."""
+    common = {protocol.name: protocol.doc for protocol in protocols_of("pushing")}
+    more = {protocol.name: protocol.doc for protocol in protocols_of("reaching")}
+    only = {name: f"{doc}; reaching only" for name, doc in more.items() if name not in common}
+    return {**common, **only}
+
+
 def run() -> None:
     """List what can be chosen."""
     made = table("", "name", "")
@@ -48,6 +57,7 @@ def run() -> None:
         "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},
         "conventions": dict.fromkeys(CONVENTIONS, ""),
         "learners": {name: _learner(chosen) for name, chosen in learners().items()},
+        "protocols": _protocols(),
         "families": {f"{family.name}:N": family.doc for family in FAMILIES.values()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
+from scm_world.curricula.parts import Do
 from scm_world.errors import SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.pipeline import Bench
-from scm_world.evaluation.policies import Player, as_player, player_from
+from scm_world.evaluation.policies import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import Seat, listed
@@ -50,8 +51,8 @@ def bench_of(evaluation: Evaluation, *, policy: Any = None, trusted: Sequence[st
 
     Args:
         evaluation: That was run.
-        policy: Who acted, as it was given to ``evaluate``; made again from what the evaluation
-            says if None.
+        policy: Who acted, as it was given to ``evaluate``; if None the one that it was given in
+            this process, or one made again from what the evaluation says.
         trusted: Packages whose functions may be policies, or parts of protocols.
 
     Raises:
@@ -62,20 +63,15 @@ def bench_of(evaluation: Evaluation, *, policy: Any = None, trusted: Sequence[st
     about = evaluation.about
     if about["task"] not in TASKS:
         raise UnknownOption("task", about["task"], TASKS)
-    options = dict(about["env"])
+    options = _acts(about["env"])
     if about["arguments"]:
         options["task_options"] = about["arguments"]
     place = Place(about["task"], options)
     _same_versions(place, about["versions"])
-    given = _given(policy, about["agents"])
-    seats = [
-        Seat(one["agent"], one["run"], _player(one, given, trusted), one["policy"])
-        for one in about["agents"]
-    ]
     protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
     setup = Setup(
         place,
-        tuple(seats),
+        tuple(_seats(evaluation, policy, trusted)),
         tuple(about["engines"]),
         tuple(protocols),
         tuple(about["seeds"]),
@@ -83,6 +79,30 @@ def bench_of(evaluation: Evaluation, *, policy: Any = None, trusted: Sequence[st
         about["versions"],
     )
     return Bench(setup, trusted)
+
+
+def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[Seat]:
+    """Find who acted: as given now, in a file, as given then, or by its name."""
+    agents = evaluation.about["agents"]
+    given = _given(policy, agents)
+    for one in agents:
+        who, what = (one["agent"], one["run"]), one["policy"]
+        if who in given:
+            player = as_player(given[who])
+        elif who in evaluation.policies and "path" not in what:
+            player = as_player(evaluation.policies[who])
+        else:
+            player = player_from(what, trusted=trusted)
+        yield Seat(*who, player, what)
+
+
+def _acts(options: Any) -> Any:
+    """Read the interventions among the options of an environment, which were written down."""
+    if not isinstance(options, Mapping):
+        return options
+    if isinstance(options.get("kind"), str):
+        return Do({"option": options}).request["option"]
+    return {name: _acts(value) for name, value in options.items()}
 
 
 def _same_versions(place: Place, made: Mapping[str, Mapping[str, str]]) -> None:
@@ -118,15 +138,6 @@ def _given(policy: Any, agents: Sequence[Mapping[str, Any]]) -> dict[tuple[str, 
     return found
 
 
-def _player(
-    one: Mapping[str, Any], given: Mapping[tuple[str, int], Any], trusted: Sequence[str]
-) -> Player:
-    mine = given.get((one["agent"], one["run"]))
-    if mine is not None:
-        return as_player(mine)
-    return player_from(one["policy"], trusted=trusted)
-
-
 def check(
     evaluation: Evaluation,
     *,
@@ -142,7 +153,8 @@ def check(
         evaluation: That was run, here or elsewhere.
         episodes: How many.
         seed: Which ones; by chance if None.
-        policy: Who acted, if it is no file and has no name: as it was given to ``evaluate``.
+        policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
+            what is no file and has no name.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Told how many are done.
 

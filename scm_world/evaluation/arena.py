@@ -91,7 +91,7 @@ class Fingerprint:
 
     def act(self, action: Any) -> None:
         """Take in an action."""
-        self._sum.update(np.ascontiguousarray(action).tobytes())
+        self._sum.update(action.tobytes())
 
     def __str__(self) -> str:
         return self._sum.hexdigest()
@@ -158,39 +158,40 @@ class Arena:
             EvaluationError: The policy gave no action, or an intervention was refused; with the
                 place.
         """
-        env, engine = self.env, self.env.world.backend.name
-        place: dict[str, Any] = {
-            "agent": who[0],
-            "engine": engine,
-            "protocol": protocol.name,
-            "seed": seed,
-            "episode": episode,
-        }
-        with _placed(place, env):
+        engine = self.env.world.backend.name
+        named = (who[0], engine, protocol.name, seed, episode)
+        place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
+        with _placed(place, self.env):
             turn, observation = self.begin(protocol, seed=seed, episode=episode)
-            drawn = _drawn(env, 0)
-            player.begin(env)
-            mark = Fingerprint(env)
-            fractions: list[float] = []
-            total, truncated = 0.0, False
-            while not truncated:
-                if watch is not None:
-                    watch(env)
-                action = player.act(observation)
-                mark.act(action)
-                observation, reward, _, truncated, info = env.step(action)
-                fractions.append(info["fractional_success"])
-                total += float(reward)
-                if not truncated and turn.step(env):
-                    observation, info = env.present()
-                    drawn |= _drawn(env, env.world.index)
-                mark.look()
+            steps, scores, drawn, mark = self._played(player, turn, observation, watch)
+        return Row(*who, engine, protocol.name, seed, episode, steps, scores, drawn, mark)
+
+    def _played(
+        self, player: Player, turn: Turn, observation: Any, watch: Watch | None
+    ) -> tuple[int, dict[str, float], dict[str, list[float]], str]:
+        """Play an episode that has begun; the last four fields of its row."""
+        env, info = self.env, {"is_success": False}
+        drawn = _drawn(env, 0)
+        player.begin(env)
+        mark = Fingerprint(env)
+        fractions: list[float] = []
+        total, truncated = 0.0, False
+        while not truncated:
             if watch is not None:
                 watch(env)
-        scores = scored(fractions, success=bool(info["is_success"]), total=total)
-        return Row(
-            *who, engine, protocol.name, seed, episode, len(fractions), scores, drawn, str(mark)
-        )
+            action = player.act(observation)
+            mark.act(action)
+            observation, reward, _, truncated, info = env.step(action)
+            fractions.append(info["fractional_success"])
+            total += reward
+            if not truncated and turn.step(env):
+                observation, info = env.present()
+                drawn |= _drawn(env, env.world.index)
+            mark.look()
+        if watch is not None:
+            watch(env)
+        scores = scored(fractions, success=bool(info["is_success"]), total=float(total))
+        return len(fractions), scores, drawn, str(mark)
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
         """See whether a protocol fits: begin the first episode with it.

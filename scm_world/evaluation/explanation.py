@@ -86,10 +86,10 @@ class Otherwise:
         return self.would_score - self.score
 
     def __str__(self) -> str:
-        success = "succeeded" if self.would_succeed else "not succeeded"
+        success = "would have succeeded" if self.would_succeed else "would not have succeeded"
         was, would_be = (_numbers(value) for value in (self.was, self.would_be))
         return (
-            f"with {self.variable} = {would_be} instead of {was} it would have {success}: "
+            f"with {self.variable} = {would_be} instead of {was} it {success}: "
             f"{self.would_score:.2f} instead of {self.score:.2f}"
         )
 
@@ -151,7 +151,8 @@ def why(
         metric: What is compared.
         versus: ``"A"``: the variable drawn from its training space; ``"default"``: left as it is
             without the protocol. If None, A where the protocol draws from elsewhere.
-        policy: Who acted, if it is no file and has no name: as it was given to ``evaluate``.
+        policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
+            what is no file and has no name.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Told how many variables are done.
 

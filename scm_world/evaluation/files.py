@@ -111,7 +111,9 @@ def merge(evaluations: Iterable[Evaluation]) -> Evaluation:
     if problems:
         raise ModelError(problems)
     kept = np.array(sorted(first.values()), dtype=np.int64)
-    return Evaluation(_about(listed), {name: column[kept] for name, column in columns.items()})
+    policies = {who: policy for one in listed for who, policy in one.policies.items()}
+    table = {name: column[kept] for name, column in columns.items()}
+    return Evaluation(_about(listed), table, policies)
 
 
 def _differences(one: Evaluation, other: Evaluation) -> list[str]:

@@ -14,6 +14,7 @@ from scm_world.evaluation.parts import read_part, write_part
 from scm_world.evaluation.policies import Player, as_player
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, Shard, prepare
+from scm_world.evaluation.tables import columns_of
 from scm_world.output.durable import locked
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
@@ -132,7 +133,8 @@ def evaluate(
     folder = None if out is None else Path(out)
     with locked(folder) if folder is not None else nullcontext():
         rows = played(setup, workers=workers, folder=folder, trusted=trusted, progress=progress)
-    return Evaluation.of(setup.about(), rows)
+    policies = {(seat.agent, seat.run): seat.policy for seat in setup.seats}
+    return Evaluation(setup.about(), columns_of(rows), policies)
 
 
 def played(

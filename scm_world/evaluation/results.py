@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, final
 
@@ -18,11 +17,19 @@ from scm_world.evaluation.statistics import (
     Causes,
     Interval,
     aggregate,
-    difference_interval,
     find_causes,
     mean_interval,
 )
-from scm_world.evaluation.tables import DRAWN, KEYS, Columns, columns_of, known, means
+from scm_world.evaluation.tables import (
+    DRAWN,
+    KEYS,
+    Columns,
+    columns_of,
+    digest_of,
+    known,
+    means,
+    paired,
+)
 
 SCORE = "last_fractional_success"
 """The metric of the published figures."""
@@ -37,15 +44,21 @@ class Evaluation:
         about: What was evaluated, as plain data: task, options, agents, protocols, seeds, versions.
         columns: The table, each column of shape ``(n,)``: ``KEYS``, ``steps``, ``METRICS``,
             ``hash``, and the values that were drawn (NaN where a variable was not).
+        policies: Who acted, by agent and run, as long as it was in this process; in no file.
     """
 
     about: Mapping[str, Any]
     columns: Columns
+    policies: Mapping[tuple[str, int], Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, about: Mapping[str, Any], rows: Sequence[Row]) -> Evaluation:
         """Make the table of some rows."""
         return cls(about, columns_of(rows))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the policies: not all of them can be pickled."""
+        return {**self.__dict__, "policies": {}}
 
     def __len__(self) -> int:
         return len(self.columns["episode"])
@@ -59,13 +72,7 @@ class Evaluation:
     @cached_property
     def digest(self) -> str:
         """A word that sums up the table, bit for bit, in whatever order its columns are."""
-        found = blake2b(digest_size=16)
-        for name in sorted(self.columns):
-            column = self.columns[name]
-            found.update(f"\0{name}\0".encode())
-            text = "\0".join(column) if column.dtype.kind == "U" else ""
-            found.update(text.encode() if text else np.ascontiguousarray(column).tobytes())
-        return found.hexdigest()
+        return digest_of(self.columns)
 
     # --- what there is ------------------------------------------------------------------------
 
@@ -111,7 +118,7 @@ class Evaluation:
                     raise UnknownOption(name, value, tuple(map(str, self._listed(name))))
                 kept &= self.columns[name] == value
         columns = {name: column[kept] for name, column in self.columns.items()}
-        return Evaluation(self.about, columns)
+        return Evaluation(self.about, columns, self.policies)
 
     def the(self, name: str, given: str | None) -> str:
         """Choose an agent or an engine; where there is only one it need not be named.
@@ -198,7 +205,7 @@ class Evaluation:
         """
         engine = self.the("engine", engine)
         here = self.only(engine=engine, protocol=protocol)
-        return _paired(here.only(agent=one), here.only(agent=other), known(metric))
+        return paired(here.only(agent=one).columns, here.only(agent=other).columns, metric)
 
     def gap(
         self,
@@ -215,7 +222,7 @@ class Evaluation:
             UnknownOption: It did not play the same episodes on both.
         """
         here = self.only(agent=self.the("agent", agent), protocol=protocol)
-        return _paired(here.only(engine=one), here.only(engine=other), known(metric))
+        return paired(here.only(engine=one).columns, here.only(engine=other).columns, metric)
 
     def overall(
         self, metric: str = SCORE, *, agent: str | None = None, engine: str | None = None
@@ -292,16 +299,6 @@ class Evaluation:
         from scm_world.evaluation.files import load
 
         return load(Path(path))
-
-
-def _paired(one: Evaluation, other: Evaluation, metric: str) -> Interval:
-    mine, its = means(one.columns, metric), means(other.columns, metric)
-    if mine.keys() != its.keys():
-        differ = sorted(mine.keys() ^ its.keys())[0]
-        allowed = ("episodes that both have played",)
-        raise UnknownOption("seed and episode of a pair", differ, allowed)
-    units = sorted(mine)
-    return difference_interval([mine[u] for u in units], [its[u] for u in units])
 
 
 __all__ = ["DRAWN", "KEYS", "SCORE", "Columns", "Evaluation"]

@@ -73,6 +73,9 @@ def seats_of(policy: Any, env: ScmWorldEnv, trusted: Sequence[str] | None) -> tu
             traits = _traits(one, player, env)
         except ScmWorldError as error:
             raise EvaluationError({"agent": name, "run": run}, str(error)) from error
+        except Exception as error:
+            error.add_note(f"agent {name}, run {run}, before the first episode")
+            raise
         seats.append(Seat(named("name of an agent", name), run, one, {**player.about, **traits}))
     if not seats:
         raise UnknownOption("policy", policy, ("one or several",))
@@ -137,7 +140,7 @@ def _walked(player: Player, env: Any, steps: int) -> list[bytes]:
     found = []
     for _ in range(steps):
         action: NDArray[Any] = player.act(observation)
-        found.append(np.ascontiguousarray(action).tobytes())
+        found.append(action.tobytes())
         observation, *_, truncated, _ = env.step(walk.uniform(low, high).astype(np.float32))
         if truncated:
             break

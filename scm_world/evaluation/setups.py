@@ -182,7 +182,7 @@ def prepare(
     Raises:
         ScmWorldError: What is wrong, by name.
     """
-    place = _place(task, dict(env or {}))
+    place = _place(task, env)
     engines = _several("backend", backend)
     for engine in engines:
         if not isinstance(engine, str) or engine not in BACKENDS:
@@ -190,7 +190,7 @@ def prepare(
     known = protocols_of(place.name) if place.name in ROLES or protocols is None else ()
     wanted = chosen(protocols, known)
     count = whole_number("n", n, least=1)
-    noises = tuple(whole_number("seed", seed, least=0) for seed in _several("seeds", seeds))
+    noises = tuple(_seed(seed) for seed in _several("seeds", seeds))
     found: dict[str, dict[str, str]] = {}
     seats: tuple[Seat, ...] = ()
     for engine in engines:
@@ -207,14 +207,23 @@ def prepare(
     return setup
 
 
-def _place(task: Task | str, options: dict[str, Any]) -> Place:
+def _place(task: Task | str, env: Any) -> Place:
     if not isinstance(task, Task) and (not isinstance(task, str) or task not in TASKS):
         raise UnknownOption("task", task, TASKS)
+    if not isinstance(env, Mapping | None):
+        raise UnknownOption("env", env, ("options of the environment, by name",))
     allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]
-    for name in options:
+    for name in env or {}:
         if name not in allowed:
             raise UnknownOption("option of the environment", name, allowed)
-    return Place(task, options)
+    return Place(task, dict(env or {}))
+
+
+def _seed(seed: Any) -> int:
+    found = whole_number("seed", seed, least=0)
+    if found >= 2**63:
+        raise UnknownOption("seed", seed, ("any whole number below 2**63",))
+    return found
 
 
 def _several(option: str, given: Any) -> tuple[Any, ...]:

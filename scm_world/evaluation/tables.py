@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.arena import METRICS, Row
+from scm_world.evaluation.statistics import Interval, difference_interval
 
 TEXTS = ("agent", "engine", "protocol", "hash")
 WHOLE = ("run", "seed", "episode", "steps")
@@ -81,3 +83,29 @@ def means(columns: Columns, metric: str) -> dict[tuple[int, int], float]:
     for seed, episode, score in zip(seeds, episodes, columns[metric].tolist(), strict=True):
         found.setdefault((seed, episode), []).append(score)
     return {unit: sum(scores) / len(scores) for unit, scores in found.items()}
+
+
+def paired(one: Columns, other: Columns, metric: str) -> Interval:
+    """Estimate by how much the scores of a table are higher, episode by episode.
+
+    Raises:
+        UnknownOption: They do not have the same episodes, or there is no such metric.
+    """
+    mine, its = means(one, known(metric)), means(other, metric)
+    if mine.keys() != its.keys():
+        differ = sorted(mine.keys() ^ its.keys())[0]
+        allowed = ("episodes that both have played",)
+        raise UnknownOption("seed and episode of a pair", differ, allowed)
+    units = sorted(mine)
+    return difference_interval([mine[u] for u in units], [its[u] for u in units])
+
+
+def digest_of(columns: Columns) -> str:
+    """Sum up a table, bit for bit, in whatever order its columns are."""
+    found = blake2b(digest_size=16)
+    for name in sorted(columns):
+        column = columns[name]
+        found.update(f"\0{name}\0".encode())
+        text = "\0".join(column) if column.dtype.kind == "U" else ""
+        found.update(text.encode() if text else column.tobytes())
+    return found.hexdigest()

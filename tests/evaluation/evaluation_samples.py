@@ -1,4 +1,4 @@
-"""Policies that other processes can import."""
+"""Small evaluations, and policies that other processes can import."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from scm_world.evaluation import METRICS, Evaluation, evaluate
+from scm_world.evaluation.arena import Row
 
 rng = np.random.default_rng(0)
 WEIGHTS = rng.normal(size=(56, 9)).astype(np.float32)
@@ -71,3 +74,42 @@ class Noisy:
     def __call__(self, observation: Any) -> Any:
         """Act at random."""
         return self.rng.uniform(-1, 1, 9)
+
+
+SHORT = {"max_episode_length": 16}
+MASS, START = "tool_block.mass", "tool_block.cylindrical_position"
+
+
+def small(policy: Any = "random", protocols: Any = "P0,P6", **options: Any) -> Evaluation:
+    """Evaluate a few short episodes without physics."""
+    return evaluate(policy, protocols, **{"n": 3, "backend": "fake", "env": SHORT, **options})
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Read all files below a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def by_hand(
+    scores: Any, drawn: Any = None, *, agent: str = "a", protocol: str = "P1", run: int = 0
+) -> list[Row]:
+    """Make rows with given scores of success."""
+    return [
+        Row(
+            agent,
+            run,
+            "fake",
+            protocol,
+            0,
+            episode,
+            10,
+            {**dict.fromkeys(METRICS, 0.0), "last_fractional_success": float(score)},
+            {} if drawn is None else {n: [float(v[episode])] for n, v in drawn.items()},
+            f"{agent}{run}{episode}",
+        )
+        for episode, score in enumerate(scores)
+    ]

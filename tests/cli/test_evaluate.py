@@ -1,0 +1,234 @@
+"""``scm-world evaluate`` and ``scm-world explain``: what they write, print and refuse."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from scm_world.cli import app
+from scm_world.cli.evaluation import policies_of
+from scm_world.errors import UnknownOption
+from scm_world.evaluation import METRICS, Evaluation, protocols_of
+
+QUICK = ("--backend", "fake", "--env", "max_episode_length=3", "--workers", "1")
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run where nothing is lost, on a wide terminal."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "GITHUB_ACTIONS"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def call(*arguments: str) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [*arguments])
+
+
+def results(folder: str = "out", *arguments: str) -> Evaluation:
+    """Evaluate something small into a folder."""
+    given = ("evaluate", "random,still", "--protocols", "P0,P8", "-n", "12", *QUICK, *arguments)
+    done = call(*given, "--out", folder)
+    assert done.exit_code == 0, done.output
+    return Evaluation.load(folder)
+
+
+def test_evaluate_writes_everything_and_prints_a_table() -> None:
+    """JSON, the table of episodes, plots and the report; the table names all scores."""
+    done = call(
+        "evaluate",
+        "mine=random+sweep,still",
+        "picking",
+        "--protocols=P0,P6,P8@2",
+        "-n2",
+        *QUICK,
+        "--seeds=3,4",
+        "--option=tool_block_mass=0.05",
+    )
+    assert done.exit_code == 0, done.output
+    for word in ("mine", "still", "P0", "P8@2", "goal, start from B", "95 % intervals"):
+        assert word in done.stdout
+    (folder,) = Path("scm-world-results").iterdir()
+    assert folder.name.startswith("evaluate-mine-still-picking-tool_block_mass=0.05")
+    found = Evaluation.load(folder)
+    assert (found.task, found.agents, found.protocols) == (
+        "picking",
+        ("mine", "still"),
+        ("P0", "P6", "P8@2"),
+    )
+    assert len(found) == 3 * 3 * 2 * 2
+    assert found.about["arguments"] == {} or found.about["env"]["task_options"]
+    data = json.loads((folder / "results.json").read_text())
+    assert {*METRICS} <= {*data["scores"][0]}
+    names = {path.name for path in folder.iterdir()}
+    assert {"results.json", "episodes.parquet", "bars.png", "report.html", "parts"} <= names
+    assert all(name in " ".join(done.stdout.split()) for name in names - {"parts"})
+
+
+def test_two_engines_show_the_gap() -> None:
+    """A second table has one minus the other."""
+    done = call("evaluate", "still", "--protocols=P8", "-n2", *QUICK, "--backend=fake,mujoco")
+    assert done.exit_code == 0, done.output
+    assert "fake minus mujoco, the same draws on both" in " ".join(done.stdout.split())
+
+
+def test_a_policy_beside_where_it_is_called(tmp_path: Path) -> None:
+    """``module:function`` is found in the present folder, and again for the check."""
+    Path("policies_of_a_test.py").write_text("def lazy(observation):\n    return [0.0] * 9\n")
+    done = call("evaluate", "policies_of_a_test:lazy", "--protocols=P8", "-n3", *QUICK, "--out=o")
+    assert done.exit_code == 0, done.output
+    again = call("evaluate", "--check", "o")
+    assert (again.exit_code, "the same bits in all of them" in again.stdout) == (0, True)
+    assert call("explain", "o", "--protocol=P8", "--episode=1").exit_code == 0
+
+
+def test_check_plays_again() -> None:
+    """Exit code 0 for the same bits; 1 if a number was changed, with the place."""
+    found = results()
+    again = call("evaluate", "--check", "out", "--part", "48")
+    assert again.exit_code == 0, again.output
+    assert "48 of 48 episodes" in again.stdout
+    changed = found.columns["return"] + 1.0
+    Evaluation(found.about, {**found.columns, "return": changed}).save("forged")
+    forged = call("evaluate", "--check", "forged/results.json", "--part", "5")
+    assert forged.exit_code == 1
+    assert "5 differ" in forged.stdout
+    assert "return is" in forged.stdout
+
+
+def test_explain_ranks_causes_and_asks_what_would_have_been() -> None:
+    """A table for each protocol that varies something; one for an episode."""
+    results()
+    done = call("explain", "out", "--agent", "still")
+    assert done.exit_code == 0, done.output
+    assert "P8: still on fake" in done.stdout
+    assert "P0: still" not in done.stdout
+    for word in ("tool_block.mass", "share of variance", "upper - lower third"):
+        assert word in done.stdout
+    nothing = call("explain", "out", "--agent", "still", "--protocol", "P0")
+    assert "nothing is varied" in nothing.stdout
+    one = call(
+        *("explain", "out", "--agent=still", "--protocol=P8", "--episode=3", "--versus=default")
+    )
+    assert one.exit_code == 0, one.output
+    assert "tool_block.mass = 0.02" in one.stdout
+    assert "goal_block.cylindrical_position" in one.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("evaluate",), "give a policy"),
+        (("evaluate", "stil"), "stil"),
+        (("evaluate", "still,still"), "each once"),
+        (("evaluate", "still+"), "each once"),
+        (("evaluate", "a/b=still"), "name of an agent"),
+        (("evaluate", "nowhere.onnx"), "nowhere.onnx"),
+        (("evaluate", "nowhere:lazy"), "nowhere:lazy"),
+        (("evaluate", "still", "pushng"), "pushing"),
+        (("evaluate", "still", "--protocols", "P13"), "P13"),
+        (("evaluate", "still", "--protocols", "P1@x"), "P1@100"),
+        (("evaluate", "still", "--seeds", "a"), "seeds"),
+        (("evaluate", "still", "--backend", "physx"), "physx"),
+        (("evaluate", "still", "--env", "frame_skp=3"), "frame_skip"),
+        (("evaluate", "still", "--env", "frame_skip"), "frame_skip"),
+        (("evaluate", "still", "--option", "color=3"), "color"),
+        (("evaluate", "still", "--metric", "beauty"), "beauty"),
+        (("evaluate", "still", "--format", "parket"), "parquet"),
+        (("evaluate", "still", "-n", "0"), "n"),
+        (("evaluate", "--check", "nowhere"), "nowhere"),
+        (("explain", "nowhere"), "nowhere"),
+        (("explain", "out"), "agent"),
+        (("explain", "out", "--agent=still", "--protocol=P5"), "P5"),
+        (("explain", "out", "--agent=still", "--episode=1"), "needs its protocol"),
+        (("explain", "out", "--agent=still", "--protocol=P8", "--episode=99"), "99"),
+        (("explain", "out", "--agent=still", "--metric=beauty"), "beauty"),
+        (("explain", "out", "--agent=still", "--backend=bullet"), "bullet"),
+    ],
+)
+def test_what_is_wrong_is_told(
+    arguments: tuple[str, ...], said: str, saved: Path, tmp_path: Path
+) -> None:
+    """Exit code 2, the word that is wrong, no traceback, and nothing written."""
+    (tmp_path / "out").symlink_to(saved)
+    done = call(*arguments)
+    assert done.exit_code == 2, done.output
+    assert said in " ".join(done.output.replace("│", " ").split())
+    assert "Traceback" not in done.output
+    assert not [path for path in tmp_path.rglob("*.json") if saved not in path.parents]
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write results once."""
+    from scm_world.evaluation import evaluate
+
+    folder = tmp_path_factory.mktemp("saved")
+    policies = {"still": "still", "random": "random"}
+    evaluate(policies, "P0,P8", n=2, backend="fake", env={"max_episode_length": 3}).save(folder)
+    return folder
+
+
+def test_ctrl_c_keeps_what_is_finished(tmp_path: Path) -> None:
+    """Exit code 130 and what is safe; the same command goes on and writes the same table."""
+    options = ["random", "--protocols=P0,P6", "-n", "400", *QUICK, "--format=csv"]
+    command = [sys.executable, "-m", "scm_world", "evaluate", *options]
+    process = subprocess.Popen(  # noqa: S603 # ours
+        [*command, "--out", "first"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    deadline = time.monotonic() + 120.0
+    while not [*Path("first").glob("parts/*.json")] and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate()
+    assert process.returncode == 130
+    assert "the same command goes on" in said
+    assert 1 <= len([*Path("first").glob("parts/*.json")]) < 32
+    assert not Path("first/results.json").exists()
+    for folder in ("first", "second"):
+        assert call("evaluate", *options, "--out", folder).exit_code == 0
+    first, second = (Path(folder, "episodes.csv").read_bytes() for folder in ("first", "second"))
+    assert first == second
+
+
+def test_policies_have_names() -> None:
+    """Given ones, or those of their files; several files of one name need one."""
+    assert policies_of("a/b.onnx, mine=c.zip+d.zip,pkg.mod:act") == {
+        "b": ["a/b.onnx"],
+        "mine": ["c.zip", "d.zip"],
+        "pkg.mod.act": ["pkg.mod:act"],
+    }
+    for wrong in ("", "a/x.onnx,b/x.onnx", "=still", "mine=", "a,,b"):
+        with pytest.raises(UnknownOption, match="policy"):
+            policies_of(wrong)
+
+
+def test_list_shows_protocols() -> None:
+    """``scm-world list`` has every protocol, with what it varies."""
+    done = call("list")
+    assert done.exit_code == 0
+    for protocol in protocols_of("pushing"):
+        assert f"{protocol.name} " in done.stdout
+        assert protocol.doc in done.stdout
+
+
+def test_scores_of_the_command_are_those_of_the_call() -> None:
+    """The command adds nothing of its own: the same table, bit for bit."""
+    from scm_world.evaluation import evaluate
+
+    policies = {"random": ["random"], "still": ["still"]}
+    mine = evaluate(policies, "P0,P8", n=12, backend="fake", env={"max_episode_length": 3})
+    found = results()
+    assert found == mine
+    assert np.array_equal(found.scores(agent="still"), mine.scores(agent="still"))

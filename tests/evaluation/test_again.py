@@ -1,0 +1,184 @@
+"""Facts about results that are played again, and about those of several machines."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluation_samples import (
+    MASS,
+    SHORT,
+    START,
+    contents,
+    linear,
+    opposite,
+    small,
+)
+
+from scm_world import World
+from scm_world.errors import (
+    ModelError,
+    SnapshotMismatch,
+    UnknownOption,
+)
+from scm_world.evaluation import METRICS, Evaluation, Protocol, check, merge, why
+from scm_world.evaluation import files as files_module
+from scm_world.queries import save_episode
+from scm_world.tasks import make_task
+from scm_world.variables import Draw, Shift, Subset
+
+# --- again ----------------------------------------------------------------------------------------
+
+
+def test_results_pass_the_check(tmp_path: Path) -> None:
+    """Named policies, functions and arrays, from the files alone or with the policy at hand."""
+    found = small({"named": "random", "function": linear})
+    found.save(tmp_path)
+    read = Evaluation.load(tmp_path)
+    told: list[int] = []
+    again = check(
+        read,
+        episodes=99,
+        trusted=["evaluation_samples"],
+        progress=lambda done, _: told.append(done),
+    )
+    assert again
+    assert (again.episodes, told) == (12, [*range(1, 13)])
+    assert check(read, episodes=4, seed=1, policy={"named": "random", "function": linear})
+    with pytest.raises(ModelError, match="trusted"):
+        check(read, episodes=99)
+
+
+@pytest.mark.parametrize("column", ["hash", "return", "steps", f"drawn {START}[0]"])
+def test_a_changed_number_fails_the_check(column: str) -> None:
+    """Whichever column it is in."""
+    found = small("random", "P6")
+    values = found.columns[column].copy()
+    values[1] = "0" * 32 if column == "hash" else values[1] + 1
+    again = check(Evaluation(found.about, {**found.columns, column: values}), episodes=99, seed=0)
+    assert not again
+    assert len(again.wrong) == 1
+    assert "protocol P6, seed 0, episode 1" in again.wrong[0]
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        {"start": {MASS: Draw("B"), "tool_block": {"linear_velocity": Shift([0.1, 0.0, 0.0])}}},
+        {"start": {MASS: "B"}, "random_goal": "A"},
+        {"variables_space": Subset({"*.mass": "A|B", "*.cylindrical_position": "B"})},
+        {"goal_env": True, "frame_skip": np.int64(3), "conventions": "causal_world"},
+        {"task_options": {"fractional_reward_weight": 2, "tool_block_mass": 0.05}},
+    ],
+    ids=str,
+)
+def test_environments_are_made_again(env: dict[str, Any], tmp_path: Path) -> None:
+    """Whatever the options were: from the file alone the same bits come out."""
+    small(env={**SHORT, **env}).save(tmp_path)
+    assert check(Evaluation.load(tmp_path), episodes=99)
+
+
+def test_tasks_are_made_again(tmp_path: Path) -> None:
+    """A task with arguments is the same as its name with them."""
+    task = make_task("pushing", tool_block_mass=0.05)
+    found = small(task=task)
+    found.save(tmp_path)
+    assert check(Evaluation.load(tmp_path), episodes=99)
+    assert found != small()
+
+
+def test_another_policy_fails_the_check() -> None:
+    """Given under the name of the one that acted."""
+    found = small({"mine": linear})
+    assert not check(found, policy=opposite)
+    assert check(found, policy={"mine": linear})
+    for wrong in ({"typo": linear}, {"mine": [linear, linear]}):
+        with pytest.raises(UnknownOption, match="policy"):
+            check(found, policy=wrong)
+
+
+def test_policies_in_memory_are_known_as_long_as_they_are_there() -> None:
+    """In one process they need not be given again; a file does not have them."""
+    found = small({"mine": lambda observation: np.zeros(9), "other": "still"})
+    assert check(found)
+    assert why(found.only(agent="mine"), "P6", 0).others
+    assert check(merge([found, small("random")]), episodes=99)
+    read = pickle.loads(pickle.dumps(found))  # noqa: S301 # ours
+    assert read == found
+    with pytest.raises(UnknownOption, match="give the policy itself"):
+        check(read)
+
+
+def test_other_versions_are_not_compared() -> None:
+    """The error says which version the results were made with, and which one is here."""
+    found = small()
+    versions = {"fake": {**found.about["versions"]["fake"], "numpy": "0.1"}}
+    changed = Evaluation({**found.about, "versions": versions}, found.columns)
+    with pytest.raises(SnapshotMismatch, match=r"numpy 0\.1 \(here"):
+        check(changed)
+
+
+# --- merging --------------------------------------------------------------------------------------
+
+
+def test_parts_of_several_machines_are_one_evaluation() -> None:
+    """Agents, engines, protocols and seeds of several; the same row may be in two of them."""
+    whole = small({"a": "random", "b": "still"}, "P0,P6", seeds=(0, 1))
+    a, b = small({"a": "random"}, "P0,P6", seeds=(0, 1)), small({"b": "still"}, "P6", seeds=(1, 0))
+    rest = small({"b": "still"}, "P0,P6", seeds=(0, 1))
+    merged = merge([a, b, rest])
+    for agent in ("a", "b"):
+        for metric in METRICS:
+            mine, its = (e.scores(metric, agent=agent) for e in (merged, whole))
+            np.testing.assert_array_equal(mine, its)
+    assert check(merged, episodes=99)
+    assert merged.difference("a", "b", "P6") == whole.difference("a", "b", "P6")
+
+
+def changed(found: Evaluation, **about: Any) -> Evaluation:
+    """Give the same rows with something else said of them."""
+    return Evaluation({**found.about, **about}, found.columns)
+
+
+def test_what_differs_is_not_merged() -> None:
+    """Tasks, options, versions, policies and protocols; all problems are told together."""
+    found = small({"a": "random"}, [Protocol("mine", "*.mass")])
+    versions = {"fake": {**found.about["versions"]["fake"], "numpy": "0.1", "python": "2.7"}}
+    for other, said in [
+        (
+            small({"a": "random"}, [Protocol("mine", "*.mass", "B")]),
+            "protocol mine is not the same",
+        ),
+        (small({"a": "still"}, [Protocol("mine", "*.mass")]), "agent a, run 0 is not the same"),
+        (small({"b": "random"}, "P0", task="picking"), "task is 'pushing' in one and 'picking'"),
+        (small({"b": "random"}, "P0", env={"max_episode_length": 9}), "env is"),
+        (changed(found, versions=versions), r"numpy is .* and 0\.1(.|\n)*python is"),
+    ]:
+        with pytest.raises(ModelError, match=said):
+            merge([found, other])
+    hashes = found.columns["hash"].copy()
+    hashes[0] = "0" * 32
+    with pytest.raises(ModelError, match="episode 0 did not happen alike"):
+        merge([found, Evaluation(found.about, {**found.columns, "hash": hashes})])
+    with pytest.raises(ModelError, match="no evaluation"):
+        merge([])
+
+
+def test_one_file_in_two_places_is_one_policy(tmp_path: Path) -> None:
+    """Where a machine keeps a policy does not matter, its content does."""
+    episode = World("pushing", backend="fake").rollout("sweep", seed=0, steps=4)
+    tables = []
+    for name in ("here", "there"):
+        (tmp_path / name).mkdir()
+        save_episode(episode, tmp_path / name / "policy.npz")
+        tables.append(small(str(tmp_path / name / "policy.npz"), out=tmp_path / "out"))
+    assert len(contents(tmp_path / "out")) == 2
+    assert merge(tables) == tables[0]
+
+
+def test_the_formats_are_those_that_are_documented() -> None:
+    """A new one needs a test above."""
+    assert [*files_module.CODECS] == ["parquet", "csv"]

@@ -1,0 +1,184 @@
+"""Facts about results: what the figures mean, and what is kept in files."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_samples import (
+    by_hand,
+    contents,
+    linear,
+    small,
+)
+
+from scm_world.errors import (
+    UnknownOption,
+    UnreadableFile,
+    UnwritableFolder,
+)
+from scm_world.evaluation import METRICS, Evaluation
+from scm_world.evaluation.arena import scored
+from scm_world.output import durable
+
+# --- scores ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fractions", "last", "ends", "full"),
+    [
+        ([0.5], 0.5, 0.5, 0.5),
+        ([1.0, 0.0, 0.5], 0.5, 0.5, 0.5),
+        ([1.0] + [0.0] * 19, 0.0, 0.05, 0.05),
+        ([1.0] + [0.0] * 20, 0.0, 0.0, 1 / 21),
+        ([0.0] * 80 + [1.0] * 20, 1.0, 1.0, 0.2),
+        ([0.0] * 81 + [1.0] * 19, 1.0, 0.95, 0.19),
+    ],
+)
+def test_d12_the_last_steps_are_the_last_ones(
+    fractions: list[float], last: float, ends: float, full: float
+) -> None:
+    """The mean over the last twenty control steps, or over fewer where there are fewer."""
+    found = scored(fractions, success=False, total=0.0)
+    assert found["last_fractional_success"] == last
+    assert found["last_integrated_fractional_success"] == pytest.approx(ends, abs=1e-15)
+    assert found["full_integrated_fractional_success"] == pytest.approx(full, abs=1e-15)
+
+
+def test_published_names_and_figures() -> None:
+    """Means and population standard deviations, as the predecessor writes them."""
+    found = Evaluation.of({"task": "pushing"}, by_hand([0.0, 0.5, 1.0])).published()
+    scores = found["P1"]
+    assert sorted(scores) == sorted(
+        f"{how}_{what}_fractional_success"
+        for how in ("mean", "std")
+        for what in ("last", "last_integrated", "full_integrated")
+    )
+    assert scores["mean_last_fractional_success"] == 0.5
+    assert scores["std_last_fractional_success"] == pytest.approx(np.std([0.0, 0.5, 1.0]))
+
+
+def test_paired_differences_are_surer() -> None:
+    """Where episodes decide most, the paired interval is far narrower than two apart."""
+    hard = np.random.default_rng(0).random(100)
+    rows = by_hand(hard, agent="a") + by_hand(hard + 0.02, agent="b")
+    found = Evaluation.of({"task": "pushing"}, rows)
+    difference = found.difference("b", "a", "P1")
+    assert difference.value == pytest.approx(0.02)
+    assert difference.excludes(0.0)
+    assert difference.width < 0.1 * found.score("P1", agent="a").width
+    with pytest.raises(UnknownOption, match="both have played"):
+        Evaluation.of({}, rows[:-1]).difference("b", "a", "P1")
+
+
+def test_several_runs_are_strata() -> None:
+    """A list of policies is one agent; IQM and the rest are over its runs."""
+    found = small({"mine": ["still", "random", "sweep"], "other": linear})
+    assert found.runs("mine") == (0, 1, 2)
+    assert found.scores(agent="mine").shape == (3, 2, 3)
+    assert set(found.overall(agent="mine")) == {
+        "mean",
+        "median",
+        "interquartile_mean",
+        "optimality_gap",
+    }
+    assert found.score("P0", agent="mine").n == 9
+    assert found.difference("mine", "other", "P0").n == 3
+
+
+def test_what_is_asked_for_must_exist() -> None:
+    """Agents, protocols, metrics, engines and columns, by name."""
+    found = small({"a": "still", "b": "random"})
+    for ask, said in [
+        (lambda: found.score("P0"), "agent"),
+        (lambda: found.score("P0", agent="c"), "agent"),
+        (lambda: found.score("P7", agent="a"), "protocol"),
+        (lambda: found.score("P0", "succes", agent="a"), "did you mean 'success'"),
+        (lambda: found.score("P0", agent="a", engine="bullet"), "engine"),
+        (lambda: found.only(color="red"), "column"),
+        (lambda: found.gap("fake", "bullet", "P0", agent="a"), "engine"),
+        (lambda: found.causes("P7", agent="a"), "protocol"),
+    ]:
+        with pytest.raises(UnknownOption, match=said):
+            ask()
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv"])
+def test_files_keep_every_bit(kind: str, tmp_path: Path) -> None:
+    """Of integers, floats, texts and NaN; the summary has every score with its interval."""
+    found = small({"a": linear, "b": ["random", "still"]}, "P0,P10")
+    summary, table = found.save(tmp_path / "out", kind=kind)
+    for path in (tmp_path / "out", summary):
+        again = Evaluation.load(path)
+        assert again == found
+        assert again.about == json.loads(json.dumps(dict(found.about)))
+        assert {n: c.dtype.kind for n, c in again.columns.items()} == {
+            n: c.dtype.kind for n, c in found.columns.items()
+        }
+    data = json.loads(summary.read_text())
+    assert [*data["scores"][0]] == ["agent", "engine", "protocol", *METRICS]
+    assert len(data["scores"]) == 4
+    assert {"python", "scm-world", "numpy", "fake"} <= set(data["about"]["versions"]["fake"])
+    assert table.suffix == f".{kind}"
+
+
+def test_saving_over_results_is_whole_or_absent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that is full leaves no file half-written."""
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left")
+
+    monkeypatch.setattr(durable.os, "fsync", full)
+    with pytest.raises(UnwritableFolder, match="No space left"):
+        small().save(tmp_path)
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv"])
+@pytest.mark.parametrize(
+    "how", ["no table", "cut", "other table", "no json", "list", "format", "about", "row", "text"]
+)
+def test_damaged_results_are_not_read(how: str, kind: str, tmp_path: Path) -> None:
+    """The error names the file and says what to give."""
+    summary, table = small().save(tmp_path, kind=kind)
+    data = json.loads(summary.read_text())
+    match how:
+        case "no table":
+            table.unlink()
+        case "cut":
+            table.write_bytes(table.read_bytes()[:-20])
+        case "other table":
+            small(seeds=9).save(tmp_path / "other", kind=kind)
+            table.write_bytes((tmp_path / "other" / table.name).read_bytes())
+        case "no json":
+            summary.write_text("{")
+        case "list":
+            summary.write_text("[]")
+        case "format":
+            summary.write_text(json.dumps({**data, "format": "something/1"}))
+        case "about":
+            summary.write_text(json.dumps({**data, "about": {"task": "pushing"}}))
+        case "row":
+            summary.write_text(json.dumps({**data, "table": {"file": table.name}}))
+        case "text":
+            table.write_text("agent\nme\n\0\n")
+    with pytest.raises(UnreadableFile, match=r"results\.json"):
+        Evaluation.load(tmp_path)
+
+
+def test_what_is_not_there_is_not_read(tmp_path: Path) -> None:
+    """Folders without results, files that do not exist, and formats that do not."""
+    for path in (tmp_path, tmp_path / "none", tmp_path / "none.json"):
+        with pytest.raises(UnreadableFile):
+            Evaluation.load(path)
+    with pytest.raises(UnknownOption, match="did you mean 'parquet'"):
+        small().save(tmp_path / "new", kind="parket")
+    assert not (tmp_path / "new").exists()
