@@ -425,6 +425,7 @@ __all__ = [
     "ConflictingTargets",
     "EngineError",
     "EngineFailure",
+    "EvaluationError",
     "Forbidden",
     "Infeasible",
     "InterventionError",

@@ -16,6 +16,7 @@ from scm_world.errors import (
     ConflictingTargets,
     EngineError,
     EngineFailure,
+    EvaluationError,
     Forbidden,
     Infeasible,
     InterventionError,
@@ -161,6 +162,11 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         {"versions": {"mujoco": "3.2", "mujoco-core": "4.0"}, "repair": "pip install x"},
     ),
     (EngineFailure("lost", "fake"), "lost", {"engine": "fake"}),
+    (
+        EvaluationError({"protocol": "P2", "episode": 17}, "the policy gave NaN"),
+        "protocol P2, episode 17: the policy gave NaN",
+        {"place": {"protocol": "P2", "episode": 17}, "reason": "the policy gave NaN"},
+    ),
     (SnapshotMismatch("another scene"), "another scene", {}),
 ]
 

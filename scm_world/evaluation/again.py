@@ -18,7 +18,7 @@ from scm_world.evaluation.policies import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import Seat, listed
-from scm_world.evaluation.setups import Place, Setup, Shard
+from scm_world.evaluation.setups import Place, Setup
 from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -180,17 +180,12 @@ def check(
 def _compared(bench: Bench, evaluation: Evaluation, place: int) -> list[str]:
     """Play one row again; say what is different."""
     row = {name: column[place].item() for name, column in evaluation.columns.items()}
-    setup = bench.setup
-    seats = [(seat.agent, seat.run) for seat in setup.seats]
-    names = [protocol.name for protocol in setup.protocols]
-    seat, protocol = seats.index((row["agent"], row["run"])), names.index(row["protocol"])
-    episode = row["episode"]
-    shard = Shard(seat, row["engine"], protocol, row["seed"], episode, episode + 1)
-    found = Evaluation.of({}, [bench.play(shard, episode)])
+    shard = bench.setup.shard_of(row)
+    found = Evaluation.of({}, [bench.play(shard, shard.first)])
     again = {name: column[0].item() for name, column in found.columns.items()}
     where = ", ".join(f"{key} {row[key]}" for key in KEYS)
     if again["hash"] != row["hash"]:
-        noisy = setup.seats[seat].about.get("repeats") == "no"
+        noisy = bench.setup.seats[shard.seat].about.get("repeats") == "no"
         why = "; the policy gives two actions for one observation" if noisy else ""
         return [f"{where}: other states or actions{why}"]
     return [

@@ -274,11 +274,13 @@ def _drawn(env: ScmWorldEnv, step: int) -> dict[str, list[float]]:
         if at == step
         for name, act in request.items()
     }
-    return {
-        name: np.ravel(env.world[name]).astype(float).tolist()
+    names = tuple(
+        name
         for name, act in asked.items()
         if not isinstance(act, Null) and name in env.world.model and name != "action"
-    }
+    )
+    now = env.world.evaluate(names) if names else {}
+    return {name: np.ravel(now[name]).astype(float).tolist() for name in names}
 
 
 @contextmanager

@@ -170,10 +170,7 @@ def why(
     known(metric)
     bench = bench_of(evaluation, policy=policy, trusted=trusted)
     try:
-        setup = bench.setup
-        seat = next(i for i, s in enumerate(setup.seats) if (s.agent, s.run) == (agent, run))
-        number = next(i for i, p in enumerate(setup.protocols) if p.name == protocol)
-        shard = Shard(seat, engine, number, seed, episode, episode + 1)
+        shard = bench.setup.shard_of({**where, "episode": episode})
         row = bench.play(shard, episode)
         if row.hash != one.columns["hash"][0]:
             raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")

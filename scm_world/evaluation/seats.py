@@ -109,8 +109,13 @@ def _is_several(given: Any) -> bool:
 
 
 def _short(name: str) -> str:
-    """Name an agent by the last part of a path, without what cannot stand in a table."""
-    last = name.replace("\\", "/").rstrip("/").rpartition("/")[2]
+    """Name an agent by the last part of a path or of a module, as it can stand in a table.
+
+    Example:
+        >>> _short("runs/a.onnx"), _short("stable_baselines3.ppo.ppo:PPO")
+        ('a.onnx', 'PPO')
+    """
+    last = name.replace("\\", "/").rstrip("/").rpartition("/")[2].rpartition(":")[2]
     return last.replace(",", " ").strip() or "policy"
 
 

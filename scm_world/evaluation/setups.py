@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world.backends import BACKENDS
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import ROLES, protocols_of
 from scm_world.evaluation.protocols import Protocol, chosen
@@ -125,6 +125,25 @@ class Setup:
             for engine in self.engines
             for seat in range(len(self.seats))
         ]
+
+    def shard_of(self, row: Mapping[str, Any]) -> Shard:
+        """Give the shard of one episode alone.
+
+        Args:
+            row: At least agent, run, engine, protocol, seed and episode.
+
+        Raises:
+            SnapshotMismatch: There is no such agent, run or protocol.
+        """
+        seats = [(seat.agent, seat.run) for seat in self.seats]
+        names = [protocol.name for protocol in self.protocols]
+        who = (row["agent"], row["run"])
+        if who not in seats or row["protocol"] not in names:
+            where = ", ".join(f"{name} {row[name]}" for name in ("agent", "run", "protocol"))
+            raise SnapshotMismatch(f"{where}: what is given has no such agent, run or protocol")
+        episode = row["episode"]
+        seat, protocol = seats.index(who), names.index(row["protocol"])
+        return Shard(seat, row["engine"], protocol, row["seed"], episode, episode + 1)
 
     def key(self, shard: Shard) -> str:
         """Sum up everything that decides what a shard gives."""

@@ -7,6 +7,7 @@ them and draws.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -86,6 +87,12 @@ class Draw(Frozen):
     kind: Literal["draw"] = "draw"
     source: SpaceName | Distribution
     stream: str | None = None
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Show the stream only if there is one."""
+        for name, value in super().__repr_args__():
+            if name != "stream" or value is not None:
+                yield name, value
 
     def __init__(self, source: Any, **fields: Any) -> None:
         if not isinstance(source, Frozen | dict) and source not in SPACES:

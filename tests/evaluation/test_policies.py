@@ -17,9 +17,8 @@ import pytest
 import scm_world
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.policies import NAMES, WorldPolicy, as_player, checked, player_from
+from scm_world.evaluation.policies.mlp import Layer, MlpPolicy
 from scm_world.queries import Random, save_episode
-from scm_world.training import MlpPolicy
-from scm_world.training.policy import Layer
 
 STEPS = 6
 

@@ -19,7 +19,7 @@ from scm_world.evaluation.outputs.captions import Caption, Frame
 from scm_world.evaluation.outputs.looks import metric_words, protocol_words
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.results import DRAWN, KEYS, SCORE, Evaluation
-from scm_world.evaluation.setups import Setup, Shard
+from scm_world.evaluation.setups import Setup
 from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import write_durably
 from scm_world.queries.progress import Progress
@@ -140,15 +140,9 @@ def _play(bench: Bench, evaluation: Evaluation, place: int, film: Film) -> None:
     """
     row = {name: evaluation.columns[name][place].item() for name in (*KEYS, "hash")}
     where = ", ".join(f"{key} {row[key]}" for key in KEYS)
-    seats = [(seat.agent, seat.run) for seat in bench.setup.seats]
-    names = [protocol.name for protocol in bench.setup.protocols]
-    who = (row["agent"], row["run"])
-    if who not in seats or row["protocol"] not in names:
-        raise SnapshotMismatch(f"{where}: what is given has no such agent, run or protocol")
-    seat, protocol, episode = seats.index(who), names.index(row["protocol"]), row["episode"]
-    shard = Shard(seat, row["engine"], protocol, row["seed"], episode, episode + 1)
+    shard = bench.setup.shard_of(row)
     with film:
-        again = bench.play(shard, episode, watch=film)
+        again = bench.play(shard, shard.first, watch=film)
     if again.hash != row["hash"]:
         raise SnapshotMismatch(
             f"{where}: played again, something else happened; give the policies and the versions "

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from scm_world.errors import UnreadableFile
-from scm_world.training import load_sb2, sb2
+from scm_world.evaluation.policies import sb2
+from scm_world.training import load_sb2
 
 
 class Golden(NamedTuple):
