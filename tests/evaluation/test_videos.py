@@ -55,7 +55,10 @@ def frames(path: Path) -> tuple[list[Any], float]:
 
     clip = VideoFileClip(str(path))
     found, rate = list(clip.iter_frames()), float(clip.fps)
+    process = clip.reader.proc
     clip.close()
+    for pipe in (process.stdout, process.stderr):
+        pipe.close()  # which moviepy forgets if the process has ended by then
     return found, rate
 
 
