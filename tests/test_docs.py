@@ -47,6 +47,7 @@ EXAMPLES = (
     "discovery",
     "environments",
     "evaluation",
+    "grasping",
     "learners",
     "new_family",
     "own_learner",
@@ -74,7 +75,9 @@ def test_import_is_silent_and_light() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-@pytest.mark.parametrize("name", ["scm_world", "scm_world.discovery"])
+@pytest.mark.parametrize(
+    "name", ["scm_world", "scm_world.curricula", "scm_world.discovery", "scm_world.evaluation"]
+)
 def test_all_is_honest(name: str) -> None:
     """Every public name of a package exists, and is what its other spelling means."""
     package = importlib.import_module(name)
