@@ -17,6 +17,13 @@ ENV = Annotated[
         help="Option of the environment, such as frame_skip=3; give it once for each.",
     ),
 ]
+TRUST = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="PACKAGE",
+        help="Package whose functions may be called because results name them; once for each.",
+    ),
+]
 METRIC = "last_fractional_success"
 
 
@@ -56,6 +63,7 @@ def evaluate(
         typer.Option(help="Play a random part of these results again, and compare every bit."),
     ] = None,
     part: Annotated[int, typer.Option(min=1, help="Episodes that --check plays.")] = 12,
+    trust: TRUST = None,
 ) -> None:
     """Find out how well policies do in protocols, with intervals.
 
@@ -66,7 +74,7 @@ def evaluate(
     from scm_world.cli import evaluation, explanation
 
     if check is not None:
-        raise typer.Exit(explanation.check_again(check, part, policy))
+        raise typer.Exit(explanation.check_again(check, part, policy, tuple(trust or ())))
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     options = evaluation.Options(
@@ -101,11 +109,12 @@ def explain(
     versus: Annotated[
         str | None, typer.Option(help="A: from the training space; default: left as it is.")
     ] = None,
+    trust: TRUST = None,
 ) -> None:
     """Say which variables decided the scores, or what an episode would have been without them."""
     from scm_world.cli import explanation
 
-    where = explanation.Where(results, agent, backend, metric)
+    where = explanation.Where(results, agent, backend, metric, tuple(trust or ()))
     if episode is None:
         raise typer.Exit(explanation.show_causes(where, protocol))
     if protocol is None:

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, final
 
+from rich.markup import escape
 from rich.text import Text
 
 from scm_world.cli.assignments import parse_assignments
@@ -91,7 +92,9 @@ def policies_of(text: str) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for word in (part.strip() for part in text.split(",")):
         name, equals, given = word.partition("=")
-        runs = (given if equals else word).split("+")
+        if Path(word).is_file():  # a path may have any letters
+            name, equals, given = "", "", word
+        runs = [word] if Path(word).is_file() else (given if equals else word).split("+")
         label = name.strip() if equals else _label(runs[0])
         if not word or not all(runs) or not label or label in found:
             allowed = ("names or files, each once; NAME=POLICY gives a name",)
@@ -168,7 +171,7 @@ def _tables(found: Evaluation, metric: str) -> Iterable[Any]:
     title = f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals"
     doers = [(agent, engine) for engine in found.engines for agent in found.agents]
     heads = [agent if len(found.engines) == 1 else f"{agent}, {engine}" for agent, engine in doers]
-    made = table("protocol", "varied", *heads, title=title)
+    made = table("protocol", "varied", *map(escape, heads), title=title)
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
     for protocol in found.protocols:
         scores = (
@@ -183,7 +186,9 @@ def _tables(found: Evaluation, metric: str) -> Iterable[Any]:
 
 def _gaps(found: Evaluation, metric: str) -> Any:
     one, other = found.engines
-    made = table("protocol", *found.agents, title=f"{one} minus {other}, the same draws on both")
+    made = table(
+        "protocol", *map(escape, found.agents), title=f"{one} minus {other}, the same draws on both"
+    )
     for protocol in found.protocols:
         gaps = (found.gap(one, other, protocol, metric, agent=agent) for agent in found.agents)
         made.add_row(protocol, *(Text(str(gap)) for gap in gaps))

@@ -13,6 +13,7 @@ from scm_world.cli.console import console, keep_whole, show, table
 from scm_world.cli.evaluation import policies_of
 from scm_world.cli.questions import shown_episodes
 from scm_world.evaluation import Causes, Evaluation, check, why
+from scm_world.evaluation.files import false_scores
 
 SHOWN = 8  # variables that are listed
 NOTHING = "nothing is varied in it"
@@ -22,29 +23,30 @@ def _policy(text: str | None) -> Any:
     return None if text is None else policies_of(text)
 
 
-def check_again(path: Path, episodes: int, policy: str | None) -> int:
+def check_again(
+    path: Path, episodes: int, policy: str | None, trusted: tuple[str, ...] = ()
+) -> int:
     """Play a part of some results again; return the exit code."""
-    sys.path.insert(0, str(Path.cwd()))
+    _look_here(trusted, policy)
     results = Evaluation.load(path)
-    trusted = _own(results)
+    false = false_scores(path, results)
     with shown_episodes() as progress:
         found = check(
             results, episodes=episodes, policy=_policy(policy), trusted=trusted, progress=progress
         )
     terminal = console()
-    for line in found.wrong:
+    for line in (*false, *found.wrong):
         terminal.print(Text(line), soft_wrap=True)
     said = "the same bits in all of them" if found else f"{len(found.wrong)} differ"
     chosen = f"{found.episodes} of {len(results)} episodes, chosen with seed {found.seed}"
     terminal.print(f"played again: {chosen}: {said}", soft_wrap=True)
-    return 0 if found else 1
+    return 0 if found and not false else 1
 
 
-def _own(results: Evaluation) -> tuple[str, ...]:
-    """Name the packages of policies that are functions: who checks results has them at hand."""
-    policies = [agent["policy"] for agent in results.about["agents"]]
-    names = [str(one["name"]) for one in policies if one.get("kind") == "function"]
-    return tuple({name.partition(":")[0].partition(".")[0] for name in names})
+def _look_here(trusted: tuple[str, ...], policy: str | None) -> None:
+    """Find modules of one's own beside where the command is called, if they are asked for."""
+    if trusted or policy is not None:
+        sys.path.insert(0, str(Path.cwd()))
 
 
 @final
@@ -57,12 +59,14 @@ class Where:
         agent: Who acted, if there are several.
         engine: On which engine, if there are several.
         metric: Score that is explained.
+        trusted: Packages whose functions may be policies.
     """
 
     path: Path
     agent: str | None
     engine: str | None
     metric: str
+    trusted: tuple[str, ...] = ()
 
 
 def show_causes(where: Where, protocol: str | None) -> int:
@@ -95,7 +99,7 @@ def _causes(found: Causes, title: str) -> Any:
 
 def show_otherwise(where: Where, protocol: str, episode: int, versus: str | None) -> int:
     """Print what an episode would have been; return the exit code."""
-    sys.path.insert(0, str(Path.cwd()))
+    _look_here(where.trusted, None)
     results = Evaluation.load(where.path)
     with shown_episodes() as progress:
         found = why(
@@ -106,7 +110,7 @@ def show_otherwise(where: Where, protocol: str, episode: int, versus: str | None
             engine=where.engine,
             metric=where.metric,
             versus=versus,
-            trusted=_own(results),
+            trusted=where.trusted,
             progress=progress,
         )
     title = f"{protocol}, episode {episode}: {where.metric.replace('_', ' ')} {found.score:.3g}"

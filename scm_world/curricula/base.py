@@ -9,11 +9,11 @@ from typing import Annotated, Any, ClassVar, Literal, final
 
 from pydantic import PlainSerializer, PlainValidator, ValidationError
 
-from scm_world.curricula.situations import Memory, Situation
+from scm_world.curricula.situations import STREAM, Memory, Situation
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.queries.timed import as_act
-from scm_world.variables import Function, Intervention
+from scm_world.variables import Draw, Function, Intervention
 from scm_world.variables.spaces import Frozen
 from scm_world.world.declaration import Declaration
 
@@ -169,8 +169,16 @@ class Do(Part):
         super().__init__(request=acts_of(request), **fields)  # type: ignore[call-arg]
 
     def acts(self, situation: Situation) -> Acts:
-        """Give the intervention."""
-        return dict(self.request) if situation.due else {}
+        """Give the intervention; its draws have noises of their own."""
+        return dict(self._acts) if situation.due else {}
+
+    @cached_property
+    def _acts(self) -> Acts:
+        own = {"stream": f"{STREAM}/{self.key}"}
+        return {
+            name: act.model_copy(update=own) if isinstance(act, Draw) and not act.stream else act
+            for name, act in self.request.items()
+        }
 
     def names(self) -> Iterator[str]:
         """List what it sets."""

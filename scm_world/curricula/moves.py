@@ -73,7 +73,11 @@ class Interpolate(Part):
     def _between(self, situation: Situation, name: str, share: float) -> Value:
         variable = situation.declaration.model.declared(name)
         begin = self.start.get(name)
-        one = situation.world[name] if begin is None else variable.array(begin)
+        if begin is None:
+            usual = situation.initial.get(name)
+            one = situation.world[name] if usual is None else usual
+        else:
+            one = variable.array(begin)
         other = variable.array(self.stop[name])
         if isinstance(variable.bounds, Rotations):
             return _turned(one, other, share)

@@ -14,6 +14,7 @@ from scm_world.variables import Box, Cylinder, Distribution, Draw, Normal, Subse
 from scm_world.variables.checks import check_draw, check_region
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
+from scm_world.variables.subsets import refuse_infinite
 from scm_world.world.declaration import Declaration
 
 __all__ = ["Acts", "AnyPart", "Do", "Goal", "Part", "Resample", "as_part"]
@@ -50,6 +51,7 @@ class Resample(Part):
         space = fields.get("space", "A")
         if not (isinstance(space, Frozen | dict) or space in SPACES):
             raise UnknownOption("space", space, (*SPACES, "a Subset", "a distribution"))
+        refuse_infinite("space", space)
         super().__init__(what=words("what", what), **fields)  # type: ignore[call-arg]
 
     def acts(self, situation: Situation) -> Acts:

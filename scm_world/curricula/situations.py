@@ -87,6 +87,8 @@ class Situation:
         due: Whether what has no time of its own acts now.
         first: Where bodies come and go: what decides that, which is asked for before all else,
             so that the rest finds the bodies that there are then; else None.
+        initial: Values at the beginning of the episode, before anything was done, of what parts
+            ask for.
     """
 
     world: World
@@ -95,6 +97,7 @@ class Situation:
     memory: Memory
     due: bool
     first: frozenset[str] | None = None
+    initial: Mapping[str, Value] = field(default_factory=dict)
 
     @property
     def declaration(self) -> Declaration:

@@ -155,7 +155,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
         Args:
             seed: Of the noise.
-            options: As without this wrapper; what ``"do"`` sets, the curriculum leaves alone.
+            options: As without this wrapper; what ``"do"`` sets, the curriculum leaves alone for
+                the whole episode, and ``"episode"`` is the number of the episode for it, too.
 
         Raises:
             InterventionError: An intervention was refused.
@@ -164,6 +165,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if self._next is not None:
             episode, memory = self._next
             self._turn.memory = Memory(episode, memory.stages)
+        elif options and options.get("episode") is not None:
+            self._turn.memory.episode = whole_number("episode", options["episode"], least=0)
         if self._place is not None and seed is None:
             seed, number = self._place
             options = {"episode": number, **(options or {})}
@@ -237,12 +240,16 @@ def _plain(curriculum: Curriculum) -> Any:
     return data
 
 
+REMEMBER = ("DelayObservation", "NormalizeObservation")
+"""Wrappers of Gymnasium that count how often they are asked."""
+
+
 def _refuse_forgetful(layers: Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]) -> None:
     """Refuse wrappers inside whose observations cannot be made again after an intervention."""
     for layer in layers:
-        if isinstance(layer, gymnasium.ObservationWrapper):
+        name = type(layer).__name__
+        if isinstance(layer, gymnasium.ObservationWrapper) and name not in REMEMBER:
             continue
-        if layer.observation_space != layer.env.observation_space:
-            name = type(layer).__name__
+        if name in REMEMBER or layer.observation_space != layer.env.observation_space:
             allowed = (f"ObservationWrapper; put {name} around the curriculum",)
             raise UnknownOption("wrapper inside of CurriculumEnv", name, allowed)

@@ -22,7 +22,7 @@ from scm_world.evaluation.setups import Place, Setup
 from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.tasks import TASKS
+from scm_world.tasks import TASKS, Task
 from scm_world.world.start import whole_number
 
 
@@ -46,13 +46,20 @@ class Check:
         return not self.wrong
 
 
-def bench_of(evaluation: Evaluation, *, policy: Any = None, trusted: Sequence[str] = ()) -> Bench:
+def bench_of(
+    evaluation: Evaluation,
+    *,
+    policy: Any = None,
+    task: Task | None = None,
+    trusted: Sequence[str] = (),
+) -> Bench:
     """Prepare to play episodes of an evaluation again.
 
     Args:
         evaluation: That was run.
         policy: Who acted, as it was given to ``evaluate``; if None the one that it was given in
             this process, or one made again from what the evaluation says.
+        task: Where, if it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
 
     Raises:
@@ -61,12 +68,7 @@ def bench_of(evaluation: Evaluation, *, policy: Any = None, trusted: Sequence[st
         UnreadableFile: The file of a policy is another one by now.
     """
     about = evaluation.about
-    if about["task"] not in TASKS:
-        raise UnknownOption("task", about["task"], TASKS)
-    options = _acts(about["env"])
-    if about["arguments"]:
-        options["task_options"] = about["arguments"]
-    place = Place(about["task"], options)
+    place = _place(about, task)
     _same_versions(place, about["versions"])
     protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
     setup = Setup(
@@ -79,6 +81,28 @@ def bench_of(evaluation: Evaluation, *, policy: Any = None, trusted: Sequence[st
         about["versions"],
     )
     return Bench(setup, trusted)
+
+
+def _place(about: Mapping[str, Any], task: Task | None) -> Place:
+    """Find where the episodes happened.
+
+    Raises:
+        UnknownOption: Its task is one of the user's own, and is not given, or another one is.
+    """
+    options = _acts(about["env"])
+    if task is not None:
+        place = Place(task, options)
+        now = place.about()
+        if any(now.get(key) != about.get(key) for key in ("task", "arguments", "class")):
+            made = about.get("class", about["task"])
+            raise UnknownOption("task", task, (f"{made} with {about['arguments']}",))
+        return place
+    if "class" in about or about["task"] not in TASKS:
+        allowed = (*TASKS, "one of your own, if it is given: task=")
+        raise UnknownOption("task", about.get("class", about["task"]), allowed)
+    if about["arguments"]:
+        options["task_options"] = about["arguments"]
+    return Place(about["task"], options)
 
 
 def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[Seat]:
@@ -144,6 +168,7 @@ def check(
     episodes: int = 12,
     seed: int | None = None,
     policy: Any = None,
+    task: Task | None = None,
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Check:
@@ -155,6 +180,7 @@ def check(
         seed: Which ones; by chance if None.
         policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
             what is no file and has no name.
+        task: Where, if it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Told how many are done.
 
@@ -165,7 +191,7 @@ def check(
     count = min(whole_number("episodes", episodes, least=1), len(evaluation))
     drawn = secrets.randbits(32) if seed is None else whole_number("seed", seed, least=0)
     places = np.random.default_rng(drawn).choice(len(evaluation), count, replace=False)
-    bench = bench_of(evaluation, policy=policy, trusted=trusted)
+    bench = bench_of(evaluation, policy=policy, task=task, trusted=trusted)
     wrong = []
     try:
         for done, place in enumerate(sorted(places.tolist())):

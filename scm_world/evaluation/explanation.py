@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, final
 
 import numpy as np
+from pydantic import PrivateAttr
 
 from scm_world.curricula.parts import Acts, AnyPart, Part
 from scm_world.curricula.situations import Situation
@@ -20,7 +21,9 @@ from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.evaluation.setups import Shard
 from scm_world.evaluation.tables import known
 from scm_world.queries.progress import Progress
+from scm_world.tasks import Task
 from scm_world.variables import Draw
+from scm_world.world import World
 
 VERSUS = ("A", "default")
 SAME = "it would have been the same"
@@ -41,6 +44,12 @@ class Instead(Part):
     of: AnyPart
     name: str
     versus: Literal["A", "default"]
+    _found: set[str] = PrivateAttr(default_factory=set)
+
+    @property
+    def found(self) -> set[str]:
+        """The name, once the part has set the variable."""
+        return self._found
 
     def parts(self) -> tuple[Part, ...]:
         """Give the part."""
@@ -51,6 +60,7 @@ class Instead(Part):
         acts = self.of.acts(situation)
         if self.name not in acts:
             return acts
+        self._found.add(self.name)
         act = acts[self.name]
         rest = {name: act for name, act in acts.items() if name != self.name}
         if self.versus == "default":
@@ -132,6 +142,7 @@ def why(
     metric: str = SCORE,
     versus: str | None = None,
     policy: Any = None,
+    task: Task | None = None,
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Explanation:
@@ -153,6 +164,7 @@ def why(
             without the protocol. If None, A where the protocol draws from elsewhere.
         policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
             what is no file and has no name.
+        task: Where, if it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Told how many variables are done.
 
@@ -168,7 +180,7 @@ def why(
     if versus not in (None, *VERSUS):
         raise UnknownOption("versus", versus, VERSUS)
     known(metric)
-    bench = bench_of(evaluation, policy=policy, trusted=trusted)
+    bench = bench_of(evaluation, policy=policy, task=task, trusted=trusted)
     try:
         shard = bench.setup.shard_of({**where, "episode": episode})
         row = bench.play(shard, episode)
@@ -206,13 +218,46 @@ def _others(
             left_out[name] = error.reason
         else:
             scores = row.scores[metric], then.scores[metric], bool(then.scores["success"])
-            found.append(Otherwise(name, tuple(row.drawn[name]), look.value, *scores))
-            if found[-1].was == found[-1].would_be:
-                left_out[found.pop().variable] = SAME
+            would_be = tuple(then.drawn.get(name, look.value))
+            one = Otherwise(name, tuple(row.drawn[name]), would_be, *scores)
+            reason = _no_answer(one, row, then, part.found, arena.env.world)
+            if reason:
+                left_out[name] = reason
+            else:
+                found.append(one)
         if progress is not None:
             progress(done + 1, len(row.drawn))
     best_first = tuple(sorted(found, key=lambda one: -one.gain))
     return Explanation(row.scores[metric], best_first, left_out)
+
+
+def _no_answer(one: Otherwise, row: Row, then: Row, found: set[str], world: World) -> str:
+    """Say why what would have been says nothing about a variable; empty if it does."""
+    if one.variable not in found:
+        return "the protocol does not set it"
+    changed = [
+        n
+        for n in then.drawn
+        if n != one.variable
+        and then.drawn[n] != row.drawn.get(n)
+        and not _follows(world, n, one.variable)
+    ]
+    gone = [n for n in row.drawn if n != one.variable and n not in then.drawn]
+    if changed or gone:
+        return f"{', '.join((*changed, *gone))} would have been drawn anew with it"
+    return SAME if one.was == one.would_be else ""
+
+
+def _follows(world: World, name: str, cause: str) -> bool:
+    """Tell whether the spaces of a variable follow another one, as a height follows a size."""
+    model = world.model
+    if name not in model or cause not in model:
+        return False
+    variable = model.declared(name)
+    causes = {cause, *model.descendants(model.target(cause))}
+    return any(
+        s is not None and not causes.isdisjoint(s.parents()) for s in (variable.a, variable.b)
+    )
 
 
 @dataclass

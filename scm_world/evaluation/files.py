@@ -33,7 +33,11 @@ def save(evaluation: Evaluation, folder: Path, form: str) -> tuple[Path, Path]:
         raise UnknownOption("format", form, CODECS)
     made(folder)
     table, summary = folder / f"{TABLE}.{form}", folder / RESULTS
-    write_durably(table, CODECS[form][0](evaluation.columns))
+    content = CODECS[form][0](evaluation.columns)
+    summary.unlink(missing_ok=True)  # it is of the table that goes
+    for other in CODECS:
+        (folder / f"{TABLE}.{other}").unlink(missing_ok=True)
+    write_durably(table, content)
     data = {
         "format": FORMAT,
         "table": {"file": table.name, "rows": len(evaluation), "digest": evaluation.digest},
@@ -60,6 +64,27 @@ def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
         for engine in evaluation.only(agent=agent).engines
         for mine in [evaluation.only(agent=agent, engine=engine)]
         for protocol in mine.protocols
+    ]
+
+
+def false_scores(path: Path, evaluation: Evaluation) -> list[str]:
+    """Compute the scores of a file again from its table; say which of them are others.
+
+    Args:
+        path: The folder, or its ``results.json``.
+        evaluation: That was read from it.
+    """
+    data = json.loads((path / RESULTS if path.is_dir() else path).read_text(encoding="utf-8"))
+    right = json.loads(json.dumps(summarized(evaluation)))
+    written = data.get("scores")
+    if not isinstance(written, list) or len(written) != len(right):
+        return [f"it has scores of {written and len(written)} rows, its table of {len(right)}"]
+    return [
+        f"{now['agent']}, {now['engine']}, {now['protocol']}: {name} is {then.get(name)!r} in the "
+        f"file, and {now[name]!r} by its table"
+        for now, then in zip(right, written, strict=True)
+        for name in now
+        if now[name] != then.get(name)
     ]
 
 

@@ -150,7 +150,9 @@ def played(
     keys = [setup.key(shard) if folder is not None else "" for shard in shards]
     found: dict[int, list[Row]] = {}
     for place, (shard, key) in enumerate(zip(shards, keys, strict=True)):
-        kept = None if folder is None else read_part(folder, key, shard.stop - shard.first)
+        noisy = setup.seats[shard.seat].about.get("repeats") == "no"  # who may be another by now
+        count = shard.stop - shard.first
+        kept = None if folder is None or noisy else read_part(folder, key, count)
         if kept is not None:
             found[place] = kept
     missing = [place for place in range(len(shards)) if place not in found]

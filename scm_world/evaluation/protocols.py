@@ -19,6 +19,8 @@ from scm_world.variables.spaces import Frozen
 from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/protocol/1"
+LONGEST = 80
+"""Letters of a name; it stands in the names of files."""
 
 
 @final
@@ -123,8 +125,9 @@ def named(what: str, name: Any) -> str:
         UnknownOption: It cannot.
     """
     is_word = isinstance(name, str) and name.isprintable() and name.strip() == name != ""
-    if not is_word or any(letter in name for letter in "/\\,"):
-        raise UnknownOption(what, name, ("a word or several, without slashes and commas",))
+    if not is_word or len(name) > LONGEST or any(letter in name for letter in "/\\,"):
+        allowed = f"a word or several, up to {LONGEST} letters, without slashes and commas"
+        raise UnknownOption(what, name, (allowed,))
     return str(name)
 
 

@@ -20,6 +20,9 @@ from scm_world.evaluation.outputs import (
 from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.queries.progress import Progress
 
+STALE = ("bars.png", "radar.png", "profile.png", "gap.png", "causes*.png", "report.html")
+"""What an earlier evaluation may have left in the folder."""
+
 CORNERS = 3
 """With fewer protocols a radar has no area."""
 
@@ -54,6 +57,9 @@ def write_outputs(
         MissingExtra: Videos are wanted, and moviepy is not installed.
     """
     place = Path(folder)
+    for name in STALE:
+        for old in place.glob(name):
+            old.unlink()
     films: list[Path] = []
     if videos:
         films = _films(evaluation, place, metric, policy, trusted, progress)
@@ -71,7 +77,8 @@ def _pictures(evaluation: Evaluation, metric: str) -> dict[str, Callable[..., An
     found: dict[str, Callable[..., Any]] = {"bars": partial(draw_bars, metric=metric)}
     if len(evaluation.protocols) >= CORNERS:
         found["radar"] = partial(draw_radar, metric=metric)
-    found["profile"] = partial(draw_profile, metric=metric)
+    if _comparable(evaluation):
+        found["profile"] = partial(draw_profile, metric=metric)
     if len(evaluation.engines) > 1:
         found["gap"] = partial(draw_gap, metric=metric)
     if evaluation.drawn():
@@ -81,6 +88,14 @@ def _pictures(evaluation: Evaluation, metric: str) -> dict[str, Callable[..., An
             draw = partial(draw_causes, agent=agent, engine=engine, metric=metric)
             found[name.replace("/", "_")] = draw
     return found
+
+
+def _comparable(evaluation: Evaluation) -> bool:
+    """Tell whether all agents have played the same protocols, and more than one episode of each."""
+    agents = [evaluation.only(agent=agent) for agent in evaluation.agents]
+    same = {frozenset(mine.protocols) for mine in agents} == {frozenset(evaluation.protocols)}
+    least = min(len(mine) / len(mine.protocols) / len(mine.engines) for mine in agents)
+    return same and least > 1
 
 
 def _films(

@@ -20,12 +20,14 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
+from scm_world.evaluation.statistics.intervals import LEVEL
 from scm_world.evaluation.tables import (
     DRAWN,
     KEYS,
     Columns,
     columns_of,
     digest_of,
+    is_rate,
     known,
     means,
     paired,
@@ -141,7 +143,8 @@ class Evaluation:
         """Give the scores of an agent on an engine.
 
         Returns:
-            Shape ``(runs, protocols, episodes)``; episodes in the order of seed and number.
+            Shape ``(runs, protocols, episodes)``, of the protocols that it has played; episodes
+            in the order of seed and number.
 
         Raises:
             UnknownOption: There is no such metric, agent or engine, or protocols do not have the
@@ -150,8 +153,9 @@ class Evaluation:
         known(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine)
+        played = [protocol for protocol in self.protocols if protocol in mine.protocols]
         parts = [
-            [mine.only(run=run, protocol=protocol)._by_unit(metric) for protocol in self.protocols]
+            [mine.only(run=run, protocol=protocol)._by_unit(metric) for protocol in played]
             for run in mine._listed("run")
         ]
         lengths = {len(scores) for row in parts for scores in row}
@@ -174,7 +178,8 @@ class Evaluation:
     ) -> Interval:
         """Estimate the mean score in a protocol, with its 95 % interval over episodes.
 
-        Several training runs are strata: the interval says how sure we are of these runs.
+        Several training runs are strata: the interval says how sure we are of these runs. Where
+        all episodes of a run are one and the same, bit for bit, the score is what it is.
 
         Raises:
             UnknownOption: There is no such protocol, metric, agent or engine.
@@ -182,9 +187,11 @@ class Evaluation:
         known(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine, protocol=protocol)
-        proportion = None if metric != "return" else False
         values, runs = mine.columns[metric], mine.columns["run"]
-        return mean_interval(values, runs, proportion=proportion)
+        if len(set(mine.columns["hash"].tolist())) == len(set(runs.tolist())) < len(values):
+            mean = float(values.mean())  # nothing is random here: one episode, again and again
+            return Interval(mean, mean, mean, LEVEL, len(values))
+        return mean_interval(values, runs, proportion=is_rate(metric, values))
 
     def difference(
         self,
@@ -261,13 +268,14 @@ class Evaluation:
         score_of = means(mine.columns, known(metric))
         units = zip(first.columns["seed"].tolist(), first.columns["episode"].tolist(), strict=True)
         varied = {n: v for n, v in first.drawn().items() if not np.isnan(v).all()}
-        return find_causes(varied, np.array([score_of[unit] for unit in units]))
+        scores = np.array([score_of[unit] for unit in units])
+        return find_causes(varied, scores, proportion=is_rate(metric, scores))
 
     def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
         """Give means and standard deviations under the predecessor's names, by protocol."""
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         found: dict[str, Any] = {}
-        for protocol in self.protocols:
+        for protocol in self.only(agent=agent, engine=engine).protocols:
             mine = self.only(agent=agent, engine=engine, protocol=protocol)
             found[protocol] = {
                 f"{how}_{metric}": float(getattr(np, how)(mine.columns[metric]))

@@ -65,10 +65,11 @@ def seats_of(policy: Any, env: ScmWorldEnv, trusted: Sequence[str] | None) -> tu
         UnknownOption: There is none, or two have one name.
         EvaluationError: One does not fit the environment; with its name.
     """
-    seats = []
+    seats: list[Seat] = []
     for agent, run, one in listed(policy):
         player = as_player(one, trusted=trusted)
         name = _short(str(player.about["name"])) if agent is None else agent
+        name = seats[0].agent if agent is None and seats else name  # a list is one agent
         try:
             traits = _traits(one, player, env)
         except ScmWorldError as error:
@@ -129,7 +130,7 @@ def _traits(policy: Any, player: Player, env: ScmWorldEnv) -> dict[str, str]:
     actions = _walked(player, env, 1 if is_known else _TRIES)
     if is_known:
         return {}
-    found = blake2b(_source(policy), digest_size=8)
+    found = blake2b(source_of(policy), digest_size=8)
     if actions != _walked(player, env, _TRIES):
         return {"traits": found.hexdigest(), "repeats": "no"}
     found.update(b"".join(actions))
@@ -152,7 +153,7 @@ def _walked(player: Player, env: Any, steps: int) -> list[bytes]:
     return found
 
 
-def _source(policy: Any) -> bytes:
+def source_of(policy: Any) -> bytes:
     """Give the text of a function or class, where there is one."""
     inside = policy.policy if isinstance(policy, WorldPolicy) else policy
     inside = inside if inspect.isroutine(inside) or isinstance(inside, type) else type(inside)

@@ -17,7 +17,7 @@ from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import ROLES, protocols_of
 from scm_world.evaluation.protocols import Protocol, chosen
-from scm_world.evaluation.seats import Seat, seats_of
+from scm_world.evaluation.seats import Seat, seats_of, source_of
 from scm_world.queries.experiments.versions import versions
 from scm_world.tasks import TASKS, Task
 from scm_world.world.start import whole_number
@@ -58,16 +58,24 @@ class Place:
             ModelError: Something of it cannot be written down.
         """
         arguments = {} if isinstance(self.task, str) else self.task.given
+        kind = TASKS[self.task] if isinstance(self.task, str) else type(self.task)
+        own = {} if kind is TASKS.get(self.name) else {"class": _class(kind)}
         try:
             return json.loads(  # type: ignore[no-any-return]
                 json.dumps(
-                    {"task": self.name, "arguments": arguments, "env": dict(self.options)},
+                    {"task": self.name, "arguments": arguments, **own, "env": dict(self.options)},
                     default=_plain,
                     allow_nan=False,
                 )
             )
         except (TypeError, ValueError) as error:
             raise ModelError([f"the environment cannot be written down: {error}"]) from None
+
+
+def _class(kind: type[Task]) -> str:
+    """Name a class of tasks that is none of this package, and sum up its text."""
+    text = blake2b(source_of(kind), digest_size=8).hexdigest()
+    return f"{kind.__module__}:{kind.__qualname__} {text}"
 
 
 @final

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.arena import METRICS, Row
 from scm_world.evaluation.statistics import Interval, difference_interval
+from scm_world.evaluation.statistics.proportions import is_binary
 
 TEXTS = ("agent", "engine", "protocol", "hash")
 WHOLE = ("run", "seed", "episode", "steps")
@@ -97,7 +98,14 @@ def paired(one: Columns, other: Columns, metric: str) -> Interval:
         allowed = ("episodes that both have played",)
         raise UnknownOption("seed and episode of a pair", differ, allowed)
     units = sorted(mine)
-    return difference_interval([mine[u] for u in units], [its[u] for u in units])
+    first, second = (np.array([scores[unit] for unit in units]) for scores in (mine, its))
+    binary = is_rate(metric, first) and is_rate(metric, second)
+    return difference_interval(first, second, proportion=binary)
+
+
+def is_rate(metric: str, scores: NDArray[np.float64]) -> bool:
+    """Tell whether scores are failures and successes: not by chance, as fractions may be."""
+    return metric == "success" and is_binary(scores)
 
 
 def digest_of(columns: Columns) -> str:

@@ -127,7 +127,8 @@ def _head(task: Task) -> SCM:
     if missing:
         where = "decides what stands in the world: declare it in shared()"
         raise ModelError([f"{name!r} {where}" for name in missing])
-    return SCM(variable for name, variable in shared.items() if name in wanted)
+    mine = (variable for name, variable in shared.items() if name in wanted)
+    return SCM(task.conventions.adapt(mine))
 
 
 def _with_causes(names: Iterable[str], declared: dict[str, Variable]) -> set[str]:

@@ -88,9 +88,12 @@ def test_a_policy_beside_where_it_is_called(tmp_path: Path) -> None:
     Path("policies_of_a_test.py").write_text("def lazy(observation):\n    return [0.0] * 9\n")
     done = call("evaluate", "policies_of_a_test:lazy", "--protocols=P8", "-n3", *QUICK, "--out=o")
     assert done.exit_code == 0, done.output
-    again = call("evaluate", "--check", "o")
+    refused = call("evaluate", "--check", "o")  # a file does not decide what is run
+    assert refused.exit_code == 2
+    again = call("evaluate", "--check", "o", "--trust", "policies_of_a_test")
     assert (again.exit_code, "the same bits in all of them" in again.stdout) == (0, True)
-    assert call("explain", "o", "--protocol=P8", "--episode=1").exit_code == 0
+    told = call("explain", "o", "--protocol=P8", "--episode=1", "--trust=policies_of_a_test")
+    assert told.exit_code == 0
 
 
 def test_check_plays_again() -> None:

@@ -81,7 +81,7 @@ def test_why_finds_what_broke_an_episode() -> None:
     assert best.would_succeed
     assert best.gain > 0.5
     assert (other.variable, other.gain) == (MASS, 0.0)
-    assert told.left_out == {"goal_block.cartesian_position": "it would have been the same"}
+    assert told.left_out == {"goal_block.cartesian_position": "the protocol does not set it"}
 
 
 def test_why_within_an_episode_and_where_bodies_come() -> None:

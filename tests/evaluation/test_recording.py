@@ -392,7 +392,7 @@ def test_damaged_files_are_refused_by_name(tmp_path: Path) -> None:
         "other columns": lambda table: table.drop_columns(["episode"]),
         "damaged": lambda table: table.drop_columns(["observation"]),
         "other episodes": lambda table: table.slice(0, STEPS),
-        "is not what was written": lambda table: table.slice(1),
+        "in another order": lambda table: table.slice(1),
     }
     for reason, change in changes.items():
         with pytest.raises(UnreadableFile, match=rf"runs\.parquet.*{reason}"):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world._types import Floats
+from scm_world.errors import UnknownOption
 from scm_world.evaluation.outputs.looks import (
     Line,
     Looks,
@@ -65,6 +66,11 @@ def compare_agents(evaluation: Evaluation, engine: str, metric: str = SCORE) -> 
     """
     metric_words(metric)
     here = evaluation.only(engine=engine)
+    for agent in here.agents:
+        missing = set(here.protocols) - set(here.only(agent=agent).protocols)
+        if missing:
+            played = (f"agents that have all played {', '.join(sorted(missing))}",)
+            raise UnknownOption("agent of a comparison", agent, played)
     scores = {agent: here.scores(metric, agent=agent) for agent in here.agents}
     over = "runs" if all(len(one) > 1 for one in scores.values()) else "episodes"
     at = _thresholds(

@@ -47,6 +47,8 @@ class ByNetwork(Playing):
         self._path = path
         try:
             content = path.read_bytes()
+            if _ELSEWHERE in content:
+                raise ValueError("its weights lie in another file; save it as one file")
             self._session = runtime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"]
             )
@@ -106,6 +108,9 @@ def _fits(node: Any, array: Actions) -> bool:
         )
     )
 
+
+_ELSEWHERE = b"\x0a\x08location\x12"
+"""How ONNX writes that weights are kept outside of the file: an entry with this key."""
 
 _ADVICE = (
     "give an ONNX network that takes the observations of the environment, each with a first "

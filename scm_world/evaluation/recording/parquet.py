@@ -79,17 +79,25 @@ def decoded(data: bytes, path: str, trusted: Sequence[str]) -> tuple[Header, lis
     header = Header.read(about.get(KEY), path, trusted)
     try:
         shapes = json.loads(about[SHAPES])
-        numbers = table["episode"].to_numpy()
+        numbers, steps = (table[name].to_numpy() for name in ("episode", "step"))
     except (KeyError, ValueError):
         raise UnreadableFile(path, "it has other columns", ADVICE) from None
     if not np.array_equal(np.unique(numbers), np.arange(len(header.episodes))):
         raise UnreadableFile(path, "it has other episodes than it says", ADVICE)
+    lengths = np.bincount(numbers, minlength=len(header.episodes))
+    if np.any(np.diff(numbers) < 0) or not np.array_equal(steps, _counted(lengths)):
+        raise UnreadableFile(path, "its rows are in another order", ADVICE)
     bounds = np.searchsorted(numbers, np.arange(len(header.episodes) + 1))
     episodes = []
     for number, (start, stop) in enumerate(pairwise(bounds)):
         rows = table.slice(start, stop - start)
         episodes.append(header.episode(number, partial(_numbers, rows, shapes)))
     return header, episodes
+
+
+def _counted(lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Count from 0 in each of several lengths."""
+    return np.concatenate([np.arange(length) for length in lengths])
 
 
 def _numbers(rows: Any, shapes: Mapping[str, Sequence[int]]) -> Numbers:

@@ -152,6 +152,7 @@ def find_causes(
     resamples: int = RESAMPLES,
     permutations: int = PERMUTATIONS,
     seed: int = 0,
+    proportion: bool | None = None,
 ) -> Causes:
     """Estimate the effect of each varied variable on the score.
 
@@ -165,6 +166,7 @@ def find_causes(
         permutations: Of the tests.
         seed: Of both. What is found about one variable does not depend on which others there are,
             except for Holm's correction.
+        proportion: Whether scores are failures and successes; as for ``mean_interval``.
 
     Returns:
         An effect for each variable. Columns that never change and columns that too few episodes
@@ -183,7 +185,7 @@ def find_causes(
         floor_friction   0.00 [0.00, 0.04]  0.765     0.03 [-0.14, 0.19]    floor_friction
     """
     given = numbers("scores", scores)
-    options = _Options(checked_level(level), resamples, permutations, seed)
+    options = _Options(checked_level(level), resamples, permutations, seed, proportion)
     left_out: dict[str, str] = {}
     found = []
     for variable, values in drawn.items():
@@ -211,6 +213,7 @@ class _Options:
     resamples: int
     permutations: int
     seed: int
+    proportion: bool | None = None
     _made: dict[int, Integers] = field(default_factory=dict)
 
     def shuffles(self, n: int) -> Integers:
@@ -274,6 +277,7 @@ def _column(name: str, column: Floats, scores: Floats, options: _Options) -> Col
         level=options.level,
         resamples=options.resamples,
         seed=options.seed,
+        proportion=options.proportion,
     )
     share, p = _share([values], of, options)
     return Column(name, contrast, lower, upper, share, p, len(of))

@@ -122,6 +122,7 @@ def difference_interval(
     level: float = LEVEL,
     resamples: int = RESAMPLES,
     seed: int = 0,
+    proportion: bool | None = None,
 ) -> Interval:
     """Estimate how much higher ``a`` is than ``b``, where both met the same draws.
 
@@ -132,6 +133,7 @@ def difference_interval(
         level: Confidence.
         resamples: Of the bootstrap.
         seed: Of the bootstrap.
+        proportion: Whether they are failures and successes; as for ``mean_interval``.
 
     Returns:
         The mean of ``a - b``. Where every score is 0 or 1 the interval is that of Bonett and
@@ -151,7 +153,8 @@ def difference_interval(
     difference = first - second
     members = strata_of(difference, strata)
     level = checked_level(level)
-    if is_binary(first) and is_binary(second):
+    binary = is_binary(first) and is_binary(second)
+    if binary if proportion is None else proportion:
         return _around(difference, paired_bounds(difference, members, level), level)
     return _bootstrapped(difference, members, level, resamples, seed)
 
@@ -163,6 +166,7 @@ def unpaired_interval(
     level: float = LEVEL,
     resamples: int = RESAMPLES,
     seed: int = 0,
+    proportion: bool | None = None,
 ) -> Interval:
     """Estimate how much higher ``a`` is than ``b``, if the episodes have nothing in common.
 
@@ -172,6 +176,7 @@ def unpaired_interval(
         level: Confidence.
         resamples: Of the bootstrap of each mean.
         seed: Of the bootstrap.
+        proportion: Whether they are failures and successes; as for ``mean_interval``.
 
     Returns:
         The difference of the means. Its ends are recovered from those of the two means.
@@ -188,7 +193,8 @@ def unpaired_interval(
         >>> print(unpaired_interval([1.0] * 56 + [0.0] * 14, [1.0] * 48 + [0.0] * 32))
         0.20 [0.05, 0.33]
     """
-    one, other = (mean_interval(x, level=level, resamples=resamples, seed=seed) for x in (a, b))
+    how: Any = {"level": level, "resamples": resamples, "seed": seed, "proportion": proportion}
+    one, other = (mean_interval(x, **how) for x in (a, b))
     value = one.value - other.value
     below = math.hypot(one.value - one.low, other.high - other.value)
     above = math.hypot(one.high - one.value, other.value - other.low)

@@ -85,6 +85,9 @@ class Grasp:
     air. Heavy blocks are carried slowly, as far as there is time. A block that lies on the wrong
     face stays on it, and one that no two fingers reach stays where it is.
 
+    It is meant for picking, pick and place, stacking two and pushing. Where there are dozens of
+    blocks it begins, and mostly does not finish.
+
     It depends on nothing but the world, without noise, and begins anew with every episode: one
     instance serves any number of episodes and of worlds.
 

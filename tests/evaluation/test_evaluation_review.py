@@ -1,0 +1,162 @@
+"""What a hostile reader of evaluations found, and how it is now."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.curricula import every
+from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, check, evaluate, merge, why
+from scm_world.evaluation.files import false_scores
+from scm_world.evaluation.policies.onnx import ByNetwork
+from scm_world.evaluation.reporting import write_outputs
+from scm_world.tasks import Pushing
+
+SHORT: dict[str, Any] = {"max_episode_length": 3}
+
+
+def tiny(policy: Any = "still", protocols: Any = "P0", **options: Any) -> Evaluation:
+    """Evaluate on the fake engine."""
+    given = {"n": 2, "backend": "fake", "env": SHORT, **options}
+    return evaluate(policy, protocols, **given)
+
+
+def test_what_else_would_have_been_drawn_is_no_answer() -> None:
+    """Where another block would have been elsewhere, too, nothing is said about the first."""
+    found = tiny(task="stacking2", protocols="P6", n=10, backend="mujoco")
+    told = why(found, "P6", 9)
+    reasons = told.left_out.values()
+    assert any("would have been drawn anew with it" in reason for reason in reasons)
+    assert {one.variable for one in told.others}.isdisjoint(told.left_out)
+
+
+def test_a_value_that_was_used_is_told() -> None:
+    """A protocol that acts within episodes is explained with the values of that step."""
+    often = Protocol("often", act=every(2, {"tool_block.mass": "B"}, first=2))
+    (one,) = why(tiny(protocols=often), "often", 0).others
+    assert one.was[0] >= 0.045
+    assert 0.015 <= one.would_be[0] <= 0.045
+    assert one.would_be[0] != 0.02  # its default, which the episode had before
+
+
+def test_what_the_protocol_does_not_set_is_not_explained() -> None:
+    """A draw of the environment's own is told apart."""
+    start = {**SHORT, "start": {"floor_friction": "A"}}
+    told = why(tiny(protocols="P2", env=start), "P2", 0)
+    assert told.left_out["floor_friction"] == "the protocol does not set it"
+
+
+class Bigger(Pushing):
+    """A task of the user's own, under the name of another one."""
+
+    rest = tuple(0.9 * angle for angle in Pushing.rest)
+
+
+def test_a_task_of_ones_own_is_another_one(tmp_path: Path) -> None:
+    """Its results are not those of the task whose name it has, and it is given again."""
+    usual = tiny(task=Pushing(), out=tmp_path)
+    own = tiny(task=Bigger(), out=tmp_path)
+    assert own != usual
+    with pytest.raises(UnknownOption, match="task="):
+        check(own)
+    assert check(own, task=Bigger())
+    with pytest.raises(UnknownOption, match="Bigger"):
+        check(own, task=Pushing())
+
+
+def test_weights_beside_a_network_are_refused(tmp_path: Path) -> None:
+    """They are not summed up with the file, so that others could take their place."""
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "p.onnx"
+    path.write_bytes(b"..\x0a\x08location\x12\x06p.data..")
+    with pytest.raises(UnreadableFile, match="save it as one file"):
+        ByNetwork(path, {"name": "p"})
+
+
+class Noisy:
+    """Draws from a noise of its own."""
+
+    def __init__(self, mean: float) -> None:
+        self.mean, self.noise = mean, np.random.default_rng(0)
+
+    def __call__(self, observation: Any) -> Any:
+        """Act by chance."""
+        return self.noise.uniform(-0.1, 0.1, 9) + self.mean
+
+
+def test_what_a_noisy_policy_did_is_not_used_again(tmp_path: Path) -> None:
+    """Another one could have its name."""
+    first = tiny({"x": Noisy(-0.5)}, out=tmp_path)
+    assert first.about["agents"][0]["policy"]["repeats"] == "no"
+    assert tiny({"x": Noisy(0.5)}, out=tmp_path) != first
+
+
+def test_episodes_without_noise_have_no_interval() -> None:
+    """There is one episode, however often it was played; of several there is."""
+    found = tiny(protocols="P0,P2", n=8)
+    still, drawn = (found.score(protocol, "success") for protocol in ("P0", "P2"))
+    assert (still.low, still.high) == (still.value, still.value)
+    assert drawn.width > 0.0
+
+
+def test_fractions_are_no_rates_by_chance() -> None:
+    """All zero is treated as nearly all zero is."""
+    found = tiny(protocols="P2", n=8)
+    score = found.score("P2", "last_fractional_success")
+    assert (score.low, score.high) == (0.0, 0.0)
+
+
+def test_a_list_is_one_agent() -> None:
+    """Also if it has no name."""
+    found = tiny(["still", "sweep"])
+    assert found.agents == ("still",)
+    assert found.runs("still") == (0, 1)
+
+
+def test_one_episode_is_enough_for_a_report(tmp_path: Path) -> None:
+    """What cannot be said of one episode is left out."""
+    files = {path.name for path in write_outputs(tiny(n=1, protocols="P0,P2"), tmp_path)}
+    assert files >= {"bars.png", "report.html"}
+    assert "profile.png" not in files
+
+
+def test_nothing_of_an_earlier_evaluation_stays(tmp_path: Path) -> None:
+    """Pictures and tables that are not made again are deleted."""
+    for found, kind in ((tiny(protocols="P0,P1,P2"), "parquet"), (tiny(), "csv")):
+        found.save(tmp_path, kind=kind)
+        write_outputs(found, tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert not {"radar.png", "episodes.parquet", "causes.png"} & left
+    assert Evaluation.load(tmp_path) == found
+
+
+def test_forged_scores_are_found(tmp_path: Path) -> None:
+    """They are computed again from the table."""
+    found = tiny(protocols="P2")
+    file, _ = found.save(tmp_path, kind="csv")
+    assert false_scores(tmp_path, found) == []
+    file.write_text(file.read_text().replace('"value": 0.0', '"value": 0.99', 1))
+    assert "0.99" in false_scores(file, Evaluation.load(file))[0]
+
+
+def test_agents_of_other_protocols_can_be_merged_and_shown(tmp_path: Path) -> None:
+    """Each has its own; they are not compared over different ones."""
+    both = merge([tiny({"a": "still"}, "P0,P5"), tiny({"b": "sweep"}, "P5,P8")])
+    assert both.scores(agent="b").shape == (1, 2, 2)
+    assert "profile.png" not in {path.name for path in write_outputs(both, tmp_path)}
+
+
+@WorldPolicy
+def middle(world: Any) -> Any:
+    """Hold the joints in the middle."""
+    return 0.5 * (world.action_low + world.action_high)
+
+
+def test_long_names_are_refused_before_anything_is_played() -> None:
+    """They could not stand in the names of files."""
+    with pytest.raises(UnknownOption, match="80 letters"):
+        tiny({"x" * 300: middle})
