@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, final
+from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, final
 
 from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from scm_world.curricula.situations import STREAM, Memory, Situation
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import flatten
+from scm_world.queries.plans import PACKAGE
 from scm_world.queries.timed import as_act
 from scm_world.variables import Draw, Function, Intervention
 from scm_world.variables.spaces import Frozen
@@ -196,3 +197,45 @@ class Do(Part):
             function = getattr(act, "function", None)
             if isinstance(function, Function):
                 yield function
+
+
+class HasPart(Protocol):
+    """A value that is made of parts."""
+
+    @property
+    def part(self) -> Part:
+        """All that is done."""
+
+
+Made = TypeVar("Made", bound=HasPart)
+
+
+def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str]) -> Made:
+    """Read a value that was written down as plain data.
+
+    Args:
+        kind: Of the value.
+        data: Plain data.
+        form: What its ``"format"`` has to be.
+        trusted: Packages, besides this one, whose functions may be called.
+
+    Raises:
+        ModelError: It is something else, or it calls a function outside of those packages.
+    """
+    what = kind.__name__.lower()
+    if not isinstance(data, Mapping) or data.get("format") != form:
+        raise ModelError([f"not a {what}: expected the format {form!r}"])
+    validate: Any = kind
+    try:
+        made: Made = validate.model_validate({k: v for k, v in data.items() if k != "format"})
+    except (ValidationError, TypeError, ValueError) as error:
+        raise ModelError([f"not a {what}: {error}"]) from None
+    problems = [
+        f"it calls {function.reference!r}; pass trusted=(…) to read it"
+        for part in made.part.walk()
+        for function in part.functions()
+        if not function.is_defined_in((PACKAGE, *trusted))
+    ]
+    if problems:
+        raise ModelError(problems)
+    return made

@@ -9,12 +9,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, final
 
-from pydantic import ValidationError
-
-from scm_world.curricula.base import AnyPart, as_part
+from scm_world.curricula.base import AnyPart, as_part, read_from
 from scm_world.curricula.times import AtStep, Every
 from scm_world.errors import ModelError, UnknownVariable, UnreadableFile
-from scm_world.queries.plans import PACKAGE
 from scm_world.variables import Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.spaces import Frozen
@@ -80,23 +77,9 @@ class Curriculum(Frozen):
             trusted: Packages, besides this one, whose functions may be called.
 
         Raises:
-            ModelError: It is no curriculum, or it names a function outside of those packages.
+            ModelError: It is no curriculum, or it calls a function outside of those packages.
         """
-        if not isinstance(data, Mapping) or data.get("format") != FORMAT:
-            raise ModelError([f"not a curriculum: expected the format {FORMAT!r}"])
-        try:
-            made = cls.model_validate({k: v for k, v in data.items() if k != "format"})
-        except (ValidationError, TypeError, ValueError) as error:
-            raise ModelError([f"not a curriculum: {error}"]) from None
-        problems = [
-            f"it calls {function.reference!r}; pass trusted=(…) to read it"
-            for part in made.part.walk()
-            for function in part.functions()
-            if not function.is_defined_in((PACKAGE, *trusted))
-        ]
-        if problems:
-            raise ModelError(problems)
-        return made
+        return read_from(cls, data, form=FORMAT, trusted=trusted)
 
     @classmethod
     def from_json(cls, text: str, *, trusted: Sequence[str] = ()) -> Curriculum:

@@ -6,13 +6,10 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, final
 
-from pydantic import ValidationError
-
 from scm_world.curricula import Curriculum, as_curriculum, at_step
-from scm_world.curricula.base import words
+from scm_world.curricula.base import read_from, words
 from scm_world.curricula.parts import AnyPart, Part, Resample, as_part
-from scm_world.errors import ModelError, UnknownOption
-from scm_world.queries.plans import PACKAGE
+from scm_world.errors import UnknownOption
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
@@ -101,21 +98,7 @@ class Protocol(Frozen):
         Raises:
             ModelError: It is none, or it calls a function outside of the trusted packages.
         """
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ModelError([f"not a protocol: expected the format {FORMAT!r}"])
-        try:
-            made = cls.model_validate({k: v for k, v in data.items() if k != "format"})
-        except (ValidationError, TypeError, ValueError) as error:
-            raise ModelError([f"not a protocol: {error}"]) from None
-        problems = [
-            f"protocol {made.name} calls {function.reference!r}; pass trusted=(…) to read it"
-            for part in made.part.walk()
-            for function in part.functions()
-            if not function.is_defined_in((PACKAGE, *trusted))
-        ]
-        if problems:
-            raise ModelError(problems)
-        return made
+        return read_from(cls, data, form=FORMAT, trusted=trusted)
 
 
 def named(what: str, name: Any) -> str:
