@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world.curricula.parts import Do
-from scm_world.errors import SnapshotMismatch, UnknownOption
+from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.policies import as_player, player_from
@@ -21,6 +21,7 @@ from scm_world.evaluation.seats import Seat, listed
 from scm_world.evaluation.setups import Place, Setup
 from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import PACKAGE
 from scm_world.queries.progress import Progress
 from scm_world.tasks import TASKS, Task
 from scm_world.world.start import whole_number
@@ -68,7 +69,7 @@ def bench_of(
         UnreadableFile: The file of a policy is another one by now.
     """
     about = evaluation.about
-    place = _place(about, task)
+    place = _place(about, task, trusted)
     _same_versions(place, about["versions"])
     protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
     setup = Setup(
@@ -83,13 +84,14 @@ def bench_of(
     return Bench(setup, trusted)
 
 
-def _place(about: Mapping[str, Any], task: Task | None) -> Place:
+def _place(about: Mapping[str, Any], task: Task | None, trusted: Sequence[str]) -> Place:
     """Find where the episodes happened.
 
     Raises:
         UnknownOption: Its task is one of the user's own, and is not given, or another one is.
+        ModelError: What is done at the start calls a function of no trusted package.
     """
-    options = _acts(about["env"])
+    options = _acts(about["env"], trusted)
     if task is not None:
         place = Place(task, options)
         now = place.about()
@@ -120,13 +122,21 @@ def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Itera
         yield Seat(*who, player, what)
 
 
-def _acts(options: Any) -> Any:
-    """Read the interventions among the options of an environment, which were written down."""
+def _acts(options: Any, trusted: Sequence[str]) -> Any:
+    """Read the interventions among the options of an environment, which were written down.
+
+    Raises:
+        ModelError: One calls a function of no trusted package.
+    """
     if not isinstance(options, Mapping):
         return options
     if isinstance(options.get("kind"), str):
-        return Do({"option": options}).request["option"]
-    return {name: _acts(value) for name, value in options.items()}
+        part = Do({"option": options})
+        for function in part.functions():
+            if not function.is_defined_in((PACKAGE, *trusted)):
+                raise ModelError([f"it calls {function.reference!r}; pass trusted=(…) to read it"])
+        return part.request["option"]
+    return {name: _acts(value, trusted) for name, value in options.items()}
 
 
 def _same_versions(place: Place, made: Mapping[str, Mapping[str, str]]) -> None:

@@ -144,9 +144,9 @@ def merge(evaluations: Iterable[Evaluation]) -> Evaluation:
 def _differences(one: Evaluation, other: Evaluation) -> list[str]:
     """Say what of two evaluations cannot stand in one table."""
     found = [
-        f"{what} is {one.about[what]!r} in one and {other.about[what]!r} in another"
-        for what in ("task", "arguments", "env")
-        if one.about[what] != other.about[what]
+        f"{what} is {one.about.get(what)!r} in one and {other.about.get(what)!r} in another"
+        for what in ("task", "class", "arguments", "env")
+        if one.about.get(what) != other.about.get(what)
     ]
     for engine in one.about["versions"].keys() & other.about["versions"].keys():
         mine, its = one.about["versions"][engine], other.about["versions"][engine]

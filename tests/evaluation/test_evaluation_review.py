@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scm_world.curricula import every
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, check, evaluate, merge, why
 from scm_world.evaluation.files import false_scores
 from scm_world.evaluation.policies.onnx import ByNetwork
@@ -66,6 +66,18 @@ def test_a_task_of_ones_own_is_another_one(tmp_path: Path) -> None:
     assert check(own, task=Bigger())
     with pytest.raises(UnknownOption, match="Bigger"):
         check(own, task=Pushing())
+    with pytest.raises(ModelError, match="class is"):
+        merge([tiny(task=Pushing()), tiny(task=Bigger(), protocols="P2")])
+
+
+def test_a_file_does_not_decide_what_is_called() -> None:
+    """Neither by its policies nor by what its environment begins with."""
+    found = tiny()
+    function = {"kind": "function", "reference": "os:getcwd", "constants": {}}
+    act = {"kind": "mechanism", "function": function, "parents": []}
+    env = {**found.about["env"], "start": {"floor_friction": act}}
+    with pytest.raises(ModelError, match=r"os:getcwd.*trusted"):
+        check(Evaluation({**found.about, "env": env}, found.columns))
 
 
 def test_weights_beside_a_network_are_refused(tmp_path: Path) -> None:
