@@ -7,15 +7,15 @@ A backend holds one scene. It knows bodies, parameters and states, and nothing a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Integers
 from scm_world.scene.controller import ControlMode
 from scm_world.scene.difference import Difference
 from scm_world.scene.scene import ParameterKey, Parameters, Scene
-from scm_world.scene.state import PhysicalState
+from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
 
 
 @final
@@ -149,3 +149,57 @@ class Backend(ABC):
     @abstractmethod
     def n_blocks(self) -> int:
         """How many movable blocks the scene has."""
+
+    @classmethod
+    def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
+        """Give what steps several scenes of this engine in one call.
+
+        Args:
+            backends: All of this class. Each can still be used by itself at any time.
+            threads: That an engine may use which can step several scenes at once.
+        """
+        return OneByOne(backends)
+
+
+class EngineBatch(ABC):
+    """Several scenes of one engine that are stepped in one call.
+
+    That is, bit for bit, the same as stepping one after another.
+    """
+
+    @abstractmethod
+    def step(
+        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
+    ) -> None:
+        """Hold commands for some physics steps.
+
+        Args:
+            which: Numbers of the scenes that are stepped, ascending, shape (m,).
+            mode: What a command means.
+            commands: One for each scene, shape (n, 9) [rad] or [N m].
+            substeps: How many steps of ``preset.timestep``.
+            into: Where their states are written afterwards: the vector of scene i into the first
+                columns of row i, shape (n, at least 27 + 13 k).
+        """
+
+
+@final
+class OneByOne(EngineBatch):
+    """Scenes of an engine that steps one at a time.
+
+    Args:
+        backends: The scenes.
+    """
+
+    def __init__(self, backends: Sequence[Backend]) -> None:
+        self._backends = tuple(backends)
+
+    def step(
+        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
+    ) -> None:
+        """Step the scenes one after another."""
+        for index in which.tolist():
+            backend = self._backends[index]
+            backend.step(mode, commands[index], substeps)
+            size = ROBOT_SIZE + BLOCK_SIZE * backend.n_blocks
+            backend.read(PhysicalState(backend.n_blocks, into[index, :size]))

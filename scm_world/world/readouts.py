@@ -51,7 +51,8 @@ class Readouts:
             )
         )
 
-    def _plan(self, names: tuple[str, ...]) -> tuple[_Step, ...]:
+    def needed(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """List what has to be computed for some variables and for the memory, causes first."""
         wanted: set[str] = set()
         stack = [name for name in (*names, *self.lagged) if name in self._computed]
         while stack:
@@ -60,7 +61,10 @@ class Readouts:
                 wanted.add(name)
                 parents = self._model.declared(name).all_parents
                 stack.extend(p.name for p in parents if p.lag == 0 and p.name in self._computed)
-        return tuple(self._bind(name) for name in self.order if name in wanted)
+        return tuple(name for name in self.order if name in wanted)
+
+    def _plan(self, names: tuple[str, ...]) -> tuple[_Step, ...]:
+        return tuple(self._bind(name) for name in self.needed(names))
 
     def _bind(self, name: str) -> _Step:
         variable: Any = self._model.declared(name)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world._types import ArrayLike, Value, Values
 from scm_world.backends import Backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX, cameras
@@ -16,25 +16,24 @@ from scm_world.errors import NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
 from scm_world.scene import PhysicalState, Scene
 from scm_world.scene.camera import Camera
-from scm_world.scene.kinematics import inverse_kernel
 from scm_world.tasks import Task
 from scm_world.variables import Noise
 from scm_world.variables.catalogue import PRESET
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit
-from scm_world.world.commands import clipped, disturbed
+from scm_world.world.commands import clipped
 from scm_world.world.commit import commit, difference, feasible, refuse_overlaps
 from scm_world.world.declaration import Declaration, Options
-from scm_world.world.declared import Declared
 from scm_world.world.family import Family
 from scm_world.world.following import policy_inputs
 from scm_world.world.proposal import Instant, Proposal
 from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
 from scm_world.world.start import beginning, check_held, the_backend, the_task, whole_number
+from scm_world.world.stepping import Stepped
 
 
-class World(Declared):
+class World(Stepped):
     """A task as a causal model, with an engine that moves it.
 
     Args:
@@ -237,32 +236,6 @@ class World(Declared):
             EngineFailure: The engine lost the state.
         """
         self.advance(clipped(action, *self.declaration.action_bounds, self._action_unit))
-
-    def advance(self, command: Floats) -> None:
-        """Advance one control step with nine finite numbers in their range; see ``step``."""
-        self._require_episode()
-        if self._action_is_held:
-            known = {**self._now, **self.evaluate(self._inputs), "action": command}
-            where = self.moment(self._index)
-            command = self._held.solve(known, moment=where, only=("action",))["action"]
-            command = clipped(command, *self.declaration.action_bounds, self._action_unit)
-        self._readouts.remember()
-        self._now["action"] = command
-        if self._noisy:
-            bounds = self.declaration.action_bounds
-            noise = float(self._now[ACTUATOR_NOISE])
-            command = disturbed(command, *bounds, noise, self.moment(self._index))
-        if self._by_tips:
-            height = float(self._now["robot_height"])
-            joints = self._state.joint_positions
-            inverse_kernel(command, height, joints, self._command, self._reached)
-            command = self._command
-        self.backend.step(self._mode, command, self._substeps)
-        self.backend.read(self._state)
-        self._index += 1
-        self._clock[...] = self._index
-        self._readouts.stale()
-        self._instant = None
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.

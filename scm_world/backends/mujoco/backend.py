@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, final
 
@@ -11,7 +11,14 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
+from scm_world.backends.base import (
+    Backend,
+    Capabilities,
+    Contact,
+    EngineBatch,
+    EngineSnapshot,
+)
+from scm_world.backends.mujoco.batch import MujocoBatch, Seat
 from scm_world.backends.mujoco.contacts import Touches, touches
 from scm_world.backends.mujoco.model import compiled, shape_owners
 from scm_world.backends.mujoco.parameters import couple, slots
@@ -65,12 +72,14 @@ class MujocoBackend(Backend):
     """MuJoCo, with one compiled model per structure and everything else edited in place."""
 
     name: ClassVar[str] = "mujoco"
-    capabilities: ClassVar[Capabilities] = Capabilities()
+    capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
 
     _structure: Structure | None = None
     _instant: Instant | None
     _written: Floats | None
     _touches: Touches | None
+    _seat: Seat | None = None
+    _edited = True
 
     @property
     def version(self) -> str:
@@ -84,6 +93,7 @@ class MujocoBackend(Backend):
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; where the structure is the same, that costs little."""
+        self._seat = None
         if scene.structure == self._structure:
             mujoco.mj_resetData(self._model, self._data)
         else:
@@ -100,6 +110,7 @@ class MujocoBackend(Backend):
         Raises:
             UnknownOption: There is no such parameter. Nothing has changed.
         """
+        self._return()
         if difference.structure is not None:
             difference = self._restructure(difference.structure, difference)
         if difference.parameters:
@@ -125,6 +136,7 @@ class MujocoBackend(Backend):
 
     def read(self, into: PhysicalState) -> None:
         """Write the present state into an existing vector."""
+        self._return()
         vector = into.vector
         read_state(self._positions, self._velocities, self._torques, vector)
         if self._written is not None:
@@ -136,6 +148,7 @@ class MujocoBackend(Backend):
         Raises:
             EngineFailure: A position or velocity is not finite afterwards.
         """
+        self._return()
         if mode is not self._mode:
             self._switch(mode)
         self._command[:] = command
@@ -150,6 +163,7 @@ class MujocoBackend(Backend):
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
+        self._return()
         numbers = np.empty(self._size)
         mujoco.mj_getState(self._model, self._data, numbers, _STATE)
         payload = Payload(
@@ -172,6 +186,7 @@ class MujocoBackend(Backend):
         here = f"{self.name} {self.version}"
         if snapshot.engine != here:
             raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
+        self._seat = None  # nothing of the present counts
         payload: Payload = snapshot.payload
         if payload.structure != self._structure:
             self._load(payload.structure)
@@ -182,6 +197,41 @@ class MujocoBackend(Backend):
         self._touches = payload.touches
         if self._instant is not None:
             self._source = self._instant.source(payload.structure.blocks)
+
+    @classmethod
+    def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
+        """Give what steps several scenes in one call, with C threads."""
+        guests = [backend for backend in backends if isinstance(backend, MujocoBackend)]
+        return MujocoBatch(guests, threads)
+
+    @property
+    def structure(self) -> Structure:
+        """The structure of the scene."""
+        return self._present
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model, with the present parameters."""
+        return self._model
+
+    def depart(self, seat: Seat, mode: ControlMode) -> bool:
+        """Let a seat have the state; tell whether the model has changed since the last time."""
+        if mode is not self._mode:
+            self._switch(mode)
+        edited = self._edited
+        if self._seat is not seat:
+            self._return()
+            seat.take(self._data)
+            self._seat, edited = seat, True
+        self._instant = self._written = self._touches = None
+        self._edited = False
+        return edited
+
+    def _return(self) -> None:
+        """Take the state back from where it is stepped."""
+        if self._seat is not None:
+            self._seat.give_back(self._data)
+            self._seat = None
 
     def close(self) -> None:
         """Free the model and its data."""
@@ -210,11 +260,13 @@ class MujocoBackend(Backend):
         self._torques = data.qfrc_actuator[:N_JOINTS]
         self._command = data.ctrl[:N_JOINTS]
         self._mode = ControlMode.JOINT_POSITIONS
+        self._edited = True
 
     def _switch(self, mode: ControlMode) -> None:
         """Make the nine servos follow positions, or pass torques on."""
         steer(self._model.actuator_gainprm, self._model.actuator_biasprm, mode)
         self._mode = mode
+        self._edited = True
 
     def _edit(self, parameters: Parameters) -> None:
         """Write parameters, then whatever follows from them; those in force cost nothing."""
@@ -230,6 +282,7 @@ class MujocoBackend(Backend):
             if present is not None and given.tobytes() == present.tobytes():
                 continue
             place.write(given)
+            self._edited = True
             constant |= place.constant
             coupled |= place.coupled
             steered |= place.steered
@@ -286,5 +339,6 @@ class MujocoBackend(Backend):
 
     def _last_touches(self) -> Touches:
         if self._touches is None:
+            self._return()
             self._touches = touches(self._data, self._owners)
         return self._touches

@@ -8,7 +8,7 @@ physics step left: whatever is set back to it gets MuJoCo's own numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numba
 import numpy as np
@@ -166,3 +166,41 @@ def finite(positions: Floats, velocities: Floats) -> bool:
     for value in velocities:
         total += value * 0.0
     return total == 0.0
+
+
+_OUTPUT = numba.types.Array(numba.float64, 2, "C", readonly=True)
+
+
+@numba.njit(
+    numba.int64(
+        numba.float64[:, :], numba.float64[:, :], _OUTPUT, numba.int32[::1], numba.float64[:, ::1]
+    ),
+    cache=True,
+)
+def read_states(
+    positions: Floats, velocities: Floats, torques: Floats, which: Any, into: Floats
+) -> int:
+    """Convert MuJoCo's coordinates of several scenes, one to a row.
+
+    Args:
+        positions: MuJoCo's own, shape (n, 9 + 7 k).
+        velocities: MuJoCo's own, shape (n, 9 + 6 k).
+        torques: MuJoCo's own, shape (n, 9 + 6 k).
+        which: The rows, shape (m,).
+        into: Their first columns are written, shape (n, at least 27 + 13 k).
+
+    Returns:
+        A row in which something is not finite; -1 if there is none.
+    """
+    position, velocity = np.empty(positions.shape[1]), np.empty(velocities.shape[1])
+    torque = np.empty(N_JOINTS)
+    end = ROBOT_SIZE + BLOCK_SIZE * ((positions.shape[1] - N_JOINTS) // 7)
+    wrong = -1
+    for i in which:
+        position[:] = positions[i]
+        velocity[:] = velocities[i]
+        torque[:] = torques[i, :N_JOINTS]
+        read_state(position, velocity, torque, into[i, :end])
+        if not finite(position, velocity):
+            wrong = i
+    return wrong

@@ -1,0 +1,171 @@
+"""Many scenes in MuJoCo, stepped in one call by threads of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, final
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from scm_world._types import Floats, Integers
+from scm_world.backends.base import EngineBatch
+from scm_world.backends.mujoco.state import read_states
+from scm_world.errors import EngineFailure
+from scm_world.scene.controller import ControlMode
+from scm_world.scene.scene import Structure
+from scm_world.scene.trifinger import N_JOINTS
+
+KEPT = 4
+"""Structures whose simulations are kept although no scene is in them at the moment."""
+
+
+class Guest(Protocol):
+    """A scene that can be stepped elsewhere; see ``MujocoBackend``."""
+
+    @property
+    def structure(self) -> Structure:
+        """Of the compiled model."""
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model with the present parameters."""
+
+    def depart(self, seat: Seat, mode: ControlMode) -> bool:
+        """Let a seat have the state; tell whether the model has changed since the last time."""
+
+
+@final
+class Seat:
+    """A place in a batch, for one scene.
+
+    Attributes:
+        room: Where it is.
+        index: Of the simulation.
+    """
+
+    __slots__ = ("index", "room")
+
+    def __init__(self, room: _Room, index: int) -> None:
+        self.room, self.index = room, index
+
+    def take(self, data: mujoco.MjData) -> None:
+        """Take over the state of a scene; nothing else of ``mjSTATE_INTEGRATION`` is in use."""
+        room, index = self.room, self.index
+        room.time[index] = data.time
+        room.positions[index] = data.qpos
+        room.velocities[index] = data.qvel
+        room.warm[index] = data.qacc_warmstart
+        room.commands[index] = data.ctrl
+
+    def give_back(self, data: mujoco.MjData) -> None:
+        """Copy everything that the last step left."""
+        self.room.batch.get_data(self.index, data)
+
+
+@final
+class _Room:
+    """The simulations of all scenes of one structure.
+
+    Args:
+        structure: Of the scenes.
+        model: Of any of them.
+        n: How many scenes there could be.
+        threads: That step them.
+    """
+
+    def __init__(self, structure: Structure, model: mujoco.MjModel, n: int, threads: int) -> None:
+        self.structure = structure
+        # An MjData for each scene: contacts of the last step can be asked for.
+        self.batch: Any = Batch(model, n, threads, persistent=True)
+        self.seats = [Seat(self, index) for index in range(n)]
+        self.models: list[mujoco.MjModel] = [model] * n
+        bind = self.batch.bind
+        self.time, self.commands = bind("time"), bind("ctrl")
+        self.positions, self.velocities = bind("qpos"), bind("qvel")
+        self.warm = bind("qacc_warmstart")
+        self.forces = bind("qfrc_actuator")
+
+    def step(self, which: Integers, commands: Floats, substeps: int) -> None:
+        """Hold commands, shape (n, 9), in some of the simulations."""
+        if len(which) == len(self.seats):
+            self.commands[:, :N_JOINTS] = commands
+            self.batch.step(nstep=substeps)
+        else:
+            self.commands[which, :N_JOINTS] = commands[which]
+            self.batch.step(ids=which, nstep=substeps)
+
+
+@final
+class MujocoBatch(EngineBatch):
+    """Scenes of MuJoCo, each with parameters of its own, stepped by C threads.
+
+    While a scene is being stepped here, its state is in a seat; as soon as anything else is asked
+    of it, it takes its state back. Results are, bit for bit, those of single scenes.
+
+    Args:
+        guests: The scenes.
+        threads: That step them; the results do not depend on how many.
+    """
+
+    def __init__(self, guests: Sequence[Guest], threads: int) -> None:
+        self._guests = tuple(guests)
+        self._threads = max(1, min(threads, len(self._guests)))
+        self._rooms: dict[Structure, _Room] = {}
+        self._seats: list[Seat | None] = [None] * len(self._guests)
+
+    def step(
+        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
+    ) -> None:
+        """Hold commands for some physics steps.
+
+        Raises:
+            EngineFailure: A position or velocity is not finite afterwards.
+        """
+        rooms: dict[int, tuple[_Room, list[int]]] = {}
+        changed: set[int] = set()
+        for index in which.tolist():
+            seat = self._seat(index)
+            key = id(seat.room)
+            rooms.setdefault(key, (seat.room, []))[1].append(index)
+            if self._guests[index].depart(seat, mode):
+                seat.room.models[index] = self._guests[index].model
+                changed.add(key)
+        for key, (room, members) in rooms.items():
+            if key in changed:
+                room.batch.set_models(room.models)
+            self._step(room, np.array(members, dtype=np.int32), commands, substeps, into)
+
+    def _step(self, room: _Room, which: Any, commands: Floats, substeps: int, into: Floats) -> None:
+        try:
+            room.step(which, commands, substeps)
+        except SimulationError as error:
+            raise EngineFailure(f"MuJoCo: {error}", "mujoco") from error
+        wrong = read_states(room.positions, room.velocities, room.forces, which, into)
+        if wrong >= 0:
+            said = f"MuJoCo produced a state that is not finite in scene {wrong} of the batch"
+            raise EngineFailure(said, "mujoco")
+
+    def _seat(self, index: int) -> Seat:
+        """Give the seat of a scene in the room of its structure."""
+        guest, seat = self._guests[index], self._seats[index]
+        structure = guest.structure
+        if seat is None or seat.room.structure != structure:
+            self._seats[index] = None
+            seat = self._seats[index] = self._room(structure, guest).seats[index]
+        return seat
+
+    def _room(self, structure: Structure, guest: Guest) -> _Room:
+        found = self._rooms.get(structure)
+        if found is None:
+            self._leave_unused()
+            found = _Room(structure, guest.model, len(self._guests), self._threads)
+            self._rooms[structure] = found
+        return found
+
+    def _leave_unused(self) -> None:
+        used = {id(seat.room) for seat in self._seats if seat is not None}
+        unused = [key for key, room in self._rooms.items() if id(room) not in used]
+        for key in unused[: max(0, len(self._rooms) + 1 - KEPT)]:
+            del self._rooms[key]

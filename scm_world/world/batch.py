@@ -1,0 +1,198 @@
+"""Many worlds that are stepped together, each with its own parameters, noise and clock."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats, Integers
+from scm_world.errors import UnknownOption
+from scm_world.scene.kinematics import inverse_kernel
+from scm_world.world.columns import Table
+from scm_world.world.declaration import Declaration
+from scm_world.world.start import whole_number
+from scm_world.world.world import World
+
+KEPT = 4
+"""Tables of structures that are kept for when these come again."""
+
+
+def cores() -> int:
+    """Count the cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+@final
+class Batch:
+    """Worlds of one task, options and engine, advanced in one call.
+
+    What happens in a world is, bit for bit, what happens if it is stepped alone. Between steps,
+    ``world`` gives a world as it is now, to ask it or to do something to it: use that, not a
+    reference of your own, whose present may be older.
+
+    Args:
+        worlds: They belong to the batch from now on.
+        threads: Of the engine, if it can use several; as many as there are cores if None.
+        names: What ``table`` is to have besides the states.
+
+    Raises:
+        UnknownOption: The worlds are not alike, or the number of threads is none.
+
+    Example:
+        >>> worlds = [World("pushing", backend="fake") for _ in range(3)]
+        >>> for seed, world in enumerate(worlds):
+        ...     world.reset(seed=seed)
+        >>> batch = Batch(worlds, names=["reward"])
+        >>> batch.advance(np.zeros((3, 9)))
+        >>> batch.table(0).column("reward").shape, batch.world(2).index
+        ((3, 1), 1)
+    """
+
+    def __init__(
+        self, worlds: Sequence[World], *, threads: int | None = None, names: Iterable[str] = ()
+    ) -> None:
+        self._worlds = tuple(worlds)
+        if not self._worlds:
+            raise UnknownOption("worlds", [], ("one or more",))
+        kinds = {(world.identity, world.engine) for world in self._worlds}
+        if len(kinds) > 1:
+            raise UnknownOption("worlds", kinds, ("worlds of one task, options and engine",))
+        count = cores() if threads is None else whole_number("threads", threads, least=1)
+        backends = [world.backend for world in self._worlds]
+        self._engine = backends[0].batch(backends, count)
+        self._names = tuple(names)
+        self._tables: dict[Declaration, Table] = {}
+        self._homes: list[Table | None] = [None] * len(self._worlds)
+        self._away = np.zeros(len(self._worlds), dtype=np.bool_)
+        self._all = np.arange(len(self._worlds))
+        self._led: set[int] = set()
+        self._by_tips = self._worlds[0].action_mode == "end_effector_positions"
+        self._told = np.empty((len(self._worlds), 9))
+
+    def __len__(self) -> int:
+        """Count the worlds."""
+        return len(self._worlds)
+
+    def world(self, index: int) -> World:
+        """Give a world as it is now."""
+        world = self._worlds[index]
+        if self._away[index]:
+            table = self._homes[index]
+            if table is not None:
+                table.hand_over(index, world)
+            self._away[index] = False
+        return world
+
+    def table(self, index: int) -> Table:
+        """Give the table in whose row of this number the present of a world is.
+
+        The row is as it was after the last step of that world.
+        """
+        return self._homes[index] or self._table(self._worlds[index])
+
+    def tables(self, rows: Integers) -> list[tuple[Table, Integers]]:
+        """Give the tables of some worlds, each with the rows of those that are in it."""
+        first = self._homes[int(rows[0])] if len(rows) else None
+        homes = self._homes
+        if first is not None and all(homes[row] is first for row in rows.tolist()):
+            return [(first, rows)]
+        found: dict[int, tuple[Table, list[int]]] = {}
+        for row in rows.tolist():
+            table = self.table(row)
+            found.setdefault(id(table), (table, []))[1].append(row)
+        return [(table, np.array(members)) for table, members in found.values()]
+
+    def advance(
+        self, commands: Floats, which: NDArray[np.bool_] | None = None, *, evaluate: bool = True
+    ) -> None:
+        """Advance worlds one control step; see ``World.advance``.
+
+        Args:
+            commands: For each world nine finite numbers in their range, shape (n, 9).
+            which: Who is advanced, shape (n,); all if None.
+            evaluate: Whether to compute what the tables have.
+
+        Raises:
+            NotReset: A world has no episode yet.
+            EngineFailure: The engine lost a state.
+        """
+        rows = self._all if which is None else np.flatnonzero(which)
+        for row in rows[~self._away[rows]].tolist():
+            self._load(row)
+        led = {row: self._lead(row, commands[row]) for row in self._led.intersection(rows.tolist())}
+        for table, members in self.tables(rows):
+            self._step(table, members, commands, led)
+            if evaluate:
+                table.evaluate(members)
+
+    def _step(
+        self, table: Table, rows: Integers, commands: Floats, led: dict[int, tuple[Floats, Floats]]
+    ) -> None:
+        table.remember(rows)
+        table.advance(rows, commands)
+        told = self._told
+        self._tell(table, rows, commands)
+        for row in led.keys() & set(rows.tolist()):
+            decided, told[row] = led[row]
+            table.act(row, decided)
+        for (mode, substeps), members in self._paces(rows):
+            self._engine.step(members, mode, told, substeps, table.matrix)
+        self._away[rows] = True
+
+    def _tell(self, table: Table, rows: Integers, commands: Floats) -> None:
+        """Write what the engine is told, where the action alone decides it."""
+        if not self._by_tips:
+            self._told[rows] = commands[rows]
+            return
+        heights, reached = table.column("robot_height"), np.empty(3, dtype=np.bool_)
+        joints = table.matrix[:, :9]
+        for row in rows.tolist():
+            height = float(heights[row, 0])
+            inverse_kernel(commands[row], height, joints[row], self._told[row], reached)
+
+    def _paces(self, rows: Integers) -> list[tuple[Any, Integers]]:
+        """Tell worlds with different presets apart."""
+        found: dict[Any, list[int]] = {}
+        for row in rows.tolist():
+            found.setdefault(self._worlds[row].pace, []).append(row)
+        if len(found) == 1:
+            return [(next(iter(found)), rows)]
+        return [(pace, np.array(members)) for pace, members in found.items()]
+
+    def _load(self, row: int) -> None:
+        """Take a world as it is now into its row."""
+        world = self._worlds[row]
+        table = self._homes[row] = self._table(world)
+        table.load(row, world)
+        if world.is_led:
+            self._led.add(row)
+        else:
+            self._led.discard(row)
+
+    def _lead(self, row: int, command: Floats) -> tuple[Floats, Floats]:
+        """Decide on the action of a world, and on what its engine is told."""
+        world = self.world(row)
+        decided = world.decided(command)
+        return decided, world.told(decided).copy()
+
+    def _table(self, world: World) -> Table:
+        declaration = world.declaration
+        found = self._tables.get(declaration)
+        if found is None:
+            used = {id(table) for table in self._homes}
+            unused = [key for key, table in self._tables.items() if id(table) not in used]
+            for key in unused[: max(0, len(self._tables) + 1 - KEPT)]:
+                del self._tables[key]
+            names = [*self._names, *(("robot_height",) if self._by_tips else ())]
+            there = [name for name in names if name in declaration.model]
+            found = self._tables[declaration] = Table(world, there, len(self._worlds))
+        return found
+
+    def close(self) -> None:
+        """Free the engines of all worlds."""
+        for world in self._worlds:
+            world.close()

@@ -1,0 +1,143 @@
+"""Present values of many worlds of one structure: a row for each world, columns for variables.
+
+What a control step needs is computed for all rows at once, by the very functions that a single
+world calls, so that the bits are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Floats, Integers, Value
+from scm_world.entities import CONTROL_INDEX
+from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
+from scm_world.world.equations import Equation, equation
+from scm_world.world.world import World
+
+ACTION = "action"
+
+
+@final
+class Table:
+    """The values that some variables need, of all worlds of one structure.
+
+    Args:
+        world: Any of this structure.
+        names: What is wanted of the present.
+        n: How many worlds there could be.
+
+    Attributes:
+        declaration: Of the structure.
+        matrix: Shape (n, w); the first columns are those of ``PhysicalState``.
+        where: The columns of each variable.
+        names: What can be asked for.
+        computed: What is computed in every step, causes before effects.
+    """
+
+    def __init__(self, world: World, names: Iterable[str], n: int) -> None:
+        self.declaration = world.declaration
+        self.lagged = world.lagged
+        self.names = tuple(dict.fromkeys((*names, *self.lagged)))
+        self.computed = world.needed(self.names)
+        self._width = ROBOT_SIZE + BLOCK_SIZE * self.declaration.n_blocks
+        self.where: dict[str, slice] = dict(self.declaration.slices)
+        self.earlier: dict[str, slice] = {}
+        self._place_all()
+        constants: list[float] = []
+        self._equations = self._bound(constants)
+        first = self._width
+        self.matrix = np.zeros((n, first + len(constants)))
+        self.matrix[:, first:] = constants
+        self._still = tuple(
+            (name, self.where[name])
+            for name in self.declaration.static_names
+            if name in self.where and name not in self.computed
+        )
+        self._remembered = self._memory()
+
+    def _place_all(self) -> None:
+        """Give columns to everything that is needed and is no state."""
+        model = self.declaration.model
+        parents = [p for name in self.computed for p in model.declared(name).all_parents]
+        present = [p.name for p in parents if p.lag == 0]
+        for name in (ACTION, CONTROL_INDEX, *self.names, *self.computed, *present):
+            if name not in self.where:
+                self.where[name] = self._columns(name)
+        for name in self.lagged:
+            self.earlier[name] = self._columns(name)
+
+    def _columns(self, name: str) -> slice:
+        size = 9 if name == ACTION else int(np.prod(self.declaration.model.declared(name).shape))
+        first, self._width = self._width, self._width + size
+        return slice(first, self._width)
+
+    def _bound(self, constants: list[float]) -> tuple[Equation, ...]:
+        """Bind the mechanisms of what is computed; their constants become columns at the end."""
+        return tuple(
+            equation(self.declaration.model, name, self.where, self.earlier, constants, self._width)
+            for name in self.computed
+        )
+
+    def _memory(self) -> tuple[Integers, Integers]:
+        """List the columns that a step remembers, and where it does."""
+        pairs = [(self.where[name], self.earlier[name]) for name in self.lagged]
+        sources = [np.arange(source.start, source.stop) for source, _ in pairs]
+        targets = [np.arange(target.start, target.stop) for _, target in pairs]
+        nothing = [np.empty(0, dtype=np.int64)]
+        return np.concatenate(nothing + sources), np.concatenate(nothing + targets)
+
+    # --- to and from single worlds ------------------------------------------------------------
+
+    def load(self, row: int, world: World) -> None:
+        """Take over the present of a world of this structure."""
+        numbers = self.matrix[row]
+        now, (_, state) = world.evaluate(self.names), world.current()
+        numbers[: state.vector.size] = state.vector
+        for name, place in self._still:
+            numbers[place] = np.ravel(now[name])
+        numbers[self.where[CONTROL_INDEX]] = world.index
+        self.act(row, now[ACTION])
+        for name in self.lagged:
+            numbers[self.where[name]] = np.ravel(now[name])
+        for bound in self._equations:
+            bound.begin(row, now)
+
+    def act(self, row: int, action: Value) -> None:
+        """Write the action of a row."""
+        self.matrix[row, self.where[ACTION]] = action
+
+    def hand_over(self, row: int, world: World) -> None:
+        """Give a world the present of its row."""
+        numbers = self.matrix[row]
+        earlier = {
+            name: numbers[place].reshape(self.declaration.model.declared(name).shape)
+            for name, place in self.earlier.items()
+        }
+        vector = numbers[: ROBOT_SIZE + BLOCK_SIZE * self.declaration.n_blocks]
+        index = int(numbers[self.where[CONTROL_INDEX]][0])
+        world.arrive(vector, index, numbers[self.where[ACTION]].copy(), earlier)
+
+    # --- a control step -----------------------------------------------------------------------
+
+    def remember(self, rows: Integers) -> None:
+        """Let the present of some rows become what was one control step ago."""
+        sources, targets = self._remembered
+        if len(sources):
+            self.matrix[rows[:, None], targets] = self.matrix[rows[:, None], sources]
+
+    def advance(self, rows: Integers, actions: Floats) -> None:
+        """Write the actions of some rows, shape (n, 9), and let their clocks go on."""
+        self.matrix[rows, self.where[ACTION]] = actions[rows]
+        self.matrix[rows, self.where[CONTROL_INDEX].start] += 1.0
+
+    def evaluate(self, rows: Integers) -> None:
+        """Compute everything for some rows, after a step."""
+        for bound in self._equations:
+            bound.compute(self.matrix, rows)
+
+    def column(self, name: str) -> Floats:
+        """Give the values of a variable in all rows, shape (n, k), as a view."""
+        return self.matrix[:, self.where[name]]
