@@ -51,8 +51,12 @@ class Delta:
         Args:
             action: Shape (9,), in the units of the environment.
         """
-        offset = (self._offset() - self._middle) / self._half
-        found: Floats = np.clip(action + offset, self._low, self._high)
+        return self.moved(action, self._offset())
+
+    def moved(self, action: Floats, offset: Floats) -> Floats:
+        """Add what actions are relative to, shape (..., 9) [SI units]; clip to the range."""
+        relative = (offset - self._middle) / self._half
+        found: Floats = np.clip(action + relative, self._low, self._high)
         return found
 
     def _offset(self) -> Floats:
@@ -61,12 +65,12 @@ class Delta:
             tips: Floats = world.evaluate((TIPS,))[TIPS]
             return tips
         now, state = world.current()
-        if world.action_mode == "joint_positions" and self._is_set():
+        if world.action_mode == "joint_positions" and self.is_set():
             return state.joint_positions
         last: Floats = now["action"]
         return last
 
-    def _is_set(self) -> bool:
+    def is_set(self) -> bool:
         """Tell whether nothing was commanded since the joints were put where they are."""
         world = self._world
         if world.version != self._version:

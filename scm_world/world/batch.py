@@ -67,7 +67,8 @@ class Batch:
         self._names = tuple(names)
         self._tables: dict[Declaration, Table] = {}
         self._homes: list[Table | None] = [None] * len(self._worlds)
-        self._away = np.zeros(len(self._worlds), dtype=np.bool_)
+        self._away = np.zeros(len(self._worlds), dtype=np.bool_)  # it went on in its row only
+        self._loaded = np.zeros(len(self._worlds), dtype=np.bool_)  # its row is as it is
         self._all = np.arange(len(self._worlds))
         self._led: set[int] = set()
         self._by_tips = self._worlds[0].action_mode == "end_effector_positions"
@@ -85,7 +86,13 @@ class Batch:
             if table is not None:
                 table.hand_over(index, world)
             self._away[index] = False
+        self._loaded[index] = False
         return world
+
+    def fill(self, rows: Integers) -> None:
+        """Write the present of some worlds into their rows, where it is not there already."""
+        for row in rows[~self._loaded[rows]].tolist():
+            self._load(row)
 
     def table(self, index: int) -> Table:
         """Give the table in whose row of this number the present of a world is.
@@ -121,8 +128,7 @@ class Batch:
             EngineFailure: The engine lost a state.
         """
         rows = self._all if which is None else np.flatnonzero(which)
-        for row in rows[~self._away[rows]].tolist():
-            self._load(row)
+        self.fill(rows)
         led = {row: self._lead(row, commands[row]) for row in self._led.intersection(rows.tolist())}
         for table, members in self.tables(rows):
             self._step(table, members, commands, led)
@@ -141,7 +147,7 @@ class Batch:
             table.act(row, decided)
         for (mode, substeps), members in self._paces(rows):
             self._engine.step(members, mode, told, substeps, table.matrix)
-        self._away[rows] = True
+        self._away[rows] = self._loaded[rows] = True
 
     def _tell(self, table: Table, rows: Integers, commands: Floats) -> None:
         """Write what the engine is told, where the action alone decides it."""
@@ -168,6 +174,7 @@ class Batch:
         world = self._worlds[row]
         table = self._homes[row] = self._table(world)
         table.load(row, world)
+        self._loaded[row] = True
         if world.is_led:
             self._led.add(row)
         else:

@@ -193,7 +193,8 @@ def _compiled(
         kinds.append(VECTOR if np.ndim(value) else types.float64)
     try:
         inner.compile(tuple(kinds))
-        result = inner.overloads[tuple(kinds)].signature.return_type
+        made: Any = inner.overloads[tuple(kinds)]
+        result = made.signature.return_type
     except (NumbaError, KeyError, RuntimeError):
         return None
     one, several = isinstance(result, types.Number | types.Boolean), result == VECTOR
@@ -206,5 +207,6 @@ def _constants(function: Any, count: int) -> list[Any]:
     """Give the constants of a function in the order of its parameters, after the parents."""
     if not isinstance(function, partial):
         return []
-    names = list(inspect.signature(function.func.py_func).parameters)[count:]
+    inner: Any = function.func
+    names = list(inspect.signature(inner.py_func).parameters)[count:]
     return [function.keywords[name] for name in names if name in function.keywords]

@@ -40,6 +40,7 @@ class Stepped(Declared):
     _readouts: Readouts
     _instant: Instant | None
     _mode: ControlMode
+    _started: bool
     _substeps: int
     _index: int
     _clock: NDArray[Any]
@@ -60,6 +61,11 @@ class Stepped(Declared):
         self.backend.step(self._mode, self.told(command), self._substeps)
         self.backend.read(self._state)
         self._goes_on(self._index + 1)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there is an episode."""
+        return self._started
 
     @property
     def lagged(self) -> tuple[str, ...]:

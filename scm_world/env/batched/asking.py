@@ -1,0 +1,156 @@
+"""What is asked of many environments at once, spread over each of them."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.env.given import doubles
+from scm_world.errors import ActionError, UnknownOption
+
+PER_WORLD = ("do", "episode")
+MASK = "reset_mask"
+
+
+def seeds_of(seed: Any, size: int) -> list[int | None]:
+    """Give each environment its seed.
+
+    Args:
+        seed: One for the first, the next numbers are for the others; a list; or None.
+        size: How many environments there are.
+
+    Raises:
+        UnknownOption: It is none of these.
+
+    Example:
+        >>> seeds_of(7, 3)
+        [7, 8, 9]
+    """
+    if seed is None:
+        return [None] * size
+    try:
+        if not isinstance(seed, Sequence | np.ndarray):
+            return [operator.index(seed) + i for i in range(size)]
+        seeds = [None if one is None else operator.index(one) for one in seed]
+    except TypeError:
+        seeds = []
+    if len(seeds) != size:
+        raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
+    return seeds
+
+
+def masked(mask: Any, size: int) -> NDArray[np.bool_]:
+    """Read which environments are meant.
+
+    Raises:
+        UnknownOption: It is no array of truth values, or none of them is true.
+    """
+    if mask is None:
+        return np.ones(size, bool)
+    read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
+    if not (read and mask.any()):
+        allowed = (f"an array of {size} truth values, at least one of them true",)
+        raise UnknownOption(MASK, mask, allowed)
+    return np.array(mask)
+
+
+def options_of(
+    options: Mapping[str, Any] | None, which: NDArray[np.bool_]
+) -> list[dict[str, Any] | None]:
+    """Give each environment that is reset its options.
+
+    Args:
+        options: ``"do"`` and ``"episode"``, each one for all, a list, or a mapping by index.
+        which: The environments that are reset, shape (n,).
+
+    Raises:
+        UnknownOption: There is no such option, or a wrong number of them.
+
+    Example:
+        >>> options_of({"episode": 2, "do": {1: {"floor_friction": 0.4}}}, np.ones(2, bool))
+        [{'episode': 2}, {'episode': 2, 'do': {'floor_friction': 0.4}}]
+    """
+    given = {name: value for name, value in (options or {}).items() if name != MASK}
+    if not given:
+        return [None] * which.size
+    found: list[dict[str, Any] | None] = [{} for _ in range(which.size)]
+    for name, value in given.items():
+        if name not in PER_WORLD:
+            raise UnknownOption("reset option", name, (*PER_WORLD, MASK))
+        for index, one in spread(name, value, which.size).items():
+            mine = found[index]
+            if mine is not None:
+                mine[name] = one
+    return [one if reset else None for one, reset in zip(found, which, strict=True)]
+
+
+def spread(what: str, given: Any, size: int) -> dict[int, Any]:
+    """Give each environment that is meant its part of what is asked.
+
+    Args:
+        what: Said in the error.
+        given: One for all; a list with one, or None, for each; or a mapping by index.
+        size: How many environments there are.
+
+    Raises:
+        UnknownOption: A list of another length, or an index that does not exist.
+
+    Example:
+        >>> spread("do", [None, {"floor_friction": 0.4}], 2)
+        {1: {'floor_friction': 0.4}}
+        >>> spread("do", {"floor_friction": 0.4}, 2)
+        {0: {'floor_friction': 0.4}, 1: {'floor_friction': 0.4}}
+    """
+    by_index = isinstance(given, Mapping) and any(not isinstance(key, str) for key in given)
+    if by_index:
+        return {index_of(key, size): one for key, one in given.items() if one is not None}
+    if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
+        if len(given) != size:
+            raise UnknownOption(f"list for {what}", given, (f"one of length {size}",))
+        return {index: one for index, one in enumerate(given) if one is not None}
+    return {} if given is None else dict.fromkeys(range(size), given)
+
+
+def index_of(index: Any, size: int) -> int:
+    """Read the index of an environment.
+
+    Raises:
+        UnknownOption: There is none.
+    """
+    try:
+        number = operator.index(index)
+    except TypeError:
+        number = -1
+    if isinstance(index, bool) or not 0 <= number < size:
+        raise UnknownOption("environment", index, (f"any whole number from 0 to {size - 1}",))
+    return number
+
+
+def actions_of(actions: Any, which: NDArray[np.bool_]) -> Floats:
+    """Read the actions of all environments.
+
+    Args:
+        actions: One for each.
+        which: The environments that are stepped, shape (n,).
+
+    Returns:
+        Shape (n, 9).
+
+    Raises:
+        ActionError: Another shape, or a number that is not finite, where one is stepped.
+    """
+    given = doubles(actions)
+    if given.shape != (which.size, 9):
+        shape = f"actions of {which.size} environments have shape ({which.size}, 9)"
+        raise ActionError(f"{shape}, got {given.shape}", actions)
+    if not np.isfinite(given).all():
+        wrong = np.flatnonzero(which & ~np.isfinite(given).all(axis=1))
+        if wrong.size:
+            text = f"environment {wrong[0]}: an action is nine finite numbers"
+            raise ActionError(f"{text}, got {given[wrong[0]]!r}", actions)
+    return given

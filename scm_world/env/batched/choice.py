@@ -1,0 +1,60 @@
+"""Which crew simulates."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+from scm_world.env.batched.crew import Crew
+from scm_world.env.batched.loop import LoopCrew
+from scm_world.env.environment import ScmWorldEnv
+from scm_world.errors import UnknownOption
+
+CREWS = ("loop", "processes")
+
+
+def made_crew(
+    crew: str | None,
+    make: Callable[[], ScmWorldEnv],
+    num_envs: int,
+    *,
+    backend: str,
+    threads: int | None = None,
+    workers: int | None = None,
+) -> Crew:
+    """Make what simulates many environments.
+
+    Args:
+        crew: Its name; the fastest one for the backend if None.
+        make: Makes one environment.
+        num_envs: How many.
+        backend: Name of the engine.
+        threads: Of the native crew.
+        workers: Processes of the crew that has some.
+
+    Raises:
+        UnknownOption: There is no such crew, or an option is not one of it.
+    """
+    kind = crew if crew is not None else _fastest(backend, num_envs, workers)
+    if kind not in CREWS:
+        raise UnknownOption("crew", kind, CREWS)
+    for option, value, owner in (("threads", threads, "native"), ("workers", workers, "processes")):
+        if value is not None and kind != owner:
+            raise UnknownOption(option, value, (f"None with crew={kind!r}", f"any with {owner!r}"))
+    if kind == "processes":
+        from scm_world.env.batched.processes import ProcessCrew
+
+        return ProcessCrew(make, num_envs, workers=workers)
+    return LoopCrew(make, num_envs)
+
+
+def _fastest(backend: str, num_envs: int, workers: int | None) -> str:
+    several = num_envs > 1 and cores() > 1
+    return "processes" if workers is not None or (backend == "bullet" and several) else "loop"
+
+
+def cores() -> int:
+    """Count the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

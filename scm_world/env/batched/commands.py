@@ -1,0 +1,93 @@
+"""Actions of many environments, turned into what their worlds take."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats, Integers
+from scm_world.env.batched.crew import located
+from scm_world.env.batched.inside import Inside
+from scm_world.env.delta import TIPS
+from scm_world.env.environment import ScmWorldEnv
+from scm_world.errors import ActionError
+from scm_world.world.batch import Batch
+from scm_world.world.columns import ACTION, Table
+
+JOINTS = "joint_positions"
+
+
+@final
+class Commands:
+    """Scales actions, adds what they are relative to, and clips them.
+
+    Args:
+        env: Any of the environments.
+        num_envs: How many there are.
+
+    Attributes:
+        names: What has to be known of the present.
+    """
+
+    def __init__(self, env: ScmWorldEnv, num_envs: int) -> None:
+        inside = Inside.of(env)
+        self._middle, self._half = inside.middle, inside.half
+        self._low, self._high = env.world.action_low, env.world.action_high
+        self._delta = inside.delta
+        self._mode = env.world.action_mode
+        self.names = (TIPS,) if self._delta is not None and self._mode == TIPS else ()
+        # Where the joints were put since the last command: it is relative to them.
+        self._are_set = np.zeros(num_envs, dtype=np.bool_)
+        self._found = np.empty((num_envs, 9))
+
+    def read(self, rows: Integers, actions: NDArray[Any], batch: Batch) -> Floats:
+        """Give the commands of some environments.
+
+        Args:
+            rows: Their numbers, shape (m,).
+            actions: Shape (n, 9).
+            batch: Their worlds.
+
+        Returns:
+            Shape (n, 9); rows of others mean nothing. It holds until the next call.
+
+        Raises:
+            ActionError: A number is not finite.
+        """
+        given = actions[rows].astype(np.float64)
+        bad = rows[~np.isfinite(given).all(axis=1)]
+        if len(bad):
+            row = int(bad[0])
+            said = f"an action is nine finite numbers, got {actions[row]!r}"
+            raise located(ActionError(said, actions[row]), row)
+        if self._delta is not None:
+            batch.fill(rows)
+            actions = np.array(actions, dtype=np.float64)
+            for table, members in batch.tables(rows):
+                offset = self._offset(table, members)
+                actions[members] = self._delta.moved(actions[members], offset)
+            given = actions[rows]
+        scaled = self._middle + self._half * given
+        self._found[rows] = np.minimum(np.maximum(scaled, self._low), self._high)
+        return self._found
+
+    def _offset(self, table: Table, rows: Integers) -> Floats:
+        """Give what actions are relative to, shape (m, 9)."""
+        if self._mode == TIPS:
+            return table.column(TIPS)[rows]
+        last = table.column(ACTION)[rows]
+        if self._mode != JOINTS:
+            return last
+        return np.where(self._are_set[rows, None], table.column(JOINTS)[rows], last)
+
+    def look(self, index: int, env: ScmWorldEnv) -> None:
+        """Note whether the joints of an environment were put somewhere."""
+        if self._delta is not None and self._mode == JOINTS:
+            delta = Inside.of(env).delta
+            self._are_set[index] = delta is not None and delta.is_set()
+
+    def passed(self, rows: Integers) -> None:
+        """Note that some environments were told something."""
+        self._are_set[rows] = False

@@ -1,0 +1,89 @@
+"""What holds many environments, wherever and however they are simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from scm_world.env.batched.sheet import Form, Sheet
+from scm_world.env.copies import EnvSnapshot
+from scm_world.errors import ScmWorldError
+from scm_world.variables.subsets import AnyRegion
+from scm_world.world import Audit
+
+
+class Crew(Protocol):
+    """Many environments that are made alike, each with its own parameters, noise and clock.
+
+    Each does, bit for bit, what it would do alone. Whatever happens to one of them is in its row
+    of the sheet afterwards. ``reset``, ``do`` and ``restore`` happen in all of those that are
+    named or in none; so does what makes one unlike the others (see ``Form.check``). The message
+    of an error says in which environment it happened.
+
+    Attributes:
+        num_envs: How many there are.
+        form: What they have in common.
+        sheet: What they said last; one object for the life of the crew.
+    """
+
+    num_envs: int
+    form: Form
+    sheet: Sheet
+
+    def reset(
+        self,
+        which: NDArray[Any],
+        seeds: Sequence[int | None],
+        options: Sequence[Mapping[str, Any] | None],
+    ) -> None:
+        """Begin an episode in some of them; rewards and flags of the sheet stay.
+
+        Args:
+            which: Which ones, shape (n,), bool.
+            seeds: One for each environment, as in ``ScmWorldEnv.reset``.
+            options: Also.
+        """
+
+    def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
+        """Advance some of them one control step.
+
+        Args:
+            which: Which ones, shape (n,), bool.
+            actions: Shape (n, 9), 64-bit floats; those of the others are not looked at.
+        """
+
+    def do(
+        self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
+    ) -> dict[int, Audit]:
+        """Intervene in some of them, by index, as ``ScmWorldEnv.do`` does."""
+
+    def snapshot(self, indices: Sequence[int]) -> list[EnvSnapshot]:
+        """Save some of them."""
+
+    def restore(self, snapshots: Mapping[int, EnvSnapshot]) -> None:
+        """Take some of them to a snapshot; it may be that of another one."""
+
+    def call(self, indices: Sequence[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
+        """Call a method of some of them; what cannot be called is given as it is."""
+
+    def attribute(self, indices: Sequence[int], name: str) -> list[Any]:
+        """Look an attribute of some of them up."""
+
+    def assign(self, name: str, values: Mapping[int, Any]) -> None:
+        """Set an attribute of some of them."""
+
+    def close(self) -> None:
+        """Free everything they hold. The sheet can still be read."""
+
+
+def located(error: ScmWorldError, index: int) -> ScmWorldError:
+    """Say in an error in which environment it happened.
+
+    Example:
+        >>> print(located(ScmWorldError("the block is in the table"), 3))
+        environment 3: the block is in the table
+    """
+    error.args = (f"environment {index}: {error}",)
+    return error

@@ -1,0 +1,96 @@
+"""What many environments show, read out of a table in compiled loops."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats, Integers
+from scm_world.env.batched.inside import Inside, scaling
+from scm_world.env.batched.sheet import FLAGS, FRACTION, GOALS, TERMS, Sheet
+from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.goals import BOUND
+from scm_world.env.vector import Vector
+from scm_world.geometry.gather import places
+from scm_world.geometry.rows import scale_rows
+from scm_world.world.columns import Table
+
+OBSERVATION = "observation"
+
+
+@final
+class Lens:
+    """Reads observations, rewards and infos of one structure.
+
+    Args:
+        env: Of this structure.
+        table: In which its world is.
+
+    Attributes:
+        is_partial: Whether observation and info have to be read in each environment by itself.
+    """
+
+    def __init__(self, env: ScmWorldEnv, table: Table) -> None:
+        inside = Inside.of(env)
+        self._vectors = {name: _Gathered(part, table) for name, part in inside.vectors.items()}
+        self.is_partial, self._shows_goals = inside.is_partial, inside.shows_goals
+        sides = env.world.task.goal_names()
+        self._goals = tuple(places(table.where[name] for name in side) for side in sides)
+        self._terms = {name: table.where[name].start for name in inside.terms}
+        self._reward = table.where["reward"].start
+        self._success, self._fraction = table.where["success"].start, table.where[FRACTION].start
+        self._clock = table.where["control_index"].start
+        self._scale, self._limit = inside.scale, inside.limit
+
+    def write(self, table: Table, rows: Integers, sheet: Sheet) -> int | None:
+        """Write some rows of the sheet.
+
+        Returns:
+            A row whose reward is no finite number; None if all are.
+        """
+        numbers = table.matrix
+        rewards = self._scale * numbers[rows, self._reward]
+        wrong = ~np.isfinite(rewards)
+        if wrong.any():
+            return int(rows[wrong][0])
+        sheet.rewards[rows] = rewards
+        sheet.terminations[rows] = False
+        sheet.truncations[rows] = numbers[rows, self._clock] >= self._limit
+        if not self.is_partial:
+            self._show(numbers, rows, sheet)
+        return None
+
+    def _show(self, numbers: Floats, rows: Integers, sheet: Sheet) -> None:
+        for name, vector in self._vectors.items():
+            vector.write(
+                numbers, rows, sheet.observations if name is None else sheet.observations[name]
+            )
+        infos: dict[str, Any] = sheet.infos
+        for name in FLAGS:
+            infos[name][rows] = numbers[rows, self._success] != 0.0
+        infos[FRACTION][rows] = numbers[rows, self._fraction]
+        for name, column in self._terms.items():
+            infos[TERMS][name][rows] = numbers[rows, column]
+        for name, columns in zip(GOALS, self._goals, strict=True):
+            found = infos[name][rows] = numbers[rows[:, None], columns]
+            if self._shows_goals:
+                sheet.observations[name][rows] = np.clip(found, -BOUND, BOUND)
+
+
+@final
+class _Gathered:
+    """A vector of numbers that all stand in the columns of a table.
+
+    Args:
+        vector: That is read.
+        table: In which they are.
+    """
+
+    def __init__(self, vector: Vector, table: Table) -> None:
+        self._scale, self._shifts = scaling(vector)
+        self._sources = places(table.where[name] for name in vector.layouts[OBSERVATION])
+
+    def write(self, numbers: Floats, rows: Integers, out: Any) -> None:
+        """Write observations, shape (n, k)."""
+        scale_rows(numbers, rows, self._sources, self._shifts, self._scale, out)

@@ -1,0 +1,179 @@
+"""Many environments whose engine steps all of them in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.entities.stage import SENSOR_NOISE
+from scm_world.env.batched.commands import Commands
+from scm_world.env.batched.crew import located
+from scm_world.env.batched.inside import Inside
+from scm_world.env.batched.lens import Lens
+from scm_world.env.batched.loop import LoopCrew
+from scm_world.env.batched.sheet import FRACTION
+from scm_world.env.copies import EnvSnapshot
+from scm_world.env.environment import ScmWorldEnv
+from scm_world.errors import ScmWorldError
+from scm_world.tasks.rewards import one_number
+from scm_world.variables.subsets import AnyRegion
+from scm_world.world import Audit
+from scm_world.world.batch import Batch
+from scm_world.world.columns import Table
+
+
+@final
+class NativeCrew:
+    """Environments that are stepped by threads of the engine, and read in compiled loops.
+
+    Pictures, the corners of blocks, contacts and the noise of sensors are read in one environment
+    after another. See ``Crew``.
+
+    Args:
+        make: Makes one of them.
+        num_envs: How many.
+        threads: Of the engine; as many as there are cores if None. Results do not depend on it.
+
+    Attributes:
+        num_envs: How many there are.
+        form: What they have in common.
+        sheet: What they said last.
+    """
+
+    def __init__(
+        self, make: Callable[[], ScmWorldEnv], num_envs: int, *, threads: int | None = None
+    ) -> None:
+        self._members = LoopCrew(make, num_envs)
+        self.num_envs = num_envs
+        self.form, self.sheet = self._members.form, self._members.sheet
+        self._envs = self._members.envs
+        lead = self._envs[0]
+        self._commands = Commands(lead, num_envs)
+        names = (*Inside.of(lead).needed, FRACTION, *self._commands.names)
+        self._batch = Batch([env.world for env in self._envs], threads=threads, names=names)
+        self._lenses: dict[int, tuple[Table, Lens]] = {}
+        self._sensed: set[int] = set()
+
+    def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
+        """Advance some of them one control step."""
+        rows = np.flatnonzero(which)
+        if not len(rows):
+            return
+        commands = self._commands.read(rows, actions, self._batch)
+        self._batch.advance(commands, which)
+        self._commands.passed(rows)
+        for table, members in self._batch.tables(rows):
+            lens = self._lens(table, int(members[0]))
+            wrong = lens.write(table, members, self.sheet)
+            if wrong is not None:
+                self._explain(wrong)
+            again: Iterable[int] = members.tolist() if lens.is_partial else self._sensed
+            for row in again:
+                if which[row]:
+                    self._bring([row])
+                    self.sheet.write(row, *self._envs[row].present())
+
+    def reset(
+        self,
+        which: NDArray[Any],
+        seeds: Sequence[int | None],
+        options: Sequence[Mapping[str, Any] | None],
+    ) -> None:
+        """Begin an episode in some of them."""
+        indices = self._bring(np.flatnonzero(which).tolist())
+        try:
+            self._members.reset(which, seeds, options)
+        finally:
+            self._look(indices)
+
+    def do(
+        self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
+    ) -> dict[int, Audit]:
+        """Intervene in some of them."""
+        indices = self._bring(requests)
+        try:
+            return self._members.do(requests, space)
+        finally:
+            self._look(indices)
+
+    def snapshot(self, indices: Sequence[int]) -> list[EnvSnapshot]:
+        """Save some of them."""
+        self._bring(indices)
+        return self._members.snapshot(indices)
+
+    def restore(self, snapshots: Mapping[int, EnvSnapshot]) -> None:
+        """Take some of them to a snapshot."""
+        indices = self._bring(snapshots)
+        try:
+            self._members.restore(snapshots)
+        finally:
+            self._look(indices)
+
+    def undo(self) -> None:
+        """Take back what the last reset, intervention or restoration did."""
+        everything = self._bring(range(self.num_envs))
+        self._members.undo()
+        self._look(everything)
+
+    def call(self, indices: Sequence[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
+        """Call a method of some of them; what cannot be called is given as it is."""
+        self._bring(indices)
+        try:
+            return self._members.call(indices, name, *args, **kwargs)
+        finally:
+            self._look(indices)
+
+    def attribute(self, indices: Sequence[int], name: str) -> list[Any]:
+        """Look an attribute of some of them up."""
+        self._bring(indices)
+        return self._members.attribute(indices, name)
+
+    def assign(self, name: str, values: Mapping[int, Any]) -> None:
+        """Set an attribute of some of them."""
+        self._bring(values)
+        self._members.assign(name, values)
+
+    def close(self) -> None:
+        """Free their engines."""
+        self._members.close()
+
+    def _bring(self, indices: Iterable[int]) -> list[int]:
+        """Let environments be as they are now, so that each can be used by itself."""
+        found = list(indices)
+        for index in found:
+            self._batch.world(index)
+        return found
+
+    def _look(self, indices: Iterable[int]) -> None:
+        """Note what was changed in environments that were used by themselves."""
+        for index in indices:
+            env = self._envs[index]
+            if not env.world.has_begun:
+                continue
+            self._commands.look(index, env)
+            if env.world.current()[0][SENSOR_NOISE]:
+                self._sensed.add(index)
+            else:
+                self._sensed.discard(index)
+
+    def _lens(self, table: Table, row: int) -> Lens:
+        found = self._lenses.get(id(table))
+        if found is None or found[0] is not table:
+            found = self._lenses[id(table)] = table, Lens(self._envs[row], table)
+        return found[1]
+
+    def _explain(self, row: int) -> None:
+        """Raise the error that the environment would raise alone.
+
+        Raises:
+            ModelError: Its reward is no finite number.
+        """
+        self._bring([row])
+        terms = Inside.of(self._envs[row]).terms
+        try:
+            one_number(self._envs[row].world.evaluate(("reward", *terms)), "reward", terms)
+        except ScmWorldError as error:
+            raise located(error, row) from error.__cause__

@@ -1,0 +1,184 @@
+"""The arrays of many environments: one row for each, written in place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Dict
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.env.environment import ScmWorldEnv
+from scm_world.errors import InterventionError
+
+Allocate = Callable[[tuple[int, ...], Any], NDArray[Any]]
+"""Gives an array of zeros of a shape and a dtype."""
+
+Column = NDArray[Any] | dict[str, NDArray[Any]]
+"""What all environments say about one thing, shape (n, ...); or several of them, by name."""
+
+FLAGS = ("is_success", "success")
+FRACTION = "fractional_success"
+GOALS = ("achieved_goal", "desired_goal")
+TERMS = "reward_terms"
+
+
+@final
+@dataclass(frozen=True)
+class Form:
+    """What the environments of a crew have in common.
+
+    Attributes:
+        observation_space: Of one of them.
+        action_space: Of one of them.
+        goals: How many numbers ``achieved_goal`` and ``desired_goal`` have.
+        terms: Names of the reward terms.
+        metadata: As Gymnasium wants it.
+        render_mode: Of all of them.
+    """
+
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+    goals: tuple[int, int]
+    terms: tuple[str, ...]
+    metadata: Mapping[str, Any] = field(compare=False)
+    render_mode: str | None
+
+    @classmethod
+    def of(cls, env: ScmWorldEnv) -> Form:
+        """Read it from one of them."""
+        return cls(
+            env.observation_space,
+            env.action_space,
+            _goal_sizes(env),
+            tuple(env.world.task.weights),
+            env.metadata,
+            env.render_mode,
+        )
+
+    def check(self, env: ScmWorldEnv, variable: str) -> None:
+        """Refuse an environment that is not observed like the others any more.
+
+        Args:
+            env: It was reset, intervened on or restored a moment ago.
+            variable: What was set, or what else brought this about.
+
+        Raises:
+            InterventionError: There are other bodies in it than in the others.
+        """
+        mine = (self.observation_space, self.goals)
+        if (env.observation_space, _goal_sizes(env)) == mine:
+            return
+        raise InterventionError(
+            f"{variable} changes which bodies exist, and with them what is observed, from "
+            f"{_shape(self.observation_space)} to {_shape(env.observation_space)}; environments "
+            "in a batch are all observed alike: set it for all of them with start={…} when they "
+            "are made, or use single environments",
+            variable=variable,
+        )
+
+
+def _goal_sizes(env: ScmWorldEnv) -> tuple[int, int]:
+    achieved, desired = (space.shape or () for space in env._goals.spaces.values())
+    return int(np.prod(achieved)), int(np.prod(desired))
+
+
+def _shape(space: gymnasium.Space[Any]) -> str:
+    if isinstance(space, Dict):
+        return ", ".join(f"{name} {_shape(part)}" for name, part in space.items())
+    return f"shape {space.shape}"
+
+
+@final
+@dataclass
+class Sheet:
+    """What n environments said last.
+
+    Attributes:
+        observations: Shape (n, ...), dtype of the space; by name where the space is a dictionary.
+        rewards: Shape (n,). Only steps write them, and the flags.
+        terminations: Shape (n,).
+        truncations: Shape (n,).
+        infos: Everything in ``info`` that is numbers, by its key.
+        extras: The rest of ``info``, one dictionary for each environment.
+    """
+
+    observations: Any
+    rewards: Floats
+    terminations: NDArray[np.bool_]
+    truncations: NDArray[np.bool_]
+    infos: dict[str, Column]
+    extras: list[dict[str, Any]]
+
+    @classmethod
+    def empty(cls, form: Form, size: int, allocate: Allocate = np.zeros) -> Sheet:
+        """Make one for environments of a form.
+
+        Args:
+            form: What they have in common.
+            size: How many there are.
+            allocate: Called in the same order whenever the arguments are the same.
+        """
+        infos: dict[str, Column] = {name: allocate((size,), np.bool_) for name in FLAGS}
+        infos[FRACTION] = allocate((size,), np.float64)
+        for name, width in zip(GOALS, form.goals, strict=True):
+            infos[name] = allocate((size, width), np.float64)
+        infos[TERMS] = {name: allocate((size,), np.float64) for name in form.terms}
+        return cls(
+            observations=_rows(form.observation_space, size, allocate),
+            rewards=allocate((size,), np.float64),
+            terminations=allocate((size,), np.bool_),
+            truncations=allocate((size,), np.bool_),
+            infos=infos,
+            extras=[{} for _ in range(size)],
+        )
+
+    def part(self, where: slice) -> Sheet:
+        """Give some rows: what is written there is written here, but for the extras."""
+        return Sheet(
+            _part(self.observations, where),
+            self.rewards[where],
+            self.terminations[where],
+            self.truncations[where],
+            {name: _part(column, where) for name, column in self.infos.items()},
+            self.extras[where],
+        )
+
+    def write(self, row: int, observation: Any, info: Mapping[str, Any]) -> None:
+        """Write what one environment shows."""
+        if isinstance(self.observations, dict):
+            for name, part in self.observations.items():
+                part[row] = observation[name]
+        else:
+            self.observations[row] = observation
+        for name, column in self.infos.items():
+            if isinstance(column, dict):
+                for term, value in info[name].items():
+                    column[term][row] = value
+            else:
+                column[row] = info[name]
+        if len(info) > len(self.infos):
+            rest = info.keys() - self.infos.keys()
+            self.extras[row] = {name: value for name, value in info.items() if name in rest}
+
+    def observation(self, row: int) -> Any:
+        """Copy the observation of one environment."""
+        if isinstance(self.observations, dict):
+            return {name: part[row].copy() for name, part in self.observations.items()}
+        return self.observations[row].copy()
+
+
+def _rows(space: gymnasium.Space[Any], size: int, allocate: Allocate) -> Any:
+    if isinstance(space, Dict):
+        return {name: _rows(part, size, allocate) for name, part in space.items()}
+    return allocate((size, *(space.shape or ())), space.dtype)
+
+
+def _part(column: Any, where: slice) -> Any:
+    if isinstance(column, dict):
+        return {name: _part(one, where) for name, one in column.items()}
+    return column[where]

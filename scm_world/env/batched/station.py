@@ -1,0 +1,81 @@
+"""What a process of a crew holds: some of its environments, and the memory that all share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, final
+
+import numpy as np
+
+from scm_world.env.batched.loop import LoopCrew
+from scm_world.env.batched.memory import Carver, found
+from scm_world.env.batched.sheet import Allocate, Form, Sheet
+from scm_world.env.environment import ScmWorldEnv
+
+Said = tuple[Any, list[dict[str, Any]] | None]
+"""The answer to a call, and what there is in ``info`` that is no number."""
+
+
+@final
+class Desk:
+    """What lies in shared memory: the sheet, and what the environments are to do next.
+
+    Args:
+        form: What the environments have in common.
+        size: How many there are.
+        allocate: Cuts arrays out of the memory, in the same order in every process.
+
+    Attributes:
+        sheet: What they said last.
+        which: Those that are stepped, shape (n,).
+        actions: Shape (n, 9).
+    """
+
+    def __init__(self, form: Form, size: int, allocate: Allocate) -> None:
+        self.sheet = Sheet.empty(form, size, allocate)
+        self.which = allocate((size,), np.bool_)
+        self.actions = allocate((size, 9), np.float64)
+
+
+@final
+class Station:
+    """Some neighbors, in a process of their own.
+
+    Args:
+        make: Makes one environment.
+        size: How many are here.
+        first: The index of the first one in the whole crew.
+    """
+
+    def __init__(self, make: Callable[[], ScmWorldEnv], size: int, first: int) -> None:
+        self._where = slice(first, first + size)
+        self._crew = LoopCrew(make, size, first=first)
+
+    def form(self) -> Said:
+        """Tell what the environments have in common."""
+        return self._crew.form, None
+
+    def attach(self, path: str, total: int) -> Said:
+        """Write into shared memory from now on.
+
+        Args:
+            path: Where it is.
+            total: How many environments there are in all processes.
+        """
+        desk = Desk(self._crew.form, total, Carver(found(path)))
+        self._crew.sheet = desk.sheet.part(self._where)
+        self._which, self._actions = desk.which[self._where], desk.actions[self._where]
+        return None, None
+
+    def advance(self) -> Said:
+        """Step those that are to be stepped."""
+        self._crew.step(self._which, self._actions)
+        return None, self._extras()
+
+    def tell(self, method: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Said:
+        """Call a method of the crew that is here."""
+        return getattr(self._crew, method)(*args, **kwargs), self._extras()
+
+    def _extras(self) -> list[dict[str, Any]] | None:
+        extras = self._crew.sheet.extras
+        return extras if any(extras) else None

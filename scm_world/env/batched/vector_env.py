@@ -1,0 +1,356 @@
+"""Many worlds behind Gymnasium's vector interface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, final
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from scm_world.env.batched.asking import (
+    MASK,
+    actions_of,
+    index_of,
+    masked,
+    options_of,
+    seeds_of,
+    spread,
+)
+from scm_world.env.batched.choice import made_crew
+from scm_world.env.batched.crew import Crew, located
+from scm_world.env.batched.sheet import Column, Sheet
+from scm_world.env.copies import EnvSnapshot
+from scm_world.env.environment import ScmWorldEnv
+from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
+from scm_world.variables.subsets import AnyRegion
+from scm_world.world import Audit
+from scm_world.world.start import whole_number
+
+Stepped = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+
+@final
+@dataclass(frozen=True)
+class VectorSnapshot:
+    """An instant of many environments. It can be pickled.
+
+    Attributes:
+        worlds: One snapshot for each.
+        ended: Which of them are done, and begin anew with the next step.
+    """
+
+    worlds: tuple[EnvSnapshot, ...]
+    ended: tuple[bool, ...]
+
+
+class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
+    """Many environments at once, each one with its own parameters, noise and clock.
+
+    Made by ``gymnasium.make_vec("scm_world/Pushing-v0", num_envs=64)``. What comes out is, bit
+    for bit, what Gymnasium's ``SyncVectorEnv`` makes of as many single environments, whichever
+    crew simulates them and however many threads or processes it has. Environments of one batch
+    are observed alike: what would change which bodies exist in one of them is refused.
+
+    Args:
+        num_envs: How many.
+        autoreset_mode: When one that is done begins anew: ``"NextStep"``, ``"SameStep"`` or
+            ``"Disabled"``, as in Gymnasium.
+        copy: Give observations that are yours; else the next step overwrites them.
+        crew: ``"loop"``: one after another in this process; ``"processes"``: several processes;
+            ``"native"``: many in one call of the engine; None: the fastest that there is.
+        threads: Of the native crew; as many as there are cores if None.
+        workers: How many processes; as many as there are cores if None.
+        options: Of ``ScmWorldEnv``.
+
+    Raises:
+        UnknownOption: An option does not exist, or does not go with the others.
+
+    Example:
+        >>> envs = ScmWorldVectorEnv(3, task="pushing", backend="fake")
+        >>> observations, infos = envs.reset(seed=0)
+        >>> print(envs.do({1: {"floor_friction": 0.4}})[1])
+        floor_friction = 0.4, engine reports 0.4
+        >>> envs.step(envs.action_space.sample())[0].shape
+        (3, 56)
+        >>> envs.close()
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        crew: str | None = None,
+        threads: int | None = None,
+        workers: int | None = None,
+        **options: Any,
+    ) -> None:
+        self.num_envs = whole_number("num_envs", num_envs, least=1)
+        self.autoreset_mode = _mode(autoreset_mode)
+        self.copy = copy
+        make = partial(ScmWorldEnv, **options)
+        backend = str(options.get("backend", "mujoco"))
+        self.crew: Crew = made_crew(
+            crew, make, self.num_envs, backend=backend, threads=threads, workers=workers
+        )
+        form = self.crew.form
+        self.metadata = {**form.metadata, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = form.render_mode
+        self.single_observation_space = form.observation_space
+        self.single_action_space = form.action_space
+        self.observation_space = batch_space(form.observation_space, self.num_envs)
+        self.action_space = batch_space(form.action_space, self.num_envs)
+        self._all = range(self.num_envs)
+        self._everyone = np.ones(self.num_envs, bool)
+        self._begun = np.zeros(self.num_envs, bool)
+        self._ended = np.zeros(self.num_envs, bool)
+
+    # --- Gymnasium's part -------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in all environments, or in some; it happens in all of those or in none.
+
+        Args:
+            seed: Of the first environment, the next one gets the next number; or a list.
+            options: ``"reset_mask"``: which ones, shape (n,), bool; ``"do"`` and ``"episode"``
+                as in ``ScmWorldEnv.reset``: one for all, a list, or a mapping by index.
+
+        Raises:
+            UnknownOption: Another key, or something of the wrong length.
+            InterventionError: The intervention was refused.
+        """
+        which = masked((options or {}).get(MASK), self.num_envs)
+        wishes = options_of(options, which)
+        self.crew.reset(which, seeds_of(seed, self.num_envs), wishes)
+        self._begun |= which
+        self._ended &= ~which
+        return self._observations(), self._infos(which)
+
+    def step(self, actions: Any) -> Stepped:
+        """Advance all environments one control step.
+
+        Args:
+            actions: Shape (n, 9).
+
+        Raises:
+            ActionError: Another shape, a number that is not finite, or one of them is done and
+                nothing resets it.
+            NotReset: One of them has no episode yet.
+        """
+        crew, sheet, ended = self.crew, self.crew.sheet, self._ended
+        infos: dict[str, Any] = {}
+        stepping = self._stepping(actions)
+        crew.step(stepping, actions_of(actions, stepping))
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            ended = sheet.terminations | sheet.truncations
+            if ended.any():
+                infos = self._final(ended)
+        if self.autoreset_mode is not AutoresetMode.DISABLED and ended.any():
+            crew.reset(ended, [None] * self.num_envs, [None] * self.num_envs)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            sheet.rewards[ended] = 0.0
+            sheet.terminations[ended] = sheet.truncations[ended] = False
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            self._ended = sheet.terminations | sheet.truncations
+        flags = sheet.terminations.copy(), sheet.truncations.copy()
+        infos |= self._infos(self._everyone)
+        return self._observations(), sheet.rewards.copy(), *flags, infos
+
+    def _stepping(self, actions: Any) -> NDArray[np.bool_]:
+        """Tell which environments take a step."""
+        if not self._begun.all():
+            raise located(NotReset(), int(np.argmin(self._begun)))
+        if not self._ended.any():
+            return self._everyone
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            done = ", ".join(map(str, np.flatnonzero(self._ended)))
+            advice = "reset them first with options={'reset_mask': terminations | truncations}"
+            raise ActionError(f"environments that are done take no step: {done}; {advice}", actions)
+        return ~self._ended
+
+    def _final(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
+        """Keep what is seen last of episodes that ended."""
+        shown = np.full(self.num_envs, None, dtype=object)
+        for index in np.flatnonzero(ended).tolist():
+            shown[index] = self.crew.sheet.observation(index)
+        return {
+            "final_obs": shown,
+            "_final_obs": ended.copy(),
+            "final_info": self._infos(ended),
+            "_final_info": ended.copy(),
+        }
+
+    def render(self) -> tuple[Any, ...]:
+        """Draw every environment."""
+        return self.call("render")
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of every environment; what cannot be called is given as it is."""
+        return tuple(self.crew.call(self._all, name, *args, **kwargs))
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Look an attribute of every environment up."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every environment.
+
+        Args:
+            name: Of the attribute.
+            values: A list or tuple with one for each, or one for all.
+
+        Raises:
+            UnknownOption: A list of another length.
+        """
+        given = values if isinstance(values, list | tuple) else [values] * self.num_envs
+        if len(given) != self.num_envs:
+            raise UnknownOption(f"list for {name}", values, (f"one of length {self.num_envs}",))
+        self.crew.assign(name, dict(enumerate(given)))
+
+    @property  # type: ignore[misc] # read only in Gymnasium's own kinds too
+    def np_random(self) -> Any:
+        """Gymnasium's generators of the environments, a tuple."""
+        return self.get_attr("np_random")
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Gymnasium's seeds of the environments, a tuple."""
+        return self.get_attr("np_random_seed")
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free what simulates."""
+        self.crew.close()
+
+    # --- what a causal world can do besides -------------------------------------------------------
+
+    def do(self, requests: Any, *, space: AnyRegion | None = None) -> dict[int, Audit]:
+        """Intervene now; it happens in all environments that are meant, or in none.
+
+        Args:
+            requests: An intervention for all of them, a list with one or None for each, or a
+                mapping by index.
+            space: In which every target must lie.
+
+        Returns:
+            What it did, by the index of the environment. ``present`` shows how they look then.
+
+        Raises:
+            InterventionError: One of them refused; the message says which. Nothing has changed.
+        """
+        return self.crew.do(spread("do", requests, self.num_envs), space)
+
+    def present(self) -> tuple[Any, dict[str, Any]]:
+        """Give observations and infos of the present, as after an intervention."""
+        return self._observations(), self._infos(self._everyone)
+
+    def snapshot(self) -> VectorSnapshot:
+        """Save everything that decides how the episodes go on.
+
+        Raises:
+            NotReset: One of them has none yet.
+        """
+        worlds = self.crew.snapshot(self._all)
+        return VectorSnapshot(tuple(worlds), tuple(self._ended.tolist()))
+
+    def restore(self, snapshot: VectorSnapshot | Mapping[int, EnvSnapshot]) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Args:
+            snapshot: Of as many environments; or those of single ones, by the index of the
+                environment that goes there.
+
+        Raises:
+            SnapshotMismatch: It is one of another task or engine, or of another number.
+        """
+        if isinstance(snapshot, VectorSnapshot):
+            if len(snapshot.worlds) != self.num_envs:
+                there, here = len(snapshot.worlds), self.num_envs
+                raise SnapshotMismatch(f"it is one of {there} environments, and here are {here}")
+            wanted, ended = dict(enumerate(snapshot.worlds)), snapshot.ended
+        else:
+            wanted = {index_of(key, self.num_envs): one for key, one in snapshot.items()}
+            ended = tuple((self._ended & [i not in wanted for i in self._all]).tolist())
+        self.crew.restore(wanted)
+        self._begun[list(wanted)] = True
+        self._ended = np.array(ended)
+
+    def branch(self, source: int, into: Any = None) -> None:
+        """Copy the state of one environment into others: from here on they are its counterfactuals.
+
+        They have its noise too, so that they differ by nothing but what is done to them. Reset
+        with a seed, they have one of their own again.
+
+        Args:
+            source: Index of the one that is copied.
+            into: Indices, or a mask of shape (n,), of those that become like it; all if None.
+
+        Raises:
+            NotReset: It has no episode.
+            UnknownOption: There is no such environment.
+        """
+        number = index_of(source, self.num_envs)
+        chosen = self._all if into is None else _chosen(into, self.num_envs)
+        others = [index for index in chosen if index != number]
+        (snapshot,) = self.crew.snapshot([number])
+        self.crew.restore(dict.fromkeys(others, snapshot))
+        self._begun[others] = True
+        self._ended[others] = self._ended[number]
+
+    def _observations(self) -> Any:
+        shown = self.crew.sheet.observations
+        if not self.copy:
+            return shown
+        if isinstance(shown, dict):
+            return {name: part.copy() for name, part in shown.items()}
+        return shown.copy()
+
+    def _infos(self, which: NDArray[np.bool_]) -> dict[str, Any]:
+        """Give the infos of some of them, in Gymnasium's form: each with a mask."""
+        sheet = self.crew.sheet
+        infos = _columns(sheet.infos, which, bool(which.all()))
+        if any(sheet.extras):
+            for index in np.flatnonzero(which).tolist():
+                infos = self._add_info(infos, sheet.extras[index], index)
+        return infos
+
+
+def _columns(
+    columns: Mapping[str, Column], which: NDArray[np.bool_], everyone: bool
+) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, column in columns.items():
+        if isinstance(column, dict):
+            found[name] = _columns(column, which, everyone)
+        elif everyone:
+            found[name] = column.copy()
+        else:
+            found[name] = np.zeros_like(column)
+            found[name][which] = column[which]
+        found[f"_{name}"] = which.copy()
+    return found
+
+
+def _chosen(into: Any, size: int) -> list[int]:
+    given = np.asarray(into)
+    if given.dtype == np.bool_:
+        return [int(index) for index in np.flatnonzero(masked(given, size))]
+    return [index_of(index, size) for index in np.atleast_1d(given).tolist()]
+
+
+def _mode(given: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError:
+        modes = [mode.value for mode in AutoresetMode]
+        raise UnknownOption("autoreset_mode", given, modes) from None
+
+
+__all__ = ["ScmWorldVectorEnv", "Sheet", "VectorSnapshot"]
