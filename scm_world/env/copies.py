@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, Self, final
 
 from gymnasium.utils import EzPickle
 
@@ -51,6 +51,13 @@ class Copied(EzPickle):
         """
         self.world.restore(snapshot.world)
         self._done = list(snapshot.interventions)
+
+    def sibling(self) -> Self:
+        """Make another environment with the same arguments; they share what is declared."""
+        given = self._ezpickle_kwargs
+        made = type(self)(**{**given, "task": self.world.family, "task_options": None})
+        made._ezpickle_kwargs = given
+        return made
 
     def __getstate__(self) -> dict[str, Any]:
         """Give the arguments, a snapshot of the world, and Gymnasium's generator."""

@@ -10,6 +10,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.tasks import Task, make_task
+from scm_world.world.family import Family
 
 
 def doubles(action: Any) -> Floats:
@@ -35,8 +36,8 @@ def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
     return tuple(given)
 
 
-def made_task(task: Task | str, options: Mapping[str, Any] | None) -> Task:
-    """Make a task of a name, with its options; or take one.
+def made_task(task: Task | Family | str, options: Mapping[str, Any] | None) -> Task | Family:
+    """Make a task of a name, with its options; or take one, or a family of one.
 
     Raises:
         UnknownOption: There are options for a task that is made.

@@ -6,12 +6,16 @@ rows are compiled once for every signature, not for every function, and are kept
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
-from typing import Any
+from typing import Any, final
 
 import numpy as np
+from llvmlite import ir
 from numba import njit, types
-from numba.extending import overload
+from numba.extending import intrinsic, overload
+
+from scm_world._types import Floats, Integers
 
 _types: Any = types  # numba is untyped
 VECTOR = types.float64[::1]
@@ -44,7 +48,7 @@ def _overloaded_arguments(matrix: Any, row: int, where: Any, number: int, likes:
 
     def first(matrix: Any, row: int, where: Any, number: int, likes: Any) -> Any:
         here = (_argument(matrix, row, where[number, 0], where[number, 1], likes[0]),)
-        return here + _arguments(matrix, row, where, number + 1, likes[1:])  # noqa: RUF005 # numba
+        return here + _arguments(matrix, row, where, number + 1, likes[1:])  # numba
 
     return last if len(likes) == 1 else first
 
@@ -64,41 +68,84 @@ def _overloaded_put(matrix: Any, row: int, first: int, stop: int, value: Any) ->
     return vector if isinstance(value, types.Array) else number
 
 
+def _called(typing: Any, address: Any, arguments: Any, like: Any) -> Any:
+    """Call the compiled function at an address; its result is of the type of an example."""
+    kinds = arguments.types
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        values = [builder.extract_value(given[1], i) for i in range(len(kinds))]
+        types_ = [context.get_value_type(kind) for kind in kinds]
+        made = ir.FunctionType(context.get_value_type(like), types_)
+        return builder.call(builder.inttoptr(given[0], made.as_pointer()), values)
+
+    return like(address, arguments, like), generate
+
+
+_call: Any = intrinsic(_called)
+
+
 def _each(
-    function: Any, matrix: Any, rows: Any, where: Any, likes: Any, first: int, stop: int
+    address: int,
+    matrix: Any,
+    rows: Any,
+    where: Any,
+    likes: Any,
+    first: int,
+    stop: int,
+    like: Any,
 ) -> None:
     for row in rows:
-        _put(matrix, row, first, stop, function(*_arguments(matrix, row, where, 0, likes)))
+        given = _arguments(matrix, row, where, 0, likes)
+        _put(matrix, row, first, stop, _call(address, given, like))
 
 
 @cache
-def each(signature: Any) -> Any:
-    """Give the loop that calls a compiled function of this signature for rows of a table.
-
-    Args:
-        signature: Of the function: vectors (``VECTOR``) and numbers to a vector or a number.
-
-    Returns:
-        A function of the function, the matrix, shape (n, w), the rows, shape (m,), the columns of
-        the arguments, shape (k, 2): first and one past the last, examples of the arguments, and
-        both ends of the columns of the result.
-    """
+def _loop(signature: Any) -> Any:
     made = types.void(
-        types.FunctionType(signature),
+        types.int64,
         _MATRIX,
         types.int64[::1],
         _WHERE,
         _types.Tuple(signature.args),
         types.int64,
         types.int64,
+        signature.return_type,
     )
     return njit(made, cache=True)(_each)
 
 
-def examples(signature: Any) -> tuple[Any, ...]:
-    """Give a value of the type of each argument."""
-    empty = np.empty(0)
-    return tuple(empty if kind == VECTOR else 0.0 for kind in signature.args)
+@final
+class Each:
+    """A compiled function that is called for rows of a table.
+
+    Args:
+        function: A dispatcher of numba that raises nothing.
+        signature: With which it has been compiled: vectors (``VECTOR``) and numbers to a vector
+            or a number.
+        where: Columns of each argument.
+        place: Columns of the result.
+    """
+
+    def __init__(self, function: Any, signature: Any, where: Iterable[slice], place: slice) -> None:
+        self._function = function  # the address is that of its code
+        compiled = function.get_compile_result(signature)
+        name = compiled.fndesc.llvm_cfunc_wrapper_name
+        self._address = compiled.library.get_pointer_to_function(name)
+        self._loop = _loop(signature)
+        self._where = np.array([(column.start, column.stop) for column in where], dtype=np.int64)
+        self._likes = tuple(map(_example, signature.args))
+        self._place = (place.start, place.stop, _example(signature.return_type))
+
+    def __call__(self, matrix: Floats, rows: Integers) -> None:
+        """Write the results of some rows, shape (m,), into a table, shape (n, w)."""
+        self._loop(self._address, matrix, rows, self._where, self._likes, *self._place)
+
+
+def _example(kind: Any) -> Any:
+    """Give a value of a type."""
+    if kind == VECTOR:
+        return np.empty(0)
+    return False if isinstance(kind, types.Boolean) else kind.cast_python_value(0)
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ from numba.core.errors import NumbaError
 from numba.extending import is_jitted
 
 from scm_world._types import Floats, Integers, Value, Values
-from scm_world.geometry.rows import VECTOR, each, examples
+from scm_world.geometry.rows import VECTOR, Each
 from scm_world.graph import SCM
 from scm_world.variables import Linear, Parent
 from scm_world.variables.kinds import Variable
@@ -36,25 +36,18 @@ class Compiled:
     """A compiled function, called in a compiled loop.
 
     Args:
-        function: Its dispatcher.
-        signature: With which it is called.
-        where: Columns of the arguments.
-        place: Columns of the result.
+        each: The loop.
     """
 
-    def __init__(self, function: Any, signature: Any, where: list[slice], place: slice) -> None:
-        self._function, self._loop = function, each(signature)
-        self._where = np.array([(s.start, s.stop) for s in where], dtype=np.int64)
-        self._likes = examples(signature)
-        self._place = place
+    def __init__(self, each: Each) -> None:
+        self._each = each
 
     def begin(self, row: int, now: Values) -> None:
         """Need nothing."""
 
     def compute(self, matrix: Floats, rows: Integers) -> None:
         """Call it for each row."""
-        place = self._place
-        self._loop(self._function, matrix, rows, self._where, self._likes, place.start, place.stop)
+        self._each(matrix, rows)
 
 
 @final
@@ -164,7 +157,7 @@ def equation(
         return Called(function, parents, columns, shapes, place)
     signature, more, values = found
     constants.extend(values)
-    return Compiled(_inner(function), signature, columns + more, place)
+    return Compiled(Each(_inner(function), signature, columns + more, place))
 
 
 def _inner(function: Any) -> Any:

@@ -12,15 +12,15 @@ import numpy as np
 from pydantic import ValidationError
 
 from scm_world._types import Values
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, Moment
 from scm_world.tasks import Task
 from scm_world.variables import Intervention, Variable
 from scm_world.world.absence import taken_apart
 from scm_world.world.declaration import Declaration, Options
-from scm_world.world.start import refuse_impossible
+from scm_world.world.start import refuse_impossible, the_task
 
-KEPT = 4  # declarations that are kept for structures that come again
+KEPT = 8  # declarations that are kept for structures that come again
 
 
 @final
@@ -96,6 +96,19 @@ class Family:
         if not all(_possible(variable, values) for variable in self.head.variables):
             return None  # the intervention will be refused, with the reason
         return self.declaration(self.plan(values))
+
+
+def as_family(task: Task | Family | str, options: Options) -> Family:
+    """Give all structures of a task, as they are if they are given.
+
+    Raises:
+        UnknownOption: There is no such task, or the family is one of other options.
+    """
+    if not isinstance(task, Family):
+        return Family(the_task(task), options)
+    if task.options != options:
+        raise UnknownOption("options of a world with this family", options, (str(task.options),))
+    return task
 
 
 @contextmanager

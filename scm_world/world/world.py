@@ -24,12 +24,12 @@ from scm_world.world.audit import Audit
 from scm_world.world.commands import clipped
 from scm_world.world.commit import commit, difference, feasible, refuse_overlaps
 from scm_world.world.declaration import Declaration, Options
-from scm_world.world.family import Family
+from scm_world.world.family import Family, as_family
 from scm_world.world.following import policy_inputs
 from scm_world.world.proposal import Instant, Proposal
 from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
-from scm_world.world.start import beginning, check_held, the_backend, the_task, whole_number
+from scm_world.world.start import beginning, check_held, the_backend, whole_number
 from scm_world.world.stepping import Stepped
 
 
@@ -37,7 +37,8 @@ class World(Stepped):
     """A task as a causal model, with an engine that moves it.
 
     Args:
-        task: A registered name, or a task.
+        task: A registered name, a task, or the ``family`` of a world that was made with the same
+            options: then they share what is declared.
         backend: ``"mujoco"``, ``"bullet"``, ``"fake"``, or an engine that is not used elsewhere.
         preset: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
         action_mode: ``"joint_positions"``, ``"joint_torques"`` or ``"end_effector_positions"``.
@@ -64,7 +65,7 @@ class World(Stepped):
 
     def __init__(
         self,
-        task: Task | str = "pushing",
+        task: Task | Family | str = "pushing",
         *,
         backend: Backend | str = "mujoco",
         preset: str = "fast",
@@ -82,7 +83,7 @@ class World(Stepped):
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        self.family = Family(the_task(task), self.options)
+        self.family = as_family(task, self.options)
         self._mode = self.options.mode
         self._by_tips = action_mode == "end_effector_positions"
         self._action_unit = ACTIONS[action_mode][0]

@@ -40,7 +40,8 @@ class LoopCrew:
     def __init__(self, make: Callable[[], ScmWorldEnv], num_envs: int, *, first: int = 0) -> None:
         self.num_envs = num_envs
         self._first = first
-        self.envs = [make() for _ in range(num_envs)]
+        lead = make()
+        self.envs = [lead, *(lead.sibling() for _ in range(num_envs - 1))]
         self.form = Form.of(self.envs[0])
         self.sheet = Sheet.empty(self.form, num_envs)
         self._seen = [env.observation_space for env in self.envs]

@@ -1,11 +1,12 @@
-"""Memory that several processes share."""
+"""What several processes share: memory, and bells to ring."""
 
 from __future__ import annotations
 
 import mmap
 import os
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, final
@@ -15,41 +16,45 @@ from numpy.typing import NDArray
 
 from scm_world.errors import UnwritableFolder
 
-FOLDER = "/dev/shm"  # noqa: S108 # files in it are memory
+IN_MEMORY = "/dev/shm"  # noqa: S108 # a folder made for this
 LINE = 64  # [bytes] of a cache line: no array begins within the last one of another
+MEMORY = "memory"
 
 
 @contextmanager
-def shared(size: int) -> Iterator[tuple[str, mmap.mmap]]:
-    """Give memory, and a path at which other processes find it until the end of the block.
+def meeting_place() -> Iterator[Path]:
+    """Give a folder in which processes find what they share, and remove it after the block.
 
-    After the block nothing of it has a name any more, so nothing is left behind, however the
-    processes end; it lasts as long as an array or a process uses it. (Named memory of
-    ``multiprocessing`` has to be removed by somebody at the end, and cannot be closed while an
-    array shows it.)
+    What they have opened lasts as long as one of them uses it. So nothing is left behind, however
+    they end. (Named memory of ``multiprocessing`` has to be removed by somebody at the end, and
+    cannot be closed while an array shows it.)
+    """
+    folder = IN_MEMORY if os.access(IN_MEMORY, os.W_OK) else None
+    with tempfile.TemporaryDirectory(prefix="scm_world_", dir=folder) as path:
+        yield Path(path)
+
+
+def share(place: Path, size: int) -> mmap.mmap:
+    """Make memory, filled with zeros.
 
     Args:
+        place: Where the others find it.
         size: In bytes.
 
     Raises:
         UnwritableFolder: There is not enough memory.
     """
-    folder = FOLDER if os.access(FOLDER, os.W_OK) else None
-    descriptor, path = tempfile.mkstemp(prefix="scm_world_", dir=folder)
-    try:
+    with (place / MEMORY).open("x+b") as file:
         try:
-            os.posix_fallocate(descriptor, 0, size)  # else writing to it may end the process
+            os.posix_fallocate(file.fileno(), 0, size)  # else writing to it may end the process
         except OSError as error:
-            raise UnwritableFolder(str(Path(path).parent), str(error)) from None
-        yield path, mmap.mmap(descriptor, size)
-    finally:
-        os.close(descriptor)
-        Path(path).unlink()
+            raise UnwritableFolder(str(place.parent), str(error)) from None
+        return mmap.mmap(file.fileno(), size)
 
 
-def found(path: str) -> mmap.mmap:
-    """Open the memory that another process shares."""
-    with Path(path).open("r+b") as file:
+def shared(place: Path) -> mmap.mmap:
+    """Open the memory that another process has made."""
+    with (place / MEMORY).open("r+b") as file:
         return mmap.mmap(file.fileno(), 0)
 
 
@@ -82,3 +87,58 @@ class Carver:
         if self._memory is None:
             return np.zeros(shape, dtype)
         return np.frombuffer(self._memory, dtype, count, start).reshape(shape)
+
+
+@final
+class Bell:
+    """Lets another process do something, many times, at the cost of two bytes through the kernel.
+
+    The other one calls ``answer_bell`` before it is rung.
+
+    Args:
+        place: Where the other process finds it.
+        name: Of the bell.
+    """
+
+    def __init__(self, place: Path, name: str) -> None:
+        there, back = _paths(place, name)
+        os.mkfifo(there)
+        os.mkfifo(back)
+        self._there = os.open(there, os.O_RDWR)  # a reader of its own, so that it need not wait
+        self._back = os.open(back, os.O_RDONLY | os.O_NONBLOCK)  # as nobody writes to it yet
+        os.set_blocking(self._back, True)
+
+    def ring(self, what: bytes) -> None:
+        """Ask for something, one byte; ``answer`` tells when it is done."""
+        os.write(self._there, what)
+
+    def answer(self) -> bytes:
+        """Wait for the answer, one byte; none if the other process has ended."""
+        return os.read(self._back, 1)
+
+    def close(self) -> None:
+        """Ring no more."""
+        os.close(self._there)
+        os.close(self._back)
+
+
+def answer_bell(place: Path, name: str, serve: Callable[[bytes], bytes]) -> None:
+    """Answer a bell from now on, in a thread, for as long as there is somebody to ring it.
+
+    Args:
+        place: Where it is.
+        name: Of the bell.
+        serve: Takes and gives one byte.
+    """
+    there, back = _paths(place, name)
+    ends = os.open(there, os.O_RDONLY), os.open(back, os.O_WRONLY)
+    threading.Thread(target=_answer, args=(*ends, serve), daemon=True).start()
+
+
+def _answer(there: int, back: int, serve: Callable[[bytes], bytes]) -> None:
+    while asked := os.read(there, 1):
+        os.write(back, serve(asked))
+
+
+def _paths(place: Path, name: str) -> tuple[Path, Path]:
+    return place / f"{name}.there", place / f"{name}.back"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any, final
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.env.batched.choice import cores
-from scm_world.env.batched.memory import Carver, shared
+from scm_world.env.batched.memory import Bell, Carver, meeting_place, share
 from scm_world.env.batched.sheet import Form
-from scm_world.env.batched.station import Desk, Station
+from scm_world.env.batched.station import DONE, RESET, STEP, Desk, Station
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import EngineFailure, UnknownOption
@@ -63,19 +63,22 @@ class ProcessCrew:
             Worker(partial(Station, make, part.stop - part.start, part.start))
             for part in self._parts
         ]
+        self._bells: list[Bell] = []
         self._lost = ""
-        self._end = weakref.finalize(self, _stop, self._workers)
-        self._share(range(count))
+        self._end = weakref.finalize(self, _stop, self._workers, self._bells)
+        self._share()
 
-    def _share(self, everyone: range) -> None:
+    def _share(self) -> None:
         """Start the processes, and let all of them write into one memory."""
+        everyone = range(len(self._workers))
         self.form: Form = self._ask(dict.fromkeys(everyone, ("form",)))[0]
         needed = Carver()
         Desk(self.form, self.num_envs, needed)
-        with shared(needed.size) as (path, memory):
-            self._desk = Desk(self.form, self.num_envs, Carver(memory))
-            self.sheet = self._desk.sheet
-            self._ask(dict.fromkeys(everyone, ("attach", path, self.num_envs)))
+        with meeting_place() as place:
+            self._desk = Desk(self.form, self.num_envs, Carver(share(place, needed.size)))
+            self._bells.extend(Bell(place, str(k)) for k in everyone)
+            self._ask({k: ("attach", place, str(k), self.num_envs) for k in everyone})
+        self.sheet = self._desk.sheet
 
     def reset(
         self,
@@ -84,16 +87,21 @@ class ProcessCrew:
         options: Sequence[Mapping[str, Any] | None],
     ) -> None:
         """Begin an episode in some of them."""
-        parts = {k: self._parts[k] for k in self._busy(which)}
-        self._all_or_none(
-            "reset", {k: (which[mine], seeds[mine], options[mine]) for k, mine in parts.items()}
-        )
+        busy = self._busy(which)
+        if any(seed is not None for seed in seeds) or any(options):
+            parts = {k: self._parts[k] for k in busy}
+            self._all_or_none(
+                "reset", {k: (which[mine], seeds[mine], options[mine]) for k, mine in parts.items()}
+            )
+        else:
+            self._desk.which[:] = which
+            self._ring(RESET, busy)
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step."""
         self._desk.which[:] = which
         self._desk.actions[:] = actions
-        self._ask(dict.fromkeys(self._busy(which), ("advance",)))
+        self._ring(STEP, self._busy(which))
 
     def do(
         self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
@@ -166,21 +174,41 @@ class ProcessCrew:
 
     # --- asking -----------------------------------------------------------------------------------
 
+    def _ring(self, what: bytes, busy: Sequence[int]) -> None:
+        """Let some processes do what the desk says; resets happen in all of them or in none."""
+        if self._lost:
+            raise EngineFailure(self._lost, PROCESS)
+        try:
+            for k in busy:
+                self._bells[k].ring(what)
+            said = {k: self._bells[k].answer() for k in busy}
+        except BaseException as error:
+            self._give_up(f"they were interrupted by {type(error).__name__}")
+            raise
+        rest = [k for k in busy if said[k] != DONE]
+        if rest:
+            _, errors = self._answers(dict.fromkeys(rest, ("more",)))
+            if errors and what == RESET:
+                self._undo(set(busy) - errors.keys())
+            _raise_first(errors)
+
     def _all_or_none(self, method: str, given: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
         """Ask for something that each process does wholly or not at all, and so do all of them."""
         calls: dict[int, tuple[Any, ...]]
         calls = {k: ("tell", method, args, {}) for k, args in given.items()}
         answers, errors = self._answers(calls)
         if errors:
-            self._ask(dict.fromkeys(answers, ("tell", "undo", (), {})))
-            raise errors[min(errors)]
+            self._undo(answers)
+        _raise_first(errors)
         return answers
+
+    def _undo(self, where: Iterable[int]) -> None:
+        self._ask(dict.fromkeys(where, ("tell", "undo", (), {})))
 
     def _ask(self, calls: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
         """Ask some processes at once, and give what they say."""
         answers, errors = self._answers(calls)
-        if errors:
-            raise errors[min(errors)]
+        _raise_first(errors)
         return answers
 
     def _answers(
@@ -232,6 +260,13 @@ class ProcessCrew:
         return EngineFailure(self._lost, PROCESS)
 
 
-def _stop(workers: Sequence[Worker]) -> None:
+def _raise_first(errors: Mapping[int, Exception]) -> None:
+    if errors:
+        raise errors[min(errors)]
+
+
+def _stop(workers: Sequence[Worker], bells: list[Bell]) -> None:
     for worker in workers:
         worker.stop()
+    while bells:
+        bells.pop().close()

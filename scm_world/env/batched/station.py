@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
 from scm_world.env.batched.loop import LoopCrew
-from scm_world.env.batched.memory import Carver, found
+from scm_world.env.batched.memory import Carver, answer_bell, shared
 from scm_world.env.batched.sheet import Allocate, Form, Sheet
 from scm_world.env.environment import ScmWorldEnv
+
+STEP, RESET = b"s", b"r"
+DONE, MORE = b".", b"+"
 
 Said = tuple[Any, list[dict[str, Any]] | None]
 """The answer to a call, and what there is in ``info`` that is no number."""
@@ -27,7 +31,7 @@ class Desk:
 
     Attributes:
         sheet: What they said last.
-        which: Those that are stepped, shape (n,).
+        which: Those that are stepped or reset, shape (n,).
         actions: Shape (n, 9).
     """
 
@@ -50,26 +54,43 @@ class Station:
     def __init__(self, make: Callable[[], ScmWorldEnv], size: int, first: int) -> None:
         self._where = slice(first, first + size)
         self._crew = LoopCrew(make, size, first=first)
+        self._none = [None] * size
+        self._error: Exception | None = None
 
     def form(self) -> Said:
         """Tell what the environments have in common."""
         return self._crew.form, None
 
-    def attach(self, path: str, total: int) -> Said:
-        """Write into shared memory from now on.
+    def attach(self, place: Path, bell: str, total: int) -> Said:
+        """Write into shared memory from now on, and answer a bell.
 
         Args:
-            path: Where it is.
+            place: Where they are.
+            bell: Its name.
             total: How many environments there are in all processes.
         """
-        desk = Desk(self._crew.form, total, Carver(found(path)))
+        desk = Desk(self._crew.form, total, Carver(shared(place)))
         self._crew.sheet = desk.sheet.part(self._where)
         self._which, self._actions = desk.which[self._where], desk.actions[self._where]
+        answer_bell(place, bell, self._serve)
         return None, None
 
-    def advance(self) -> Said:
-        """Step those that are to be stepped."""
-        self._crew.step(self._which, self._actions)
+    def _serve(self, asked: bytes) -> bytes:
+        """Step or reset what the desk says; what goes wrong is raised by ``more``."""
+        try:
+            if asked == STEP:
+                self._crew.step(self._which, self._actions)
+            else:
+                self._crew.reset(self._which, self._none, self._none)
+        except Exception as error:
+            self._error = error
+        return DONE if self._error is None and not any(self._crew.sheet.extras) else MORE
+
+    def more(self) -> Said:
+        """Tell what a byte cannot."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
         return None, self._extras()
 
     def tell(self, method: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Said:

@@ -1,0 +1,42 @@
+"""Single numbers in compiled code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+from numba.extending import intrinsic, overload
+
+
+def scalar(value: Any) -> float:
+    """Give a number as a float, also one that comes as an array of shape ().
+
+    Compiled code may call it, where ``float`` refuses arrays.
+
+    Example:
+        >>> import numpy as np
+        >>> scalar(np.array(3)), scalar(2)
+        (3.0, 2.0)
+    """
+    return float(value)
+
+
+@overload(scalar)
+def _scalar(value: Any) -> Any:
+    def of_array(value: Any) -> Any:
+        return float(value[()])
+
+    def of_number(value: Any) -> Any:
+        return float(value)
+
+    return of_array if isinstance(value, types.Array) else of_number
+
+
+@intrinsic
+def fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """Compute ``a * b + c`` with one rounding, in compiled code, on every processor alike."""
+
+    def write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fma(*arguments)
+
+    return types.float64(types.float64, types.float64, types.float64), write
