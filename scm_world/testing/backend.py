@@ -45,9 +45,12 @@ from scm_world.testing.scenes import (
     same,
 )
 from scm_world.testing.states import StateConformance
+from scm_world.testing.together import TogetherConformance
 
 
-class BackendConformance(ParameterConformance, StateConformance, EffectConformance):
+class BackendConformance(
+    ParameterConformance, StateConformance, EffectConformance, TogetherConformance
+):
     """Every sentence of ``Backend``, as a test.
 
     Attributes:

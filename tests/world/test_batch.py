@@ -1,0 +1,194 @@
+"""Worlds that are stepped together do what each would do alone."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from worlds import BACKENDS, NEEDS_BULLET
+
+from scm_world.errors import NotReset, UnknownOption
+from scm_world.tasks import TASKS, Pushing
+from scm_world.tasks.rewards import term
+from scm_world.variables import Mechanism
+from scm_world.world import World
+from scm_world.world.batch import Batch
+
+COUNT = 4
+ENGINES = [pytest.param(b, marks=NEEDS_BULLET if b == "bullet" else ()) for b in BACKENDS]
+NAMES = ("reward", "success", "fractional_success", "end_effector_positions")
+
+
+def worlds(task: Any = "pushing", count: int = COUNT, **options: Any) -> list[World]:
+    """Make worlds that share what is declared, each at the beginning of another episode."""
+    first = World(task, **options)
+    found = [first, *(World(first.family, **options) for _ in range(count - 1))]
+    for seed, world in enumerate(found):
+        world.reset(seed=seed)
+    return found
+
+
+def commands(world: World, steps: int) -> Any:
+    """Draw commands for all worlds, shape (steps, n, 9)."""
+    generator = np.random.default_rng(0)
+    return generator.uniform(world.action_low, world.action_high, (steps, COUNT, 9))
+
+
+def check(batch: Batch, alone: list[World], rows: Any) -> None:
+    """Compare what a table has with what worlds say."""
+    for row in rows:
+        now = alone[row].evaluate(NAMES)
+        for name in NAMES:
+            found = batch.table(row).column(name)[row]
+            np.testing.assert_array_equal(found, np.ravel(now[name]), err_msg=f"{name}, {row}")
+
+
+def check_whole(batch: Batch, alone: list[World]) -> None:
+    """Compare worlds that were handed back with others, value by value and bit by bit."""
+    for index, world in enumerate(alone):
+        handed = batch.world(index)
+        for mine, other in (
+            (world.values(), handed.values()),
+            (world.previous(), handed.previous()),
+        ):
+            assert mine.keys() == other.keys()
+            for name, value in mine.items():
+                np.testing.assert_array_equal(other[name], value, err_msg=name)
+                assert other[name].dtype == value.dtype
+
+
+def compare(alone: list[World], many: list[World], *, steps: int = 10, threads: int = 2) -> None:
+    """Go on with both kinds, and compare."""
+    batch = Batch(many, threads=threads, names=NAMES)
+    for step, asked in enumerate(commands(alone[0], steps)):
+        which = np.ones(COUNT, dtype=np.bool_)
+        which[::2] = step % 4 != 3
+        for index in np.flatnonzero(which):
+            alone[index].advance(asked[index].copy())
+        batch.advance(asked, which)
+        check(batch, alone, np.flatnonzero(which))
+    check_whole(batch, alone)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task(task: str) -> None:
+    """Rewards and successes of a batch are those of single worlds, in every task."""
+    compare(worlds(task), worlds(task), steps=6)
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+@pytest.mark.parametrize("mode", ["joint_torques", "end_effector_positions"])
+def test_every_action_mode(backend: str, mode: str) -> None:
+    """Torques and fingertips, too, mean to a batch what they mean to a world."""
+    options = {"backend": backend, "action_mode": mode, "preset": "precise"}
+    compare(worlds(**options), worlds(**options))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_numbers_of_worlds_and_threads(count: int, threads: int) -> None:
+    """What a world does depends neither on how many there are nor on the threads."""
+    alone, many = worlds(count=1), worlds(count=count)
+    batch = Batch(many, threads=threads, names=NAMES)
+    for asked in commands(alone[0], 8):
+        alone[0].advance(asked[0].copy())
+        batch.advance(np.resize(asked, (count, 9)))
+        np.testing.assert_array_equal(batch.table(0).matrix[0, :40], alone[0].current()[1].vector)
+
+
+def _lean(joints: Any) -> Any:
+    return joints + 0.05
+
+
+MEDDLING: dict[int, Callable[[Callable[[int], World]], Any]] = {
+    1: lambda world: world(0).do({"tool_block.mass": 0.08, "floor_friction": 0.4}),
+    2: lambda world: world(1).do({"actuator_noise": 0.1}),
+    3: lambda world: world(2).do({"tool_block.linear_velocity": [0.05, 0.02, 0.1]}),
+    4: lambda world: world(3).restore(world(0).snapshot()),
+    5: lambda world: world(1).reset(seed=11),
+    6: lambda world: world(2).do({"action": Mechanism(_lean, ("joint_positions",))}),
+    7: lambda world: world(0).do({"block.size": [0.06, 0.06, 0.06]}),
+}
+"""What is done to which world before some steps."""
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+def test_interventions_in_between(backend: str) -> None:
+    """Whatever is done to one of them between steps is done to that one, and to it alone."""
+    alone, many = worlds(backend=backend), worlds(backend=backend)
+    batch = Batch(many, threads=2, names=NAMES)
+    for step, asked in enumerate(commands(alone[0], 12)):
+        for world in (alone.__getitem__, batch.world):
+            MEDDLING.get(step, lambda _: None)(world)
+        for index, world in enumerate(alone):
+            world.advance(asked[index].copy())
+        batch.advance(asked)
+        check(batch, alone, range(COUNT))
+    check_whole(batch, alone)
+
+
+def test_bodies_come_and_go() -> None:
+    """A world whose structure changes goes on in another table."""
+    alone, many = worlds("general"), worlds("general")
+    batch = Batch(many, threads=2, names=NAMES)
+    request = next(iter(alone[1].task.nearby(alone[1].values())))
+    for step, asked in enumerate(commands(alone[0], 6)):
+        if step == 2:
+            alone[1].do(request)
+            batch.world(1).do(request)
+            assert many[1].declaration is not many[0].declaration
+        for index, world in enumerate(alone):
+            world.advance(asked[index].copy())
+        batch.advance(asked)
+        check(batch, alone, range(COUNT))
+    check_whole(batch, alone)
+
+
+def test_functions_of_ones_own() -> None:
+    """A reward term that is a plain function of Python is computed in its own world."""
+    own = term("reward.own", _own, ("tool_block.type", "control_index", NAMES[3]), "Of mine.")
+    task = {"terms": [own], "weights": {"reward.own": 2.0}}
+    compare(worlds(Pushing(**task)), worlds(Pushing(**task)))
+
+
+def _own(kind: Any, index: Any, tips: Any) -> float:
+    assert np.ndim(kind) <= 1
+    assert int(index) == index
+    return float(tips[0] * 3.0 + index)
+
+
+def test_worlds_must_be_alike() -> None:
+    """Worlds of two tasks, no world and no thread are refused with the reason."""
+    with pytest.raises(UnknownOption, match="one task"):
+        Batch([World("pushing", backend="fake"), World("picking", backend="fake")])
+    with pytest.raises(UnknownOption, match="one or more"):
+        Batch([])
+    with pytest.raises(UnknownOption, match="threads"):
+        Batch(worlds(backend="fake"), threads=0)
+
+
+def test_a_world_without_episode() -> None:
+    """Advancing worlds that were never reset is an error."""
+    batch = Batch([World("pushing", backend="fake")])
+    with pytest.raises(NotReset):
+        batch.advance(np.zeros((1, 9)))
+
+
+def test_a_family_of_other_options() -> None:
+    """A world cannot share what is declared for other options."""
+    family = World("pushing", backend="fake").family
+    with pytest.raises(UnknownOption, match="family"):
+        World(family, backend="fake", frame_skip=3)
+
+
+def test_a_copy_of_a_sibling_is_whole() -> None:
+    """A world that shares its declarations can be pickled and copied like any other."""
+    first = worlds(backend="fake")[1]
+    again = pickle.loads(pickle.dumps(first))  # noqa: S301 # our own
+    for world in (first, again):
+        world.step(np.zeros(9))
+    for name, value in first.values().items():
+        np.testing.assert_array_equal(again[name], value)
