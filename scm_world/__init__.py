@@ -157,4 +157,9 @@ for _task in (
 ):
     _id = f"scm_world/{''.join(part.capitalize() for part in _task.split('_'))}-v0"
     if _id not in gymnasium.registry:
-        gymnasium.register(id=_id, entry_point="scm_world.env:ScmWorldEnv", kwargs={"task": _task})
+        gymnasium.register(
+            id=_id,
+            entry_point="scm_world.env:ScmWorldEnv",
+            vector_entry_point="scm_world.env.batched:ScmWorldVectorEnv",
+            kwargs={"task": _task},
+        )

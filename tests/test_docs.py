@@ -52,6 +52,7 @@ EXAMPLES = (
     "new_family",
     "own_learner",
     "recording",
+    "vector",
 )
 
 

@@ -23,6 +23,8 @@ from scm_world.cli.options import (
     Steps,
     Task,
 )
+from scm_world.cli.sampling import collect, sweep
+from scm_world.cli.working import Address, Engine, Work, Workers
 from scm_world.errors import ScmWorldError
 
 
@@ -36,7 +38,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except ScmWorldError as error:
-            fail(str(error))
+            fail("\n".join((str(error), *getattr(error, "__notes__", ()))))
             raise typer.Exit(2) from None
         except BrokenPipeError:  # the reader has seen enough
             raise
@@ -131,7 +133,9 @@ def discover(
         float, typer.Option(min=0.0, help="Standard deviation, in halves of a range.")
     ] = 0.005,
     timeout: Annotated[float, typer.Option(min=0.0, help="Of a run [s]; 0 for no limit.")] = 300.0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that run learners.")] = 1,
+    workers: Workers = None,
+    engine: Engine = None,
+    address: Address = None,
 ) -> None:
     """Recover a causal graph by experiments, and score it; or examine learners.
 
@@ -156,80 +160,14 @@ def discover(
         seeds,
         chosen,
         timeout,
-        workers,
+        Work(engine, workers, address),
         tuple(option or ()),
     )
     raise typer.Exit(exam.run(sitting, out=out))
 
 
-app.command()(evaluate)
-app.command()(explain)
-
-
-@app.command()
-def collect(
-    task: Task,
-    design: Annotated[
-        str, typer.Option(help="What is done: see, single, all or half of the targets at once.")
-    ] = "single",
-    n: Annotated[int, typer.Option("-n", "--n", min=1, help="How many episodes.")] = 1000,
-    target: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATTERN", help="What is intervened on, such as '*.mass'."),
-    ] = None,
-    cause: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATTERN", help="Parameters that are written down."),
-    ] = None,
-    outcome: Annotated[
-        list[str] | None,
-        typer.Option(metavar="[HOW:]NAME", help="What is measured, such as sum:reward."),
-    ] = None,
-    values: Annotated[str, typer.Option(help="Where values are drawn: A, B or 'A|B'.")] = "A",
-    seen: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Share of episodes in which nothing is done.")
-    ] = 0.3,
-    nature: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="What varies by itself, such as NAME=draw:A."),
-    ] = None,
-    every_step: Annotated[
-        bool, typer.Option("--every-step", help="A row for each control step.")
-    ] = False,
-    steps: Steps = 25,
-    policy: Policy = "random",
-    backend: Backend = "mujoco",
-    seed: Seed = 0,
-    preset: Preset = "fast",
-    shard: Annotated[int, typer.Option(min=1, help="Episodes in one file.")] = 100,
-    format_: Annotated[str, typer.Option("--format", help="parquet or csv.")] = "parquet",
-    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
-    out: Out = None,
-    option: Arguments = None,
-) -> None:
-    """Collect a dataset from interventions, in a folder.
-
-    Ctrl-C keeps what is complete (exit code 130); the same command goes on.
-    """
-    from scm_world.cli.collection import Options, run
-    from scm_world.cli.questions import Circumstances
-
-    options = Options(
-        Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ())),
-        n,
-        design,
-        targets=tuple(target or ()),
-        causes=tuple(cause or ()),
-        outcomes=tuple(outcome or ()),
-        values=values,
-        seen=seen,
-        nature=tuple(nature or ()),
-        every_step=every_step,
-        shard=shard,
-        files=format_,
-        workers=workers,
-    )
-    raise typer.Exit(run(options, out=out))
+for _command in (evaluate, explain, collect, sweep):
+    app.command()(_command)
 
 
 @app.command()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -13,14 +12,17 @@ import numpy as np
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import console, table, written
 from scm_world.cli.questions import Circumstances, read_outcome, shown_episodes
+from scm_world.cli.working import Work
 from scm_world.discovery.data import Dataset, Design, collect, default_causes
 from scm_world.discovery.data.folders import SIDECAR
 from scm_world.discovery.data.recorded import settable
 from scm_world.errors import UnknownOption
+from scm_world.output.locations import Location
 from scm_world.variables.kinds import SPACES
 
 if TYPE_CHECKING:
     from scm_world.queries import Outcome, World
+    from scm_world.work.executors import Executor
 
 INTERRUPTED = 130
 SHOWN = 12  # targets that are listed
@@ -44,7 +46,7 @@ class Options:
         every_step: Whether there is a row for each control step.
         shard: Episodes in a file.
         files: ``"parquet"`` or ``"csv"``.
-        workers: Threads.
+        work: Where the episodes happen.
     """
 
     where: Circumstances
@@ -59,39 +61,52 @@ class Options:
     every_step: bool
     shard: int
     files: str
-    workers: int
+    work: Work
 
 
-def run(options: Options, *, out: Path | None) -> int:
+def run(options: Options, *, out: Location | None) -> int:
     """Collect, print a summary; return the exit code."""
     if options.values not in SPACES:
         raise UnknownOption("values", options.values, SPACES)
-    if options.files == "parquet" and find_spec("pyarrow") is None:
-        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
-        raise UnknownOption("format", "parquet", allowed)
+    check_files(options.files)
     where = options.where
     folder = out or where.folder(f"collect-{options.design}")
     world = where.world()
     terminal = console()
     try:
-        with shown_episodes() as progress:
-            found = _collected(world, options, folder, progress)
+        with options.work.begun() as executor, shown_episodes() as progress:
+            found = _collected(world, options, folder, executor, progress)
     except KeyboardInterrupt:
-        safe = len(list(folder.glob("shard-*.*")))
-        whole = -(-options.n // options.shard)
-        terminal.print(
-            f"interrupted: {safe} of {whole} files are safe in {folder}; the same command goes on",
-            soft_wrap=True,
-        )
+        terminal.print(kept(folder, options.n, options.shard), soft_wrap=True)
         return INTERRUPTED
     finally:
         world.close()
     terminal.print(_summary(found, f"{where.task} on {found.about['engine']}, seed {where.seed}"))
-    written(terminal, folder / SIDECAR, *sorted(folder.glob("shard-*.*"))[:1])
+    shards = list[Location](folder.glob("shard-*.*"))
+    written(terminal, folder / SIDECAR, *sorted(shards, key=str)[:1])
     return 0
 
 
-def _collected(world: World, options: Options, folder: Path, progress: Any) -> Dataset:
+def check_files(kind: str) -> None:
+    """Refuse files that could not be written in the end.
+
+    Raises:
+        UnknownOption: What writes Parquet is not installed.
+    """
+    if kind == "parquet" and find_spec("pyarrow") is None:
+        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
+        raise UnknownOption("format", "parquet", allowed)
+
+
+def kept(folder: Location, episodes: int, shard: int) -> str:
+    """Say what an interruption has left of episodes in shards."""
+    safe, whole = len(list(folder.glob("shard-*.*"))), -(-episodes // shard)
+    return f"interrupted: {safe} of {whole} files are safe in {folder}; the same command goes on"
+
+
+def _collected(
+    world: World, options: Options, folder: Location, executor: Executor, progress: Any
+) -> Dataset:
     where, patterns = options.where, options.targets or options.causes
     targets: Sequence[str] = ()
     if options.design != "see":
@@ -105,7 +120,7 @@ def _collected(world: World, options: Options, folder: Path, progress: Any) -> D
         shard=options.shard,
         format=options.files,
         progress=progress,
-        workers=options.workers,
+        engine=executor,
         steps=where.steps,
         policy=where.acts,
         nature=parse_assignments(options.nature, "'--nature'"),

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
+from uuid import uuid4
 
 import numpy as np
 import typer
+
+from scm_world.output.durable import made, removed, write_durably
+from scm_world.output.locations import Location
+from scm_world.output.remote import Remote
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,7 +41,7 @@ def table(*headers: str, title: str = "", caption: str = "") -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    made = Table(
+    begun = Table(
         title=Text(title) if title else None,
         caption=Text(caption) if caption else None,
         box=box.SIMPLE_HEAD,
@@ -47,8 +51,8 @@ def table(*headers: str, title: str = "", caption: str = "") -> Table:
         pad_edge=False,
     )
     for header in headers:
-        made.add_column(header, overflow="fold")
-    return made
+        begun.add_column(header, overflow="fold")
+    return begun
 
 
 def keep_whole(made: Table, terminal: Console, *columns: int) -> Table:
@@ -67,7 +71,7 @@ def fail(message: str) -> None:
     console(stderr=True).print(line, soft_wrap=True)
 
 
-def written(terminal: Console, *paths: Path) -> None:
+def written(terminal: Console, *paths: Location) -> None:
     """Say which files were written."""
     from rich.text import Text
 
@@ -107,15 +111,20 @@ def plain(value: Any) -> Any:
     return value
 
 
-def check_writable(path: Path, *, folder: bool) -> None:
+def check_writable(path: Location, *, folder: bool) -> None:
     """Refuse a place that cannot be written before time is spent on filling it.
 
     Raises:
         BadParameter: Something else lies there, or it is read-only.
+        UnwritableFolder: A store does not answer, or does not allow it.
     """
+    if isinstance(path, Remote):
+        _try(path if folder else path.parent)
     if path.exists() and path.is_dir() != folder:
         kind = "a file" if folder else "a folder"
         raise typer.BadParameter(f"{str(path)!r} is {kind}", param_hint="'--out'")
+    if isinstance(path, Remote):
+        return
     there = path
     while not there.exists() and there != there.parent:
         there = there.parent
@@ -123,11 +132,18 @@ def check_writable(path: Path, *, folder: bool) -> None:
         raise typer.BadParameter(f"{str(there)!r} cannot be written to", param_hint="'--out'")
 
 
+def _try(folder: Remote) -> None:
+    """Write something to a store, and remove it: there is no other way to know."""
+    trial = folder / f".trial-{uuid4().hex}"
+    write_durably(trial, b"")
+    removed(trial)
+
+
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def staged(folder: Location) -> Iterator[Path]:
     """Collect files elsewhere, and put them into a folder once all of them are complete."""
     with tempfile.TemporaryDirectory(prefix="scm-world-") as draft:
         yield Path(draft)
-        folder.mkdir(parents=True, exist_ok=True)
+        made(folder)
         for file in sorted(Path(draft).iterdir()):
-            shutil.copyfile(file, folder / file.name)
+            write_durably(folder / file.name, file.read_bytes())

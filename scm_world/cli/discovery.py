@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, final
 
 from rich.text import Text
@@ -23,6 +22,7 @@ from scm_world.cli.tasks import build, suffix
 from scm_world.discovery import DiscoveryReport, discover
 from scm_world.discovery.names import by_entity
 from scm_world.discovery.plots import draw_graphs
+from scm_world.output.locations import Location
 from scm_world.world import World
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class Options:
     arguments: tuple[str, ...] = ()
 
 
-def run(options: Options, *, out: Path | None, strict: bool) -> int:
+def run(options: Options, *, out: Location | None, strict: bool) -> int:
     """Discover, print, write; return the exit code."""
     about = f"{options.backend}-seed{options.seed}{suffix(options.arguments)}"
     folder = out or RESULTS / f"discover-{options.task}-{about}"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from scm_world.cli.options import Arguments, Out
+from scm_world.cli.options import Arguments, Out, read_location
+from scm_world.cli.working import Address, Engine, Work, Workers
 
 ENV = Annotated[
     list[str] | None,
@@ -50,17 +50,21 @@ def evaluate(
     metric: Annotated[
         str, typer.Option(help="Score that is shown and drawn; all are written.")
     ] = METRIC,
-    workers: Annotated[
-        int, typer.Option(min=0, help="Processes; 0 for as many as there are cores.")
-    ] = 0,
+    workers: Workers = 0,
+    engine: Engine = None,
+    address: Address = None,
     format_: Annotated[str, typer.Option("--format", help="parquet or csv.")] = "parquet",
     videos: Annotated[
         bool, typer.Option("--videos", help="Film the best, median and worst episodes.")
     ] = False,
     out: Out = None,
     check: Annotated[
-        Path | None,
-        typer.Option(help="Play a random part of these results again, and compare every bit."),
+        Any,  # a Location or None
+        typer.Option(
+            parser=read_location,
+            metavar="PATH",
+            help="Play a random part of these results again, and compare every bit.",
+        ),
     ] = None,
     part: Annotated[int, typer.Option(min=1, help="Episodes that --check plays.")] = 12,
     trust: TRUST = None,
@@ -87,7 +91,7 @@ def evaluate(
         tuple(env or ()),
         tuple(option or ()),
         metric,
-        workers,
+        Work(engine, workers, address),
         format_,
         videos,
     )
@@ -95,7 +99,12 @@ def evaluate(
 
 
 def explain(
-    results: Annotated[Path, typer.Argument(help="Folder or results.json of an evaluation.")],
+    results: Annotated[
+        Any,  # a Location
+        typer.Argument(
+            parser=read_location, metavar="RESULTS", help="Folder or results.json of an evaluation."
+        ),
+    ],
     protocol: Annotated[
         str | None, typer.Option(help="Name of a protocol; all that vary something by default.")
     ] = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -24,11 +23,13 @@ from scm_world.cli.console import (
 )
 from scm_world.cli.questions import shown_episodes
 from scm_world.cli.tasks import build, suffix
+from scm_world.cli.working import Work
 from scm_world.errors import UnknownOption
 from scm_world.evaluation import METRICS, Evaluation, evaluate
 from scm_world.evaluation.files import CODECS
 from scm_world.evaluation.parts import FOLDER
 from scm_world.evaluation.reporting import write_outputs
+from scm_world.output.locations import Location
 
 INTERRUPTED = 130
 _WORDS = {"true": True, "false": False, "none": None}
@@ -49,7 +50,7 @@ class Options:
         env: Options of the environment, each as ``name=value``.
         arguments: Of the task, likewise.
         metric: Score that is shown.
-        workers: Processes; 0 for as many as there are cores.
+        work: Where the episodes are played.
         form: ``"parquet"`` or ``"csv"``.
         videos: Whether episodes are filmed.
     """
@@ -63,7 +64,7 @@ class Options:
     env: tuple[str, ...]
     arguments: tuple[str, ...]
     metric: str
-    workers: int
+    work: Work
     form: str
     videos: bool
 
@@ -108,7 +109,7 @@ def _label(policy: str) -> str:
     return policy.replace(":", ".") if ":" in policy else Path(policy).stem
 
 
-def run(options: Options, *, out: Path | None) -> int:
+def run(options: Options, *, out: Location | None) -> int:
     """Evaluate, print a table, write everything; return the exit code."""
     _check(options)
     sys.path.insert(0, str(Path.cwd()))  # for a policy of one's own, beside where this is called
@@ -116,7 +117,7 @@ def run(options: Options, *, out: Path | None) -> int:
     check_writable(folder, folder=True)
     terminal = console()
     try:
-        with shown_episodes() as progress:
+        with options.work.begun() as executor, shown_episodes() as progress:
             found = evaluate(
                 policies_of(options.policies),
                 options.protocols,
@@ -125,7 +126,7 @@ def run(options: Options, *, out: Path | None) -> int:
                 seeds=_seeds(options.seeds),
                 backend=options.backends,
                 env=options.environment(),
-                workers=options.workers or os.cpu_count() or 1,
+                engine=executor,
                 out=folder,
                 progress=progress,
             )

@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Any, final
 from scm_world.cli.console import RESULTS, check_writable, console, table, written
 from scm_world.cli.questions import POLICIES
 from scm_world.cli.tasks import build, suffix
+from scm_world.cli.working import Work
 from scm_world.discovery.exam.results import Exam
-from scm_world.discovery.exam.study import Study, examine, slug
+from scm_world.discovery.exam.runs import slug
+from scm_world.discovery.exam.study import Study, examine
 from scm_world.discovery.exam.subjects import VIEWS, TaskView
 from scm_world.discovery.exam.tables import COLUMNS, HEADS, STANDARDISED, best, by_subject
 from scm_world.errors import UnknownOption
+from scm_world.output.locations import Location
 from scm_world.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -39,7 +42,7 @@ class Options:
         seeds: How many.
         view: How tasks are looked at.
         timeout: Of a run [s]; 0 for no limit.
-        workers: Processes.
+        work: Where the runs are done.
         arguments: Of the tasks, each as ``name=value``.
     """
 
@@ -50,11 +53,11 @@ class Options:
     seeds: int
     view: TaskView
     timeout: float
-    workers: int
+    work: Work
     arguments: tuple[str, ...] = ()
 
 
-def run(options: Options, *, out: Path | None) -> int:
+def run(options: Options, *, out: Location | None) -> int:
     """Examine, print a table, write everything; return the exit code."""
     if ":" in options.learners:  # a learner of one's own, beside where the command is called
         sys.path.insert(0, str(Path.cwd()))
@@ -66,8 +69,8 @@ def run(options: Options, *, out: Path | None) -> int:
     check_writable(folder, folder=True)
     terminal = console()
     try:
-        with shown_runs() as progress:
-            exam = examine(study, folder, workers=options.workers, progress=progress)
+        with options.work.begun(usual="process") as executor, shown_runs() as progress:
+            exam = examine(study, folder, engine=executor, progress=progress)
     except KeyboardInterrupt:
         done = len(list(folder.glob("cells/*/*.json")))
         said = f"interrupted: {done} runs are safe in {folder}; the same command goes on"

@@ -14,6 +14,7 @@ from scm_world.cli.evaluation import policies_of
 from scm_world.cli.questions import shown_episodes
 from scm_world.evaluation import Causes, Evaluation, check, why
 from scm_world.evaluation.files import false_scores
+from scm_world.output.locations import Location
 
 SHOWN = 8  # variables that are listed
 NOTHING = "nothing is varied in it"
@@ -24,7 +25,7 @@ def _policy(text: str | None) -> Any:
 
 
 def check_again(
-    path: Path, episodes: int, policy: str | None, trusted: tuple[str, ...] = ()
+    path: Location, episodes: int, policy: str | None, trusted: tuple[str, ...] = ()
 ) -> int:
     """Play a part of some results again; return the exit code."""
     _look_here(trusted, policy)
@@ -62,7 +63,7 @@ class Where:
         trusted: Packages whose functions may be policies.
     """
 
-    path: Path
+    path: Location
     agent: str | None
     engine: str | None
     metric: str

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, final
 
 from scm_world._types import Floats, Value, Values
@@ -13,6 +12,7 @@ from scm_world.cli.console import PAGE, RESULTS, check_writable, console
 from scm_world.cli.tasks import build, suffix
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
+from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import gap
 from scm_world.scene import Scene
 from scm_world.variables.kinds import SPACES
@@ -104,7 +104,9 @@ class Outcome:
         return tuple(row.name for row in self.rows if row.moved and not row.follows)
 
 
-def run(assignments: Sequence[str], options: Options, *, show_all: bool, out: Path | None) -> int:
+def run(
+    assignments: Sequence[str], options: Options, *, show_all: bool, out: Location | None
+) -> int:
     """Intervene, print, write; return the exit code."""
     from scm_world.cli.outcome import report, save
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from scm_world.errors import ScmWorldError
+from scm_world.output.locations import Location, located
 
 
 class Format(StrEnum):
@@ -36,9 +38,28 @@ Arguments = Annotated[
         help="Argument of the task, such as num_of_levels=2; give it once for each argument.",
     ),
 ]
+
+
+def read_location(text: str) -> Location:
+    """Read where results are, or are to be: a path or a URL.
+
+    Raises:
+        BadParameter: The URL cannot be reached from here; it says why.
+    """
+    try:
+        return located(text)
+    except ScmWorldError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
 Out = Annotated[
-    Path | None,
-    typer.Option(help="Folder for the results.", show_default="under scm-world-results"),
+    Any,  # a Location or None, which typer does not know
+    typer.Option(
+        parser=read_location,
+        metavar="PATH",
+        help="Folder for the results, or a URL such as s3://bucket/run.",
+        show_default="under scm-world-results",
+    ),
 ]
 
 

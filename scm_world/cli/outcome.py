@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from rich.text import Text
 from scm_world._types import Value
 from scm_world.cli.console import keep_whole, plain, show, staged, table, written
 from scm_world.cli.intervene import Outcome, Row
+from scm_world.output.locations import Location
 from scm_world.queries.experiments.versions import versions
 from scm_world.variables import Draw, Hard, Scale, Shift
 
@@ -25,7 +25,7 @@ SAME = "="
 DIVIDER = 4  # [pixels] between two pictures
 
 
-def save(outcome: Outcome, folder: Path) -> None:
+def save(outcome: Outcome, folder: Location) -> None:
     """Write result.json and the pictures, all of them or none."""
     from scm_world.backends.renderer import render, write_png
     from scm_world.scene.camera import OVERVIEW
@@ -93,7 +93,7 @@ def _data(request: Any) -> Any:
     return request
 
 
-def report(terminal: Console, outcome: Outcome, folder: Path, *, show_all: bool) -> None:
+def report(terminal: Console, outcome: Outcome, folder: Location, *, show_all: bool) -> None:
     """Print the audit, what moved, and where the files are."""
     _print_audit(terminal, outcome)
     _print_rows(terminal, outcome, show_all=show_all)

@@ -16,6 +16,7 @@ from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import RESULTS, check_writable, console, show, staged, table, written
 from scm_world.cli.tasks import build, suffix
 from scm_world.errors import UnknownOption
+from scm_world.output.locations import Location
 from scm_world.queries import (
     Difference,
     Effect,
@@ -96,7 +97,7 @@ def ask_effect(
     nature: Sequence[str],
     n: int,
     paired: bool,
-    out: Path | None,
+    out: Location | None,
 ) -> int:
     """Estimate an effect, print it, write it; return the exit code."""
     folder = out or where.folder("effect")
@@ -156,7 +157,7 @@ def shown_episodes() -> Iterator[Callable[[int, int], None]]:
 
 
 def ask_counterfactual(
-    where: Circumstances, assignments: Sequence[str], *, at: int, out: Path | None
+    where: Circumstances, assignments: Sequence[str], *, at: int, out: Location | None
 ) -> int:
     """Let an episode happen and happen otherwise, print and write both; return the exit code."""
     folder = out or where.folder("counterfactual")

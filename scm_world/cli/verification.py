@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 from rich.text import Text
@@ -14,6 +13,7 @@ from scm_world.cli.console import RESULTS, check_writable, console, staged, tabl
 from scm_world.cli.discovery import INTERRUPTED, shown_progress
 from scm_world.cli.tasks import build, suffix
 from scm_world.discovery.coverage import draw_verification
+from scm_world.output.locations import Location
 from scm_world.queries.agreement import Agreement
 from scm_world.queries.verification import Row, Verification
 from scm_world.queries.verify import LEAST, verify, verify_engines
@@ -65,7 +65,7 @@ class Options:
         return "both" if self.both else self.backend
 
 
-def run(options: Options, *, out: Path | None) -> int:
+def run(options: Options, *, out: Location | None) -> int:
     """Verify, print, write; return the exit code."""
     about = f"{options.where}-seed{options.seed}{suffix(options.arguments)}"
     folder = out or RESULTS / f"verify-{options.task}-{about}"
@@ -162,7 +162,7 @@ def _style(good: bool) -> str:
     return "green" if good else "bold red"
 
 
-def _write(terminal: Console, found: Found, folder: Path) -> None:
+def _write(terminal: Console, found: Found, folder: Location) -> None:
     with staged(folder) as draft:
         (draft / "report.json").write_text(found.to_json())
         draw_verification(found, draft / "verify.png")

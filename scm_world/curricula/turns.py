@@ -78,6 +78,10 @@ class Turn:
         self._initial = {name: world[name] for name in self._moved if name in world.model}
         return self._act(env, 0)
 
+    def may_act(self, step: int) -> bool:
+        """Tell whether anything may be due after so many control steps of the episode."""
+        return self._waits and self.curriculum.may_act(step)
+
     def step(self, env: Doable) -> bool:
         """Do what is due after a control step; tell whether that was anything.
 

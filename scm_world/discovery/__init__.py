@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from scm_world.discovery import learners
-    from scm_world.discovery.data import Dataset, Design, collect
+    from scm_world.discovery.data import Dataset, Design, Levels, collect, sweep
     from scm_world.discovery.exam.study import Study, examine
     from scm_world.discovery.exam.subjects import TaskView, subject
     from scm_world.discovery.learners import Found, Learner, learn, register
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scm_world.discovery.scores import Score, score
 
 _HOMES = {
-    **dict.fromkeys(("Dataset", "Design", "collect"), "data"),
+    **dict.fromkeys(("Dataset", "Design", "Levels", "collect", "sweep"), "data"),
     "DiscoveryReport": "report",
     **dict.fromkeys(("Found", "Learner", "learn", "register"), "learners"),
     **dict.fromkeys(("Score", "score"), "scores"),
@@ -37,6 +37,7 @@ __all__ = [
     "DiscoveryReport",
     "Found",
     "Learner",
+    "Levels",
     "Score",
     "Study",
     "TaskView",
@@ -49,6 +50,7 @@ __all__ = [
     "register",
     "score",
     "subject",
+    "sweep",
 ]
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, final
 
 from scm_world.errors import UnreadableFile
-from scm_world.output.durable import write_durably
+from scm_world.output.durable import made, removed, write_durably
+from scm_world.output.locations import Location, located
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.paired import Paired
 
@@ -25,8 +25,8 @@ class Checkpoint:
         terms: Everything that decides the result; what is there has to be of the same.
     """
 
-    def __init__(self, path: Path, terms: Mapping[str, Any]) -> None:
-        self._path = path
+    def __init__(self, path: Location | str, terms: Mapping[str, Any]) -> None:
+        self._path = located(path)
         self._terms = json.loads(json.dumps(terms))
 
     def read(self, paired: Paired) -> int:
@@ -35,8 +35,6 @@ class Checkpoint:
         Raises:
             UnreadableFile: It is damaged, or of another discovery.
         """
-        if not self._path.exists():
-            return 0
         try:
             data = json.loads(self._path.read_text(encoding="utf-8"))
             if data["format"] != FORMAT:
@@ -53,6 +51,8 @@ class Checkpoint:
             )
             paired.remember(effects, data["memory"])
             return int(data["done"])
+        except FileNotFoundError:
+            return 0
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UnreadableFile(str(self._path), str(error), ADVICE) from None
 
@@ -69,9 +69,9 @@ class Checkpoint:
             "refused": effects.refused,
             "memory": paired.memory(),
         }
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        made(self._path.parent)
         write_durably(self._path, json.dumps(data).encode())
 
     def end(self) -> None:
         """Remove the file: there is a result now."""
-        self._path.unlink(missing_ok=True)
+        removed(self._path)

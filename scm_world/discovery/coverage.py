@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scm_world.output.canvas import FAINT, INK, blank, save
+from scm_world.output.locations import Location
 from scm_world.queries.agreement import FACTORS, Agreement
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.verification import Verification, arrow
@@ -21,7 +21,7 @@ GOOD, BAD = "#4c9a6a", "#d62728"
 LISTED = 26  # lines of names that fit
 
 
-def draw_verification(found: Verification | Agreement, path: Path | str) -> None:
+def draw_verification(found: Verification | Agreement, path: Location | str) -> None:
     """Draw how soon edges were seen, what is wrong, and the signs on two engines.
 
     Args:

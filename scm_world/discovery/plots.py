@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import networkx as nx
@@ -15,6 +14,7 @@ from scm_world.discovery.names import Families
 from scm_world.discovery.report import DiscoveryReport
 from scm_world.graph import SCM
 from scm_world.output.canvas import FAINT, HEIGHT, INK, WIDTH, blank, save
+from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import EdgeKey
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _entities_together(families: Families, edges: Iterable[EdgeKey]) -> list[str
     return [name for e in sorted(groups, key=lambda e: (mean[e], e)) for name in groups[e]]
 
 
-def draw_graphs(report: DiscoveryReport, path: Path | str) -> None:
+def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
     """Draw the declared and the found graph side by side, as matrices.
 
     A column is a cause, a row an effect. A dot is an edge within the instant, a triangle one
@@ -248,7 +248,7 @@ def _legend(figure: Figure) -> None:
 # --- a declared model ---------------------------------------------------------------------------
 
 
-def draw_model(model: SCM, path: Path | str, *, title: str = "") -> None:
+def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
     """Draw a model as a layered graph, causes left of effects.
 
     Variables that differ in numbers only and have the same edges are one node. Where several

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, final
 
 from scm_world.discovery.scores import Score
 from scm_world.output.durable import write_whole
+from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import EdgeKey
 
 FORMAT = "scm_world/discovery/1"
@@ -90,7 +90,7 @@ class DiscoveryReport:
             "versions": self.versions,
         }
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Location | str) -> None:
         """Write the report as JSON, whole or not at all.
 
         Raises:

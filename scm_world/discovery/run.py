@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 from scm_world.discovery.checkpoints import Checkpoint
@@ -11,6 +10,7 @@ from scm_world.discovery.design import bounds
 from scm_world.discovery.report import DiscoveryReport
 from scm_world.discovery.scores import score
 from scm_world.graph import SCM
+from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.models import paired_effects
 from scm_world.queries.experiments.paired import Paired
@@ -27,7 +27,7 @@ def discover(
     probes: int = 32,
     seed: int = 0,
     progress: Progress | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: Location | str | None = None,
     **options: Any,
 ) -> DiscoveryReport:
     """Recover a causal graph by paired single-target interventions, and score it.
@@ -80,7 +80,7 @@ def discover(
 
 
 def _experiments(
-    world: World, probes: int, seed: int, progress: Progress | None, path: Path | None
+    world: World, probes: int, seed: int, progress: Progress | None, path: Location | str | None
 ) -> tuple[Effects, int]:
     paired = Paired(world, seed)
     saved = None if path is None else Checkpoint(path, _terms(world, seed))

@@ -6,10 +6,12 @@ from collections.abc import Iterable, Mapping
 from typing import final
 
 import numpy as np
+from numba import njit
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Value
 from scm_world.entities.base import Entity, State
 from scm_world.entities.blocks import color
+from scm_world.geometry.scalars import scalar
 from scm_world.scene import ControllerSpec, ParameterKey, trifinger
 from scm_world.scene.kinematics import forward_kernel
 from scm_world.variables import Action, Box, Exogenous, Measured, Variable
@@ -66,11 +68,21 @@ CONTROLLER = (
 ACTUATOR_NOISE = "actuator_noise"
 
 
-def tips(joint_positions: Floats, robot_height: Floats) -> Floats:
+@njit(cache=True)
+def tips_into(joint_positions: Floats, robot_height: Value, out: Floats) -> None:
+    """Write the three fingertips, shape (9,) [m]."""
+    forward_kernel(joint_positions, scalar(robot_height), out)
+
+
+@njit(cache=True)
+def tips(joint_positions: Floats, robot_height: Value) -> Floats:
     """Compute the three fingertips from the joints, shape (9,) [m]."""
     found = np.empty(9)
-    forward_kernel(joint_positions, float(robot_height), found)
+    tips_into(joint_positions, robot_height, found)
     return found
+
+
+tips.into = tips_into  # a loop that keeps the array calls this instead
 
 
 @final

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import final
 
+from numba import njit
+
 from scm_world._types import Value
 from scm_world.entities.base import Entity
 from scm_world.entities.blocks import color
+from scm_world.geometry.scalars import scalar
 from scm_world.scene import PRESETS, ParameterKey
 from scm_world.variables import Box, Categories, Exogenous, Function, Measured, Parent, Variable
 from scm_world.variables import catalogue as numbers
@@ -111,9 +114,10 @@ class Stage(Entity):
         }
 
 
-def remaining(control_index: Value, *, steps: float, seconds_per_step: float) -> float:
+@njit(cache=True)
+def remaining(control_index: Value, steps: float, seconds_per_step: float) -> float:
     """Compute the time left [s], never below zero."""
-    return max(steps - float(control_index), 0.0) * seconds_per_step
+    return max(steps - scalar(control_index), 0.0) * seconds_per_step
 
 
 @final

@@ -15,13 +15,14 @@ from scm_world.backends import Backend
 from scm_world.env.copies import Copied
 from scm_world.env.delta import MODES, PREFIX, Delta
 from scm_world.env.given import doubles, made_task, names_of
-from scm_world.env.goals import GoalReward, Goals, reader, reward_scale
+from scm_world.env.goals import GoalReward, Goals, reward_scale
 from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
 from scm_world.env.start import asked, begin, beginning_structure
 from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, UnknownOption
+from scm_world.geometry.direct import direct
 from scm_world.scene.camera import OVERVIEW, Camera
 from scm_world.scene.kinematics import scaled_clip_kernel
 from scm_world.tasks import Task
@@ -169,7 +170,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._limit = self.world.max_episode_length + extra
         self._scale = reward_scale(self.world)
         self._terms = tuple(self.world.task.weights)
-        self._read_terms = reader(self._terms)
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
         self._observers: WeakKeyDictionary[Declaration, tuple[Observer, Goals, tuple[str, ...]]]
@@ -207,6 +207,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             self._middle, self._half = np.zeros(9), np.ones(9)
         bounds = (-np.ones(9), np.ones(9)) if normalize else (low, high)
         self._delta = self.relative() if relative else None
+        self._given = np.empty(9)
+        self._range = (self._middle, self._half, low, high)
+        self._scale_and_clip = direct(scaled_clip_kernel, self._given, *self._range, self._given)
         self.action_space = self._delta.space() if self._delta else box(*bounds)
 
     def relative(self) -> Delta:
@@ -305,9 +308,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             raise ActionError(f"an action has shape (9,), got {given.shape}", action)
         if self._delta is not None:
             given = self._delta.absolute(np.array(given, dtype=np.float64))
+        self._given[...] = given  # every 32-bit number is a 64-bit one
         command = np.empty(9)
-        low, high = self.world.declaration.action_bounds
-        if not scaled_clip_kernel(given, self._middle, self._half, low, high, command):
+        if not self._scale_and_clip(self._given, *self._range, command):
             raise ActionError(f"an action is nine finite numbers, got {action!r}", action)
         return command
 
@@ -350,7 +353,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             "fractional_success": float(now["fractional_success"]),
             "achieved_goal": achieved,
             "desired_goal": desired,
-            "reward_terms": dict(zip(self._terms, map(float, self._read_terms(now)), strict=True)),
+            "reward_terms": {name: float(now[name]) for name in self._terms},
         }
         contacts, state = self._rich
         if contacts:

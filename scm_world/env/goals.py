@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from operator import itemgetter
 from typing import Any, final
 
 import gymnasium
@@ -11,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scm_world._types import Floats, Values
-from scm_world.geometry.gather import gather_into, places
+from scm_world.geometry.direct import direct
+from scm_world.geometry.gather import gather_copied, places
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.world import World
@@ -43,17 +43,19 @@ class Goals:
 
     def __init__(self, declaration: Declaration) -> None:
         sides = declaration.task.goal_names()
-        self._sides = [Collected(declaration, names) for names in sides]
         self.names = (*sides[0], *sides[1])
+        self._both = Collected(declaration, self.names)
+        self._middle = Collected(declaration, sides[0]).size
+        sizes = (self._middle, self._both.size - self._middle)
         self.spaces: dict[str, gymnasium.Space[Any]] = {
-            name: gymnasium.spaces.Box(-BOUND, BOUND, (side.size,), np.float64)
-            for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
+            name: gymnasium.spaces.Box(-BOUND, BOUND, (size,), np.float64)
+            for name, size in zip(("achieved_goal", "desired_goal"), sizes, strict=True)
         }
 
     def read(self, world: World, now: Values) -> tuple[Floats, Floats]:
         """Give what is achieved and what is desired."""
-        achieved, desired = self._sides
-        return achieved.read(world, now), desired.read(world, now)
+        both, middle = self._both.read(world, now), self._middle
+        return both[:middle], both[middle:]
 
     def observe(self, world: World, now: Values) -> dict[str, Floats]:
         """Give both vectors, by name."""
@@ -76,29 +78,28 @@ class Collected:
     def __init__(self, declaration: Declaration, names: tuple[str, ...]) -> None:
         sizes = [int(np.prod(declaration.model.declared(name).shape)) for name in names]
         ends = np.cumsum(sizes).tolist()
-        where = {n: slice(e - s, e) for n, e, s in zip(names, ends, sizes, strict=True)}
+        where = [(n, slice(e - s, e)) for n, e, s in zip(names, ends, sizes, strict=True)]
         self.size = ends[-1] if ends else 0
         still, states = frozenset(declaration.static_names), declaration.slices
-        self._still = [(n, place) for n, place in where.items() if n in still]
-        self._targets = places(place for n, place in where.items() if n in states)
-        self._sources = places(states[n] for n in where if n in states)
-        rest = [n for n in where if n not in states and n not in still]
-        self._computed = [(n, where[n]) for n in rest]
+        self._still = [(n, place) for n, place in where if n in still]
+        self._computed = [(n, at) for n, at in where if n not in states and n not in still]
         self._numbers = np.empty(self.size)
+        sources = places(states[n] for n, _ in where if n in states)
+        self._moving = (sources, places(at for n, at in where if n in states), self._numbers)
+        self._copy = direct(gather_copied, np.empty(0), *self._moving, self._numbers)
         self._version = -1
 
     def read(self, world: World, now: Values) -> Floats:
         """Copy the present numbers, shape (n,)."""
-        numbers = self._numbers
         if self._version != world.version:
             self._version = world.version
             for name, place in self._still:
-                numbers[place] = np.ravel(now[name])
+                self._numbers[place] = np.ravel(now[name])
         for name, place in self._computed:
-            numbers[place] = np.ravel(now[name])
-        if self._sources.size:
-            gather_into(world.current()[1].vector, self._sources, self._targets, numbers)
-        return numbers.copy()
+            self._numbers[place] = np.ravel(now[name])
+        found = np.empty(self.size)
+        self._copy(world.current()[1].vector, *self._moving, found)
+        return found
 
 
 @final
@@ -146,13 +147,6 @@ class GoalReward:
                 f"compute_reward leaves out {term!r} and every other dense term, which the rewards "
                 "of steps contain; make the environment with task_options={'weights': 'sparse'}"
             )
-
-
-def reader(names: tuple[str, ...]) -> Callable[[Values], tuple[Any, ...]]:
-    """Give what picks some values out of all of them, as a tuple."""
-    if len(names) == 1:
-        return lambda now: (now[names[0]],)
-    return itemgetter(*names) if names else lambda now: ()
 
 
 def reward_scale(world: World) -> float:

@@ -14,6 +14,7 @@ from scm_world._types import Floats, Value
 from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.env.bounds import WIDE
 from scm_world.env.keypoints import KEYPOINTS, Keypoints
+from scm_world.geometry.direct import direct
 from scm_world.geometry.gather import gather_scaled, places
 from scm_world.tasks import TIME
 from scm_world.variables import Normal
@@ -95,15 +96,16 @@ class Vector:
         still, states = set(declaration.static_names), declaration.slices
         fields = [(n, where) for n, where in self._slices.items() if n != KEYPOINTS]
         read = [(where, states[n]) for n, where in fields if n in states]
-        self._targets = places(where for where, _ in read)
-        self._sources = places(source for _, source in read)
+        self._read = (places(at for _, at in read), places(where for where, _ in read))
         views = [
             (n, self._raw[where].reshape(declaration.model.declared(n).shape))
             for n, where in fields
             if n not in states
         ]
         self._still = [view for view in views if view[0] in still]
-        self._computed = [view for view in views if view[0] not in still]
+        computed = [view for view in views if view[0] not in still]
+        self._computed = [view for view in computed if view[1].ndim]
+        self._single = [(n, self._slices[n].start) for n, view in computed if not view.ndim]
 
     def _scale(self, low: Floats, high: Floats, scaled: NDArray[np.bool_]) -> None:
         width = np.where(scaled, high - low, 2.0)
@@ -112,6 +114,9 @@ class Vector:
         everything = np.full(low.size, np.inf)
         limits = (-everything, everything) if self._published else (low, high)
         self._scales = np.stack([*limits, gain, offset])
+        single = np.empty(0, dtype=np.float32)
+        like = (self._raw, *self._read, self._raw, self._scales, single)
+        self._write = direct(gather_scaled, *like)
         inside = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         self.space = box(*(limits if self._published else inside))
         world = self._world
@@ -130,15 +135,17 @@ class Vector:
                 place[...] = now[name]
         for name, place in self._computed:
             place[...] = now[name]
+        for name, index in self._single:
+            raw[index] = now[name]
         if self._keypoints is not None:
             raw[self._slices[KEYPOINTS]] = self._keypoints.observe(now)
         if self._shift:
             raw[self._slices[TIME]] += self._shift
         vector = self._world.current()[1].vector
         observation = np.empty(raw.size, dtype=np.float32)
-        gather_scaled(vector, self._sources, self._targets, raw, self._scales, observation)
+        self._write(vector, *self._read, raw, self._scales, observation)
         if self._noise:
-            gather_scaled(vector, NOTHING, NOTHING, self._sensed(raw), self._scales, observation)
+            self._write(vector, NOTHING, NOTHING, self._sensed(raw), self._scales, observation)
         return observation
 
     def _sensed(self, raw: Floats) -> Floats:

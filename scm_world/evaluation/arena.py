@@ -10,11 +10,13 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._types import Floats
 from scm_world.curricula import Memory, Turn
 from scm_world.curricula.choices import Stages
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
 from scm_world.evaluation.policies import Player
+from scm_world.evaluation.policies.players import Actions
 from scm_world.evaluation.protocols import Protocol
 from scm_world.variables import Null, Subset
 
@@ -78,16 +80,21 @@ class Fingerprint:
         self._version = -1
         self.look()
 
-    def look(self) -> None:
-        """Take in the state, and the parameters if somebody has intervened."""
+    def look(self, state: Floats | None = None) -> None:
+        """Take in the state, and the parameters if somebody has intervened.
+
+        Args:
+            state: Where everything is, in the form of ``PhysicalState.vector``; what the world
+                says if None.
+        """
         world = self._world
-        now, state = world.current()
+        now, present = world.current()
         if world.version != self._version:
             self._version = world.version
             for name in world.static_names:
                 self._sum.update(name.encode())
                 self._sum.update(np.asarray(now[name]).tobytes())
-        self._sum.update(state.vector.tobytes())
+        self._sum.update((present.vector if state is None else state).tobytes())
 
     def act(self, action: Any) -> None:
         """Take in an action."""
@@ -95,6 +102,61 @@ class Fingerprint:
 
     def __str__(self) -> str:
         return self._sum.hexdigest()
+
+
+@final
+class Game:
+    """An episode under way, and what is kept of it.
+
+    Args:
+        env: At the beginning of the episode, with what the protocol does at its reset.
+        player: Who acts.
+        turn: What acts within the episode.
+
+    Attributes:
+        mark: Sums it up; whoever plays lets it look at the beginning of every instant.
+    """
+
+    def __init__(self, env: ScmWorldEnv, player: Player, turn: Turn) -> None:
+        self._drawn = _drawn(env, 0)
+        player.begin(env)
+        self.mark = Fingerprint(env)
+        self._player, self._turn = player, turn
+        self._fractions: list[float] = []
+        self._total = 0.0
+
+    def act(self, observation: Any) -> Actions:
+        """Let the player choose an action, shape (9,)."""
+        action = self._player.act(observation)
+        self.mark.act(action)
+        return action
+
+    def stepped(self, reward: float, fraction: float) -> None:
+        """Note what a control step gave: the reward, and the fractional success."""
+        self._total += reward
+        self._fractions.append(fraction)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the protocol may act now."""
+        return self._turn.may_act(len(self._fractions))
+
+    def intervene(self, env: ScmWorldEnv) -> bool:
+        """Let the protocol act, if anything is due; tell whether it did."""
+        if not self._turn.step(env):
+            return False
+        self._drawn |= _drawn(env, env.world.index)
+        return True
+
+    def row(self, place: tuple[str, int, str, str, int, int], *, success: bool) -> Row:
+        """Give what is kept.
+
+        Args:
+            place: Agent, run, engine, protocol, seed and episode.
+            success: Whether it succeeded in the end.
+        """
+        scores = scored(self._fractions, success=success, total=float(self._total))
+        return Row(*place, len(self._fractions), scores, self._drawn, str(self.mark))
 
 
 def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
@@ -163,35 +225,24 @@ class Arena:
         place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
         with _placed(place, self.env):
             turn, observation = self.begin(protocol, seed=seed, episode=episode)
-            steps, scores, drawn, mark = self._played(player, turn, observation, watch)
-        return Row(*who, engine, protocol.name, seed, episode, steps, scores, drawn, mark)
+            game = Game(self.env, player, turn)
+            success = self._finish(game, observation, watch)
+        return game.row((*who, engine, protocol.name, seed, episode), success=success)
 
-    def _played(
-        self, player: Player, turn: Turn, observation: Any, watch: Watch | None
-    ) -> tuple[int, dict[str, float], dict[str, list[float]], str]:
-        """Play an episode that has begun; the last four fields of its row."""
-        env, info = self.env, {"is_success": False}
-        drawn = _drawn(env, 0)
-        player.begin(env)
-        mark = Fingerprint(env)
-        fractions: list[float] = []
-        total, truncated = 0.0, False
+    def _finish(self, game: Game, observation: Any, watch: Watch | None) -> bool:
+        """Play an episode that has begun; tell whether it succeeded in the end."""
+        env, truncated = self.env, False
         while not truncated:
             if watch is not None:
                 watch(env)
-            action = player.act(observation)
-            mark.act(action)
-            observation, reward, _, truncated, info = env.step(action)
-            fractions.append(info["fractional_success"])
-            total += reward
-            if not truncated and turn.step(env):
-                observation, info = env.present()
-                drawn |= _drawn(env, env.world.index)
-            mark.look()
+            observation, reward, _, truncated, info = env.step(game.act(observation))
+            game.stepped(reward, info["fractional_success"])
+            if not truncated and game.intervene(env):
+                observation = env.observe()
+            game.mark.look()
         if watch is not None:
             watch(env)
-        scores = scored(fractions, success=bool(info["is_success"]), total=float(total))
-        return len(fractions), scores, drawn, str(mark)
+        return bool(info["is_success"])
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
         """See whether a protocol fits: begin the first episode with it.

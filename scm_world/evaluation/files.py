@@ -6,19 +6,19 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.arena import METRICS
-from scm_world.evaluation.parts import made
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import what_it_is
 from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
 from scm_world.graph.exchange.libraries import load as load_library
-from scm_world.output.durable import write_durably, write_whole
+from scm_world.output.durable import made, removed, write_durably, write_whole
+from scm_world.output.locations import Location
 
 FORMAT = "scm_world/evaluation/1"
 RESULTS = "results.json"
@@ -27,16 +27,16 @@ ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", 
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
 
 
-def save(evaluation: Evaluation, folder: Path, form: str) -> tuple[Path, Path]:
+def save(evaluation: Evaluation, folder: Location, form: str) -> tuple[Location, Location]:
     """Write the table, then the summary that names it; see ``Evaluation.save``."""
     if form not in CODECS:
         raise UnknownOption("format", form, CODECS)
     made(folder)
     table, summary = folder / f"{TABLE}.{form}", folder / RESULTS
     content = CODECS[form][0](evaluation.columns)
-    summary.unlink(missing_ok=True)  # it is of the table that goes
+    removed(summary)  # it is of the table that goes
     for other in CODECS:
-        (folder / f"{TABLE}.{other}").unlink(missing_ok=True)
+        removed(folder / f"{TABLE}.{other}")
     write_durably(table, content)
     data = {
         "format": FORMAT,
@@ -67,7 +67,7 @@ def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
     ]
 
 
-def false_scores(path: Path, evaluation: Evaluation) -> list[str]:
+def false_scores(path: Location, evaluation: Evaluation) -> list[str]:
     """Compute the scores of a file again from its table; say which of them are others.
 
     Args:
@@ -88,7 +88,7 @@ def false_scores(path: Path, evaluation: Evaluation) -> list[str]:
     ]
 
 
-def load(path: Path) -> Evaluation:
+def load(path: Location) -> Evaluation:
     """Read an evaluation; see ``Evaluation.load``."""
     file = path / RESULTS if path.is_dir() else path
     try:
@@ -97,7 +97,7 @@ def load(path: Path) -> Evaluation:
             raise ValueError("it is no evaluation")
         for name in ABOUT:
             data["about"][name]
-        table = file.parent / Path(data["table"]["file"]).name
+        table = file.parent / PurePosixPath(data["table"]["file"]).name
         decode = CODECS[table.suffix.removeprefix(".")][1]
         found = Evaluation(data["about"], decode(table.read_bytes()))
         if found.digest != data["table"]["digest"]:

@@ -6,31 +6,18 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from hashlib import blake2b
-from pathlib import Path
 from typing import Any
 
-from scm_world.errors import UnreadableFile, UnwritableFolder
+from scm_world.errors import UnreadableFile
 from scm_world.evaluation.arena import Row
-from scm_world.output.durable import write_whole
+from scm_world.output.durable import made, write_whole
+from scm_world.output.locations import Location
 
 FORMAT = "scm_world/evaluation-part/1"
 FOLDER = "parts"
 
 
-def made(folder: Path) -> Path:
-    """Make a folder, if there is none.
-
-    Raises:
-        UnwritableFolder: There is no permission, or a file in its place.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnwritableFolder(str(folder), error.strerror or str(error)) from None
-    return folder
-
-
-def part_path(folder: Path, key: str) -> Path:
+def part_path(folder: Location, key: str) -> Location:
     """Name the file of a shard.
 
     Args:
@@ -40,7 +27,7 @@ def part_path(folder: Path, key: str) -> Path:
     return folder / FOLDER / f"{key}.json"
 
 
-def write_part(folder: Path, key: str, rows: Sequence[Row]) -> None:
+def write_part(folder: Location, key: str, rows: Sequence[Row]) -> None:
     """Write the episodes of a shard.
 
     Raises:
@@ -53,7 +40,7 @@ def write_part(folder: Path, key: str, rows: Sequence[Row]) -> None:
     write_whole(text + "\n", path)
 
 
-def read_part(folder: Path, key: str, count: int) -> list[Row] | None:
+def read_part(folder: Location, key: str, count: int) -> list[Row] | None:
     """Read the episodes of a shard; None if it has not been played.
 
     Args:
@@ -65,8 +52,6 @@ def read_part(folder: Path, key: str, count: int) -> list[Row] | None:
         UnreadableFile: The file is damaged, or not of this shard.
     """
     path = part_path(folder, key)
-    if not path.exists():
-        return None
     advice = "delete this file; its episodes are then played again"
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -74,6 +59,8 @@ def read_part(folder: Path, key: str, count: int) -> list[Row] | None:
         if found != (FORMAT, key, _sum(data["rows"]), count):
             raise ValueError("its content is not what was written")
         return [Row(**row) for row in data["rows"]]
+    except FileNotFoundError:
+        return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
 

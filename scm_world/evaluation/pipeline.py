@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, final
 
 from scm_world.evaluation.arena import Arena, Row
+from scm_world.evaluation.lockstep import Episodes, Lockstep
 from scm_world.evaluation.parts import read_part, write_part
 from scm_world.evaluation.policies import Player, as_player
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.setups import Setup, Shard, prepare
+from scm_world.evaluation.setups import SHARD, Setup, Shard, prepare
 from scm_world.evaluation.tables import columns_of
 from scm_world.output.durable import locked
+from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
-from scm_world.work.pool import Pool
-from scm_world.work.processes import pickled
+from scm_world.work.executors import Executor, Serial, opened
 
 
 @final
@@ -30,16 +30,24 @@ class Bench:
     Attributes:
         setup: Of the evaluation.
         trusted: Packages whose functions may be policies.
+        threads: Of an engine that steps many worlds in one call; as many as there are cores if
+            None. Results do not depend on it.
     """
 
     setup: Setup
     trusted: Sequence[str] | None = None
+    threads: int | None = 1
     arenas: dict[str, Arena] = field(default_factory=dict)
+    locksteps: dict[str, Lockstep] = field(default_factory=dict)
     players: dict[int, Player] = field(default_factory=dict)
 
     def __call__(self, shard: Shard) -> list[Row]:
-        """Play all episodes of a shard."""
-        return [self.play(shard, episode) for episode in range(shard.first, shard.stop)]
+        """Play all episodes of a shard, side by side where that is faster."""
+        seat, numbers = self.setup.seats[shard.seat], range(shard.first, shard.stop)
+        protocol = self.setup.protocols[shard.protocol]
+        episodes = Episodes((seat.agent, seat.run), protocol, shard.seed, numbers)
+        rows = self.lockstep(shard.engine).play(self.player(shard.seat), episodes)
+        return rows or [self.play(shard, episode) for episode in numbers]
 
     def play(self, shard: Shard, episode: int, watch: Any = None) -> Row:
         """Play one episode of it."""
@@ -59,6 +67,13 @@ class Bench:
             self.arenas[engine] = Arena(self.setup.place.env(engine))
         return self.arenas[engine]
 
+    def lockstep(self, engine: str) -> Lockstep:
+        """Give where episodes of an engine happen side by side."""
+        if engine not in self.locksteps:
+            env, most = self.arena(engine).env, min(SHARD, self.setup.n)
+            self.locksteps[engine] = Lockstep(env, most, self.threads)
+        return self.locksteps[engine]
+
     def player(self, seat: int) -> Player:
         """Give who acts."""
         if seat not in self.players:
@@ -67,8 +82,9 @@ class Bench:
 
     def close(self) -> None:
         """Free the engines."""
-        for arena in self.arenas.values():
-            arena.close()
+        for place in (*self.locksteps.values(), *self.arenas.values()):
+            place.close()
+        self.locksteps.clear()
         self.arenas.clear()
 
 
@@ -81,8 +97,10 @@ def evaluate(
     seeds: Any = 0,
     backend: Any = "mujoco",
     env: Mapping[str, Any] | None = None,
-    workers: int = 1,
-    out: Path | str | None = None,
+    workers: int | None = None,
+    engine: Executor | str | None = None,
+    address: str | None = None,
+    out: Location | str | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
@@ -101,9 +119,14 @@ def evaluate(
         seeds: Of the noise, one or several.
         backend: ``"mujoco"``, ``"bullet"``, or both.
         env: Options of the environment, such as ``{"frame_skip": 3}``.
-        workers: Processes; with more than one, policies have to be picklable or named by a text.
-        out: Folder for what is finished; the same call goes on there after an interruption, and
-            adds policies, protocols, engines or episodes to it.
+        workers: How many shards of 25 episodes are played at the same time. None is one, in this
+            process; with an engine it is as many as there are cores. Other processes play
+            policies that can be pickled or are named by a text.
+        engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
+            ``engine_of``.
+        address: Of a Ray cluster.
+        out: Folder, or a URL, for what is finished; the same call goes on there after an
+            interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
         progress: Told how many episodes are done, and how many there are.
 
@@ -112,7 +135,9 @@ def evaluate(
 
     Raises:
         UnknownOption: Something is asked for that does not exist.
-        EvaluationError: A policy gave no action, or an intervention was refused, with the place.
+        EvaluationError: A policy gave no action, or an intervention was refused, with the place;
+            all other shards are played and safe by then.
+        EngineFailure: Three workers ended over one shard, or there is no cluster at the address.
         UnreadableFile: Somebody else is writing to the folder, or a file in it is damaged.
 
     Example:
@@ -130,22 +155,33 @@ def evaluate(
         env=env,
         trusted=trusted,
     )
-    folder = None if out is None else Path(out)
-    with locked(folder) if folder is not None else nullcontext():
-        rows = played(setup, workers=workers, folder=folder, trusted=trusted, progress=progress)
+    folder = None if out is None else located(out)
+    with (
+        opened(engine, workers, address) as executor,
+        locked(folder) if folder is not None else nullcontext(),
+    ):
+        rows = played(setup, executor, folder=folder, trusted=trusted, progress=progress)
     policies = {(seat.agent, seat.run): seat.policy for seat in setup.seats}
     return Evaluation(setup.about(), columns_of(rows), policies)
 
 
 def played(
     setup: Setup,
+    executor: Executor | None = None,
     *,
-    workers: int = 1,
-    folder: Path | None = None,
+    folder: Location | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> list[Row]:
-    """Play what has not been played, and give all rows in their order."""
+    """Play what has not been played, and give all rows in their order.
+
+    Args:
+        setup: Of the evaluation.
+        executor: Plays the shards; this process if None.
+        folder: For what is finished.
+        trusted: Packages whose functions may be policies.
+        progress: Told how many episodes are done, and how many there are.
+    """
     shards = setup.shards()
     keys = [setup.key(shard) if folder is not None else "" for shard in shards]
     found: dict[int, list[Row]] = {}
@@ -158,8 +194,12 @@ def played(
     missing = [place for place in range(len(shards)) if place not in found]
     tell = _teller(progress, sum(shard.stop - shard.first for shard in shards))
     tell(found)
-    with _bench(setup, workers, trusted) as pool:
-        for index, rows in pool.run([shards[place] for place in missing]):
+    with opened(executor) as player:
+        for seat in setup.seats:
+            player.check(f"policy {seat.agent!r} with several workers", seat.policy)
+        threads = None if isinstance(player, Serial) else 1  # else workers share the cores
+        make = partial(Bench, setup, trusted, threads)
+        for index, rows in player.run(make, [shards[place] for place in missing]):
             place = missing[index]
             found[place] = rows
             if folder is not None:
@@ -174,21 +214,3 @@ def _teller(progress: Progress | None, total: int) -> Any:
             progress(sum(map(len, found.values())), total)
 
     return tell
-
-
-@contextmanager
-def _bench(
-    setup: Setup, workers: int, trusted: Sequence[str] | None
-) -> Iterator[Pool[Shard, list[Row]]]:
-    """Open a pool of processes, or work in this one."""
-    inline = workers == 1
-    if not inline:
-        for seat in setup.seats:
-            pickled(f"policy {seat.agent!r} with several workers", seat.policy)
-    bench = Bench(setup, trusted)
-    make = (lambda: bench) if inline else partial(Bench, setup, trusted)
-    try:
-        with Pool(make, workers, inline=inline) as pool:
-            yield pool
-    finally:
-        bench.close()

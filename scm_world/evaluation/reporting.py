@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from scm_world.evaluation.again import bench_of
@@ -18,6 +17,8 @@ from scm_world.evaluation.outputs import (
     write_report,
 )
 from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.output.durable import removed
+from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
 
 STALE = ("bars.png", "radar.png", "profile.png", "gap.png", "causes*.png", "report.html")
@@ -29,19 +30,19 @@ CORNERS = 3
 
 def write_outputs(
     evaluation: Evaluation,
-    folder: Path | str,
+    folder: Location | str,
     *,
     metric: str = SCORE,
     videos: bool = False,
     policy: Any = None,
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
-) -> tuple[Path, ...]:
+) -> tuple[Location, ...]:
     """Write plots, the report, and videos if they are wanted.
 
     Args:
         evaluation: What is shown.
-        folder: Where to; it is there.
+        folder: Where to; it is there. It may be a URL.
         metric: Score that is drawn.
         videos: Whether the best, the median and the worst episode of each agent are filmed.
         policy: Who acted, for videos of policies that are no files and have no names.
@@ -56,11 +57,11 @@ def write_outputs(
         UnwritableFolder: There is no room, or no permission.
         MissingExtra: Videos are wanted, and moviepy is not installed.
     """
-    place = Path(folder)
+    place = located(folder)
     for name in STALE:
         for old in place.glob(name):
-            old.unlink()
-    films: list[Path] = []
+            removed(old)
+    films: list[Location] = []
     if videos:
         films = _films(evaluation, place, metric, policy, trusted, progress)
     files = []
@@ -100,12 +101,12 @@ def _comparable(evaluation: Evaluation) -> bool:
 
 def _films(
     evaluation: Evaluation,
-    folder: Path,
+    folder: Location,
     metric: str,
     policy: Any,
     trusted: Sequence[str],
     progress: Progress | None,
-) -> list[Path]:
+) -> list[Location]:
     bench = bench_of(evaluation, policy=policy, trusted=trusted)
     try:
         return [

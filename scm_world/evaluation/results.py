@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -32,6 +31,7 @@ from scm_world.evaluation.tables import (
     means,
     paired,
 )
+from scm_world.output.locations import Location, located
 
 SCORE = "last_fractional_success"
 """The metric of the published figures."""
@@ -286,7 +286,7 @@ class Evaluation:
 
     # --- files --------------------------------------------------------------------------------
 
-    def save(self, folder: Path | str, *, kind: str = "parquet") -> tuple[Path, Path]:
+    def save(self, folder: Location | str, *, kind: str = "parquet") -> tuple[Location, Location]:
         """Write ``results.json`` and the table beside it, ``"parquet"`` or ``"csv"``.
 
         Raises:
@@ -295,10 +295,10 @@ class Evaluation:
         """
         from scm_world.evaluation.files import save
 
-        return save(self, Path(folder), kind)
+        return save(self, located(folder), kind)
 
     @classmethod
-    def load(cls, path: Path | str) -> Evaluation:
+    def load(cls, path: Location | str) -> Evaluation:
         """Read what ``save`` wrote: the folder, or its ``results.json``.
 
         Raises:
@@ -306,7 +306,7 @@ class Evaluation:
         """
         from scm_world.evaluation.files import load
 
-        return load(Path(path))
+        return load(located(path))
 
 
 __all__ = ["DRAWN", "KEYS", "SCORE", "Columns", "Evaluation"]

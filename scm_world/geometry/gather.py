@@ -25,6 +25,17 @@ def gather_into(vector: Floats, sources: Integers, targets: Integers, out: Float
 
 
 @njit(cache=True)
+def gather_copied(
+    vector: Floats, sources: Integers, targets: Integers, numbers: Floats, out: Floats
+) -> None:
+    """Copy ``numbers[targets] = vector[sources]``, and then all numbers into ``out``."""
+    for i in range(sources.size):
+        numbers[targets[i]] = vector[sources[i]]
+    for i in range(numbers.size):
+        out[i] = numbers[i]
+
+
+@njit(cache=True)
 def gather_scaled(
     vector: Floats,
     sources: Integers,

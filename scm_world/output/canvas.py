@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scm_world.output.durable import write_durably
+from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,7 +32,7 @@ def blank() -> Figure:
     return figure
 
 
-def save(figure: Figure, path: Path | str) -> None:
+def save(figure: Figure, path: Location | str) -> None:
     """Write the picture whole or not at all.
 
     Raises:

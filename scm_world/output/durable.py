@@ -9,28 +9,43 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from scm_world.errors import UnreadableFile, UnwritableFolder
+from scm_world.output.leases import leased
+from scm_world.output.locations import Location, located
+from scm_world.output.remote import Remote, draft_name, said
 
-PARTIAL = ".part"
 
-
-def draft_of(path: Path) -> Path:
+def draft_of(path: Location) -> Location:
     """Name the hidden file that becomes another one once it is whole.
 
     Example:
         >>> draft_of(Path("study.json")).name
         '.study.json.part'
     """
-    return path.with_name(f".{path.name}{PARTIAL}")
+    return path.with_name(draft_name(path.name))
 
 
-def write_durably(path: Path | str, data: bytes) -> None:
-    """Write a file, whole or not at all; it is on the disk when this ends.
+def write_durably(path: Location | str, data: bytes) -> None:
+    """Write a file, whole or not at all; it is on the disk, or in the store, when this ends.
 
     Raises:
         UnwritableFolder: There is no room, or no permission; what was there is still there.
     """
-    target = Path(path)
-    draft = draft_of(target)
+    target = located(path)
+    if isinstance(target, Remote):
+        _put(target, data)
+    else:
+        _write(target, data)
+
+
+def _put(target: Remote, data: bytes) -> None:
+    try:
+        target.put(data)
+    except OSError as error:
+        raise UnwritableFolder(str(target.parent), f"{target.name}: {said(error)}") from error
+
+
+def _write(target: Path, data: bytes) -> None:
+    draft = target.with_name(draft_name(target.name))
     try:
         with draft.open("wb") as stream:
             stream.write(data)
@@ -46,13 +61,38 @@ def write_durably(path: Path | str, data: bytes) -> None:
             draft.unlink(missing_ok=True)
 
 
-def write_whole(text: str, path: Path | str) -> None:
+def write_whole(text: str, path: Location | str) -> None:
     """Write a text as UTF-8, whole or not at all.
 
     Raises:
         UnwritableFolder: There is no room, or no permission.
     """
     write_durably(path, text.encode("utf-8", errors="backslashreplace"))
+
+
+def removed(path: Location) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        UnwritableFolder: There is no permission.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UnwritableFolder(str(path.parent), f"{path.name}: {said(error)}") from None
+
+
+def made(folder: Location) -> Location:
+    """Make a folder, if there is none and if there can be.
+
+    Raises:
+        UnwritableFolder: There is no permission, or a file in its place.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnwritableFolder(str(folder), said(error)) from None
+    return folder
 
 
 def _sync(folder: Path) -> None:
@@ -65,16 +105,23 @@ def _sync(folder: Path) -> None:
 
 
 @contextmanager
-def locked(folder: Path | str) -> Iterator[None]:
+def locked(folder: Location | str) -> Iterator[None]:
     """Be the only one who writes to a folder, which is made if need be.
 
-    It ends with the process, however that ends. In one process, too, a second one is refused.
+    It ends with the process, however that ends; in an object store after a while, see ``leased``.
+    In one process, too, a second one is refused.
 
     Raises:
         UnreadableFile: Somebody else is writing to it.
         UnwritableFolder: There is no permission, or a file in its place.
     """
-    path = Path(folder)
+    place = located(folder)
+    with leased(place) if isinstance(place, Remote) else _flocked(place):
+        yield
+
+
+@contextmanager
+def _flocked(path: Path) -> Iterator[None]:
     try:
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDONLY)

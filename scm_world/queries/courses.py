@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, final
 
 from scm_world.errors import InterventionError
@@ -67,6 +67,24 @@ class Course:
                 found[name] = _still_held(parts, step)
         return found
 
+    def concerns(self, world: World, step: int, fired: Mapping[Key, int]) -> bool:
+        """Tell whether anything may be due at a control step, without a look at the present.
+
+        Args:
+            world: In the structure that there is then.
+            step: Number of the control step.
+            fired: When events happened.
+        """
+        if self._is_simple or step in self._starts:
+            return step in self._starts
+        return any(
+            _concerns(part, step, start, world, name, fired, (number, name, index))
+            for number, (start, plan) in enumerate(self.layers)
+            if start <= step
+            for name, parts in plan.items()
+            for index, part in enumerate(parts)
+        )
+
     def _owners(self, step: int, world: World) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
         """List what counts at a step: of each quantity the last plan that names it."""
         last: dict[str, tuple[int, dict[str, None]]] = {}
@@ -91,6 +109,29 @@ def _still_held(parts: tuple[Any, ...], step: int) -> Intervention:
     return Natural()
 
 
+def _concerns(
+    part: Any,
+    step: int,
+    start: int,
+    world: World,
+    name: str,
+    fired: Mapping[Key, int],
+    key: Key,
+) -> bool:
+    """Tell whether a part may be due at a control step."""
+    match part:
+        case At():
+            return part.step == step
+        case Clamp():
+            if step < part.start or (part.stop is not None and step > part.stop):
+                return False
+            is_held = name not in world.model or _is_state(name, world)
+            return is_held or step in (part.start, part.stop)
+        case On():
+            return step > start and fired.get(key, step) == step
+    return False
+
+
 def _due(
     part: Any, step: int, start: int, name: str, world: World, fired: dict[Key, int], key: Key
 ) -> Intervention | None:
@@ -113,8 +154,7 @@ def _held(part: Clamp, step: int, name: str, world: World) -> Intervention | Non
     """Say what a clamp does: a state is put back at every step, a parameter is set and released."""
     if step < part.start or (part.stop is not None and step > part.stop):
         return None
-    is_state = world.model.declared(world.model.target(name)).role == "state"
-    if not is_state:
+    if not _is_state(name, world):
         return {part.start: part.act, part.stop: Natural()}.get(step)
     if not isinstance(part.act, Hard | Mechanism):
         raise InterventionError(
@@ -123,3 +163,8 @@ def _held(part: Clamp, step: int, name: str, world: World) -> Intervention | Non
             value=part.act,
         )
     return part.act if step != part.stop else None
+
+
+def _is_state(name: str, world: World) -> bool:
+    role: str = world.model.declared(world.model.target(name)).role
+    return role == "state"

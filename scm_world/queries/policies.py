@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
@@ -21,9 +22,31 @@ Policy = Callable[[World], Any]
 """Looks at a world and gives an action, shape (9,) in the units of its action mode."""
 
 
+class Blind(ABC):
+    """A policy that does not look at what happens: all its actions are known beforehand."""
+
+    @abstractmethod
+    def ahead(self, world: World, first: int, count: int) -> Floats:
+        """Give the actions of some control steps.
+
+        Args:
+            world: As it is now. A policy asked for the first time may look at it.
+            first: The first control step.
+            count: How many.
+
+        Returns:
+            Shape (count, 9).
+        """
+
+    def __call__(self, world: World) -> Floats:
+        """Give the action of the present step."""
+        action: Floats = self.ahead(world, world.index, 1)[0]
+        return action
+
+
 @final
 @dataclass(frozen=True)
-class Random:
+class Random(Blind):
     """Actions drawn uniformly, from the noise of the episode.
 
     Two worlds with the same noise get the same actions, whatever else differs between them.
@@ -41,18 +64,20 @@ class Random:
         if not np.isfinite(self.share):
             raise UnknownOption("share", self.share, ("a finite number",))
 
-    def __call__(self, world: World) -> Floats:
-        """Draw the action of the present step."""
-        step = world.index // self.every
-        drawn = world.noise.uniforms("policy", n=9, episode=world.episode, step=step)[0]
+    def ahead(self, world: World, first: int, count: int) -> Floats:
+        """Draw the actions of some control steps."""
+        drawn = np.empty((count, 9))
+        for row, index in enumerate(range(first, first + count)):
+            step = index // self.every
+            drawn[row] = world.noise.uniforms("policy", n=9, episode=world.episode, step=step)[0]
         middle = 0.5 * (world.action_low + world.action_high)
         half = 0.5 * (world.action_high - world.action_low)
-        action: Floats = middle + self.share * half * (2.0 * drawn - 1.0)
-        return action
+        actions: Floats = middle + self.share * half * (2.0 * drawn - 1.0)
+        return actions
 
 
 @final
-class Sequence:
+class Sequence(Blind):
     """Actions that are given: one for all steps, or one for each.
 
     Args:
@@ -73,10 +98,15 @@ class Sequence:
             raise ActionError("actions must be finite", actions)
         self.actions: Floats = given
 
-    def __call__(self, world: World) -> Floats:
-        """Give the action of the present step."""
-        action: Floats = self.actions[min(world.index, len(self.actions) - 1)]
-        return action
+    def ahead(self, world: World, first: int, count: int) -> Floats:
+        """Give the actions of some control steps."""
+        return _kept(self.actions, first, count)
+
+
+def _kept(actions: Floats, first: int, count: int) -> Floats:
+    """Take rows of actions; after the last one it is kept."""
+    found: Floats = actions[np.minimum(np.arange(first, first + count), len(actions) - 1)]
+    return found
 
 
 INWARD = ((0.33, 0.12, 0.0), (1.0, 0.02, 0.0))
@@ -85,7 +115,7 @@ ACROSS = ((0.25, 0.12, 0.0), (1.0, -0.11, 0.0))
 
 
 @final
-class Sweep:
+class Sweep(Blind):
     """The fingertips sweep over the floor to its middle, and stay there.
 
     What lies in their way is pushed. It depends on nothing but the control step, so that it adds
@@ -114,13 +144,11 @@ class Sweep:
         self._way = way.reshape(steps, 9)
         self._joints = np.array([inverse(t, height, rest).joint_positions for t in self._way])
 
-    def __call__(self, world: World) -> Floats:
-        """Give the action of the present step."""
+    def ahead(self, world: World, first: int, count: int) -> Floats:
+        """Give the actions of some control steps."""
         if world.action_mode == "joint_torques":
             raise ActionError("a sweep needs positions as actions, not", world.action_mode)
-        way = self._way if "effector" in world.action_mode else self._joints
-        action: Floats = way[min(world.index, self.steps - 1)]
-        return action
+        return _kept(self._way if "effector" in world.action_mode else self._joints, first, count)
 
 
 def still(world: World) -> Floats:
@@ -161,14 +189,14 @@ def as_policy(given: Any) -> Policy:
     return given if callable(given) else Sequence(given)
 
 
-class _Hold:
+class _Hold(Blind):
     """Tells the robot to stay where it was when it was asked for the first time."""
 
     def __init__(self) -> None:
         self._action: Floats | None = None
 
-    def __call__(self, world: World) -> Floats:
-        """Give the action of the first step."""
+    def ahead(self, world: World, first: int, count: int) -> Floats:
+        """Give the action of the first step, again and again."""
         if self._action is None:
             self._action = still(world)
-        return self._action
+        return np.tile(self._action, (count, 1))

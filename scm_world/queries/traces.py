@@ -96,8 +96,8 @@ def run(
                 trace.audits[step] = world.do(due)
         if world.version != version:
             version = world.version
-            _note_parameters(world, trace, step)
-        _write(world, trace, wanted, contacts)
+            note_parameters(world, trace, step)
+        write(world, trace, wanted, contacts)
         if step % EVERY == 0 and step < steps:
             trace.snapshots[step] = world.snapshot()
         if step < steps:
@@ -143,15 +143,17 @@ def begin(world: World, seed: int, number: int, course: Course, trace: Trace) ->
         trace.audits[0] = world.do(due)
 
 
-def _note_parameters(world: World, trace: Trace, step: int) -> None:
+def note_parameters(world: World, trace: Trace, step: int) -> None:
+    """Write down the values of parameters, and the structure if it is another one."""
     now = world.current()[0]
     values = {name: np.array(now[name]) for name in world.static_names}
     trace.statics.append((step, values))
-    if not trace.declarations or trace.declarations[-1][1] is not world.declaration:
+    if not trace.declarations or trace.declarations[-1][1].plan != world.declaration.plan:
         trace.declarations.append((step, world.declaration))
 
 
-def _write(world: World, trace: Trace, names: tuple[str, ...], contacts: bool) -> None:
+def write(world: World, trace: Trace, names: tuple[str, ...], contacts: bool = False) -> None:
+    """Write down an instant, with what else was asked for."""
     trace.vectors.append(world.current()[1].vector.copy())
     if names:
         there = names if names == (ALL,) else tuple(name for name in names if name in world.model)

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import ClassVar
 
 import numpy as np
+from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.entities import Entity
@@ -19,6 +20,7 @@ from scm_world.tasks.base import Task
 from scm_world.tasks.observed import Observed, observe_goal, observe_obstacle, observe_tool
 from scm_world.tasks.rewards import FRACTION, FULFILLED, SUCCESS, UNIT, above, reward
 from scm_world.variables import Function, Integers, Measured, Variable
+from scm_world.variables.mechanisms import Stacked
 
 SECONDS_PER_BLOCK = 10.0
 BOX = 10  # numbers of a box in a goal vector: size (3), position (3), quaternion (4)
@@ -37,14 +39,26 @@ def gathered(*parents: Floats, tools: float) -> tuple[Floats, ...]:
     return tuple(np.array(group[i::3]) for group in groups for i in range(3))
 
 
-def filled(*parents: Floats, tools: float) -> float:
+@Stacked
+@njit(cache=True)
+def filled(numbers: Floats, tools: float) -> float:
     """Compute the fraction of the volume of all goals that the blocks fill, in [0, 1].
 
     Args:
-        parents: Size, position and quaternion of each block, then of each goal.
+        numbers: Size, position and quaternion of each block, then of each goal, shape (10 n,).
         tools: How many blocks there are.
     """
-    return float(overlap_fraction_kernel(*gathered(*parents, tools=tools)))
+    n = len(numbers) // BOX
+    size, position, turn = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
+    for i in range(n):
+        for k in range(3):
+            size[i, k], position[i, k] = numbers[BOX * i + k], numbers[BOX * i + 3 + k]
+        for k in range(4):
+            turn[i, k] = numbers[BOX * i + 6 + k]
+    of = int(tools)
+    return overlap_fraction_kernel(
+        size[:of], position[:of], turn[:of], size[of:], position[of:], turn[of:]
+    )
 
 
 def aligned(*parents: Floats, tools: float) -> float:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, Unpack, final
 
 import numpy as np
+from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.entities import Entity, GoalSphere
+from scm_world.geometry.scalars import fused, scalar
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
 from scm_world.tasks import kernels
@@ -28,29 +31,38 @@ GOALS = tuple(f"goal_{finger}" for finger in trifinger.FINGERS)
 _TINTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def nearness(error: float, *, reached: float, far: float) -> float:
+@njit(cache=True)
+def nearness(error: Value, reached: Value, far: Value) -> float:
     """Compute the fractional success: 1 at ``reached`` or nearer, 0 at ``far`` or farther."""
-    return 1.0 - (min(max(error, reached), far) - reached) / (far - reached)
+    near, end = scalar(reached), scalar(far)
+    return 1.0 - (min(max(scalar(error), near), end) - near) / (end - near)
 
 
-def within(error: float, *, reached: float) -> int:
+@njit(cache=True)
+def within(error: Value, reached: Value) -> int:
     """Tell whether the error is small enough, as 0 or 1."""
-    return int(error < reached)
+    return int(scalar(error) < scalar(reached))
 
 
+@njit(cache=True)
 def minus_norm(vector: Floats) -> float:
-    """Compute the negative Euclidean norm."""
-    return -float(np.linalg.norm(vector))
+    """Compute the negative Euclidean norm of a vector."""
+    total = 0.0
+    for number in vector:
+        total = fused(number, number, total)
+    return -math.sqrt(total)
 
 
-def minus_distance(tips: Floats, *goals: Floats) -> float:
+@njit(cache=True)
+def minus_distance(tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Floats) -> float:
     """Compute the negative distance of the tips from their goals [m]."""
-    return -float(kernels.reach_distance(tips, *goals))
+    return -kernels.reach_distance(tips, goal_60, goal_120, goal_300)
 
 
+@njit(cache=True)
 def minus_change(now: Floats, before: Floats) -> float:
     """Compute the negative norm of a difference."""
-    return -float(kernels.distance(now, before))
+    return -kernels.distance(now, before)
 
 
 @final

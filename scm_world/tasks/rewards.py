@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
+from numba import njit
 
-from scm_world._types import Values
+from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.geometry.scalars import scalar
 from scm_world.tasks.arguments import checked_weight
 from scm_world.variables import Box, Function, Linear, Measured, Parent, Variable
 
@@ -165,6 +167,7 @@ def reward(weights: Mapping[str, float]) -> Variable:
     )
 
 
-def above(value: float, *, threshold: float) -> int:
+@njit(cache=True)
+def above(value: Value, threshold: Value) -> int:
     """Tell whether a number lies above a threshold, as 0 or 1."""
-    return int(value > threshold)
+    return int(scalar(value) > scalar(threshold))

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable
-from functools import partial
-from operator import mul
+from functools import partial, update_wrapper
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -21,6 +20,33 @@ from scm_world.errors import ModelError
 from scm_world.variables.spaces import Frozen
 
 Constant = float | tuple[float, ...]
+
+
+@final
+class Stacked:
+    """A function of any number of parents that computes from all their numbers in one vector.
+
+    A loop that has the numbers in one vector already calls ``kernel`` with it instead.
+
+    Args:
+        kernel: Takes the numbers of the parents one after another, shape (n,), and the constants.
+
+    Attributes:
+        kernel: The same.
+
+    Example:
+        >>> total = Stacked(lambda numbers, scale: scale * numbers.sum())
+        >>> total(np.array([1.0, 2.0]), np.array(3.0), scale=2.0)
+        np.float64(12.0)
+    """
+
+    def __init__(self, kernel: Callable[..., Any]) -> None:
+        self.kernel = kernel
+        update_wrapper(self, kernel)
+
+    def __call__(self, *parents: Value, **constants: Any) -> Any:
+        """Compute from values of the parents."""
+        return self.kernel(np.concatenate([np.ravel(parent) for parent in parents]), **constants)
 
 
 @final
@@ -133,7 +159,10 @@ class Linear(Frozen):
         weights, intercept = self.weights, self.intercept
 
         def linear(*parents: Value, noise: Value | float = 0.0) -> Any:
-            return sum(map(mul, weights, parents), noise + intercept)
+            total = noise + intercept
+            for weight, parent in zip(weights, parents):  # noqa: B905 # every step needs it
+                total = total + weight * parent  # ``sum`` rounds otherwise from Python 3.12 on
+            return total
 
         return linear
 

@@ -19,6 +19,8 @@ from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption
 from scm_world.work.threads import children_single_threaded
 
 PROCESS = "process"  # the engine of an EngineFailure
+DONE, FAILED, UNMADE = "done", "failed", "unmade"
+"""How an answer begins: a result, an error of what was asked, or one of what makes the thing."""
 PICKLED = ("a function or class of a module, functools.partial of one, or plain data",)
 
 
@@ -73,6 +75,9 @@ class Worker:
     Args:
         make: Makes the thing, in the process: a function or class that can be pickled.
 
+    Attributes:
+        is_made: Whether the last answer was one of the thing; an error of ``make`` is none.
+
     Raises:
         UnknownOption: ``make`` cannot be pickled.
 
@@ -85,6 +90,7 @@ class Worker:
 
     def __init__(self, make: Callable[[], object]) -> None:
         self._make = pickled("make", make)
+        self.is_made = False
         self._process: Any = None
         self._pipe: Any = None
         self._interrupted = False
@@ -152,8 +158,9 @@ class Worker:
         except BaseException:
             self.stop()  # the rest of the answer would be taken for the next one
             raise
-        is_error, given = pickle.loads(said)  # noqa: S301 # written by our own process
-        if is_error:
+        how, given = pickle.loads(said)  # noqa: S301 # written by our own process
+        self.is_made = how != UNMADE
+        if how != DONE:
             raise given
         return given
 
@@ -230,20 +237,32 @@ def _serve(pipe: Connection) -> None:
         make = pipe.recv_bytes()
         while True:
             method, given = pipe.recv_bytes().decode(), pipe.recv_bytes()
-            pipe.send_bytes(_answered(make, things, method, given))
+            pipe.send_bytes(answered(make, things, method, given))
     except (EOFError, OSError):
         return
 
 
-def _answered(make: bytes, things: list[object], method: str, given: bytes) -> bytes:
-    """Do what was asked. The thing is made before the first time, and kept."""
+def answered(make: bytes, things: list[object], method: str, given: bytes) -> bytes:
+    """Do what was asked, and write down how it ended.
+
+    Args:
+        make: Makes the thing, pickled; it is called before the first time.
+        things: Keeps the thing.
+        method: Of the thing.
+        given: Its arguments, pickled.
+
+    Returns:
+        ``DONE`` and the result, or ``FAILED`` or ``UNMADE`` and an error, pickled.
+    """
+    how = FAILED if things else UNMADE
     try:
         if not things:
             things.append(pickle.loads(make)())  # noqa: S301 # written by our own process
+        how = FAILED
         result = getattr(things[0], method)(*pickle.loads(given))  # noqa: S301 # as above
-        return bytes(ForkingPickler.dumps((False, result)))
+        return bytes(ForkingPickler.dumps((DONE, result)))
     except Exception as error:  # told to the process that asked
-        return bytes(ForkingPickler.dumps((True, _portable(error))))
+        return bytes(ForkingPickler.dumps((how, _portable(error))))
 
 
 def _portable(error: Exception) -> Exception:

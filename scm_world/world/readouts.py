@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from operator import itemgetter
-from typing import Any, final
+from collections.abc import Iterable, Mapping
+from typing import final
 
 import numpy as np
 
 from scm_world._types import Value
 from scm_world.graph import SCM
-from scm_world.variables import Derived, Measured
-
-_Step = tuple[str, Callable[..., Any], Callable[[dict[str, Value]], Any], bool]
-"""A variable, its function, what picks the arguments, and whether it is a single one."""
+from scm_world.variables import Derived, Measured, Parent
+from scm_world.world.bound import Bound, key
 
 
 @final
@@ -38,7 +35,8 @@ class Readouts:
     ) -> None:
         self._now, self._before = now, before
         self._model = model
-        self._plans: dict[tuple[str, ...], tuple[_Step, ...]] = {}
+        self._plans: dict[tuple[str, ...], Bound] = {}
+        self._sure: Bound | None = None  # whose arguments are those of the present
         self._fresh = False
         self.order = order
         self._computed = frozenset(order)
@@ -63,15 +61,6 @@ class Readouts:
                 stack.extend(p.name for p in parents if p.lag == 0 and p.name in self._computed)
         return tuple(name for name in self.order if name in wanted)
 
-    def _plan(self, names: tuple[str, ...]) -> tuple[_Step, ...]:
-        return tuple(self._bind(name) for name in self.needed(names))
-
-    def _bind(self, name: str) -> _Step:
-        variable: Any = self._model.declared(name)
-        keys = [p.name if p.lag == 0 else _earlier(p.name) for p in variable.all_parents]
-        pick = itemgetter(*keys) if keys else _nothing
-        return name, variable.mechanism.bind(), pick, len(keys) == 1
-
     def evaluate(self, names: tuple[str, ...] | None = None) -> None:
         """Compute variables and whatever they need, into the present values.
 
@@ -81,14 +70,20 @@ class Readouts:
         wanted = self.order if names is None else names
         plan = self._plans.get(wanted)
         if plan is None:
-            plan = self._plans[wanted] = self._plan(wanted)
-        now = self._now
-        for name, function, pick, single in plan:
-            now[name] = function(pick(now)) if single else function(*pick(now))
+            plan = self._plans[wanted] = Bound(self._model, self._now, self.needed(wanted))
+        if plan is not self._sure:
+            plan.check()
+            self._sure = plan
+        plan.run()
         self._fresh = True
 
     def stale(self) -> None:
-        """Say that the present has changed."""
+        """Say that the present has changed, whatever has."""
+        self._fresh = False
+        self._sure = None
+
+    def moved(self) -> None:
+        """Say that physics has moved the states, and that nothing else has changed."""
         self._fresh = False
 
     def remember(self) -> None:
@@ -114,15 +109,8 @@ class Readouts:
 
     def _keep(self, name: str, value: Value) -> None:
         """Keep a value of one step ago, beside the present ones so that one look-up finds all."""
-        self._before[name] = self._now[_earlier(name)] = np.array(value)
-
-
-def _earlier(name: str) -> str:
-    return f"{name}, one step ago"
-
-
-def _nothing(now: dict[str, Value]) -> tuple[()]:
-    return ()
+        self._before[name] = self._now[key(Parent(name, 1))] = np.array(value)
+        self._sure = None
 
 
 def computed_order(model: SCM) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.exam.study import Study, cell_path, examine
+from scm_world.discovery.exam.sittings import cell_path
+from scm_world.discovery.exam.study import Study, examine
 from scm_world.discovery.exam.subjects import ModelSubject, TaskView, subject, subject_mark
 from scm_world.discovery.learners import Found, Learner, learn
 from scm_world.discovery.learners.apparatus import Model

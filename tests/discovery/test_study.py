@@ -19,7 +19,8 @@ import user_learners
 from scm_world.discovery.exam import study as study_module
 from scm_world.discovery.exam.families import model
 from scm_world.discovery.exam.results import Cell, Exam, read_cell
-from scm_world.discovery.exam.study import Study, cell_path, examine
+from scm_world.discovery.exam.sittings import cell_path
+from scm_world.discovery.exam.study import Study, examine
 from scm_world.discovery.exam.subjects import TaskView
 from scm_world.errors import ActionError, MissingExtra, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.graph import to_json

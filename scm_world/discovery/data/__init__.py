@@ -4,8 +4,11 @@ from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
 from scm_world.discovery.data.files import load, save
+from scm_world.discovery.data.levels import Levels
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sources import Part, Source
+from scm_world.discovery.data.sweeps import sweep
+from scm_world.discovery.data.swept import Swept
 from scm_world.discovery.data.views import (
     CausalLearn,
     as_causal_learn,
@@ -23,9 +26,11 @@ __all__ = [
     "Column",
     "Dataset",
     "Design",
+    "Levels",
     "Part",
     "Regime",
     "Source",
+    "Swept",
     "UnwritableFolder",
     "as_causal_learn",
     "as_frame",
@@ -38,4 +43,5 @@ __all__ = [
     "from_tigramite",
     "load",
     "save",
+    "sweep",
 ]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from functools import partial
+from typing import Any, TypedDict, Unpack, final
 
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
@@ -14,13 +15,15 @@ from scm_world.discovery.data.files import refusals, together
 from scm_world.discovery.data.folders import SHARD, Folder, Head
 from scm_world.discovery.data.laboratories import Experiments
 from scm_world.discovery.data.models import Model
-from scm_world.discovery.data.sources import Part, Source
+from scm_world.discovery.data.sources import Part, Source, Tell
 from scm_world.discovery.data.worlds import Episodes
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM
+from scm_world.output.locations import Location
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
+from scm_world.work.executors import Executor, Serial, opened
 from scm_world.world import World
 from scm_world.world.start import whole_number
 
@@ -45,11 +48,13 @@ def collect(
     n: int,
     *,
     seed: int = 0,
-    out: Path | str | None = None,
+    out: Location | str | None = None,
     shard: int = SHARD,
     format: str = "parquet",  # noqa: A002 # as other libraries call it
     progress: Progress | None = None,
-    workers: int = 1,
+    workers: int | None = None,
+    engine: Executor | str | None = None,
+    address: str | None = None,
     **circumstances: Unpack[Circumstances],
 ) -> Dataset:
     """Let episodes happen under a design, and write them down as a table with regimes.
@@ -64,11 +69,16 @@ def collect(
         design: What is done in which episode.
         n: How many episodes.
         seed: Of the noise; for a laboratory only of what the design draws by lot.
-        out: A folder: new, empty, or one in which this collection was begun.
+        out: A folder, or a URL: new, empty, or one in which this collection was begun.
         shard: How many episodes are in one of its files.
         format: Of the files: ``"parquet"`` (needs the extra ``data``) or ``"csv"``.
-        progress: Told after each episode how many are done, and how many there will be.
-        workers: Threads in which episodes of a world happen.
+        progress: Told how many episodes are done, and how many there will be: after each episode
+            in this process, after each shard of others.
+        workers: How many shards are made at the same time. None is one, in this process; with an
+            engine it is as many as there are cores.
+        engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
+            ``engine_of``. A laboratory, which keeps books, has the first one only.
+        address: Of a Ray cluster.
         circumstances: ``steps`` of an episode, 25 in a world. Of a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
             or ``Outcome``), and ``every_step``: a row for each control step, with the action.
@@ -82,7 +92,8 @@ def collect(
         BudgetExhausted: The laboratory has fewer episodes left.
         UnreadableFile: The folder holds something else, or a damaged file.
         UnwritableFolder: There is no room, or no permission; nothing is lost.
-        UnknownOption: An argument does not fit.
+        UnknownOption: An argument does not fit, or other processes cannot have the source.
+        EngineFailure: Three workers ended over one shard, or there is no cluster at the address.
 
     Example:
         >>> from scm_world.queries import World
@@ -95,12 +106,13 @@ def collect(
     count = whole_number("n", n, least=1)
     size = whole_number("shard", shard, least=1)
     whole_number("seed", seed, least=0)
-    made = source_of(source, design, count, seed=seed, workers=workers, **circumstances)
+    made = source_of(source, design, count, seed=seed, **circumstances)
     about = json.loads(json.dumps(made.about))
     if out is None:
         size = count if made.at_once else size
         head = Head(about, made.columns, count, size, format, made.edges)
-        return together(head, _gathered(made, head, None, progress))
+        with _opened(source, engine, workers, address) as executor:
+            return together(head, _gathered(made, head, None, executor, progress))
     if isinstance(source, Laboratory):
         allowed = ("None with a laboratory: give it a log, and save the dataset",)
         raise UnknownOption("out", str(out), allowed)
@@ -108,8 +120,8 @@ def collect(
         raise ModelError(["a function of the model has no name: define it at the top of a module"])
     head = Head(about, made.columns, count, size, format, made.edges)
     folder = Folder(out, head, design.modules)
-    with folder.opened():
-        parts = _gathered(made, head, folder, progress)
+    with _opened(source, engine, workers, address) as executor, folder.opened():
+        parts = _gathered(made, head, folder, executor, progress)
         folder.note(refusals(parts), complete=True)
     return together(head, parts)
 
@@ -120,7 +132,6 @@ def source_of(
     n: int,
     *,
     seed: int,
-    workers: int = 1,
     **given: Unpack[Circumstances],
 ) -> Source:
     """Turn what can be collected from into something that has episodes.
@@ -141,7 +152,6 @@ def source_of(
                 nature=given.get("nature"),
                 steps=whole_number("steps", given.get("steps", STEPS), least=1),
                 seed=seed,
-                workers=workers,
             )
             return Episodes(
                 source,
@@ -163,39 +173,94 @@ def _refuse_others(given: Mapping[str, Any], allowed: tuple[str, ...], of: str) 
             raise UnknownOption(f"circumstance of {of}", name, allowed or ("nothing",))
 
 
+@contextmanager
+def _opened(
+    source: Any, engine: Executor | str | None, workers: int | None, address: str | None
+) -> Iterator[Executor]:
+    """Open what makes shards."""
+    with opened(engine, workers, address) as executor:
+        if isinstance(source, Laboratory) and not isinstance(executor, Serial):
+            allowed = ("'serial' with one worker: a laboratory keeps its books in one process",)
+            raise UnknownOption("engine of work", executor.engine, allowed)
+        yield executor
+
+
 def _gathered(
-    source: Source, head: Head, folder: Folder | None, progress: Progress | None
+    source: Source,
+    head: Head,
+    folder: Folder | None,
+    executor: Executor,
+    progress: Progress | None,
 ) -> list[Part]:
     """Read or make all parts."""
-    parts: list[Part] = []
-    done = 0
-
-    def tell(more: int) -> None:
-        nonlocal done
-        done += more
-        if progress is not None and more:
-            progress(done, head.n)
-
-    for index, numbers in enumerate(head.ranges()):
+    ranges = head.ranges()
+    tally = _Tally(head.n, progress)
+    parts: dict[int, Part] = {}
+    for index, numbers in enumerate(ranges):
         part = None if folder is None else folder.read(index, numbers)
-        if part is None:
-            part = _made(source, numbers, tell, head)
-            _refuse_hopeless([*parts, part], numbers.stop)
-            if folder is not None:
-                folder.write(index, numbers, part)
-        else:
-            tell(len(numbers))
-        parts.append(part)
-    return parts
+        if part is not None:
+            parts[index] = part
+            tally.add(len(numbers))
+    missing = [index for index in range(len(ranges)) if index not in parts]
+    serial = isinstance(executor, Serial)
+    make = partial(Maker, source, tally.add if serial else None)
+    refused = [pair for part in parts.values() for pair in part.refused]
+    made = sum(len(ranges[index]) for index in parts)
+    for place, found in executor.run(make, [ranges[index] for index in missing]):
+        index = missing[place]
+        parts[index] = part = replace(found, table=replace(found.table, about=head.about))
+        refused += part.refused
+        made += len(ranges[index])
+        _refuse_hopeless(refused, made)
+        if folder is not None:
+            folder.write(index, ranges[index], part)
+        if not serial:
+            tally.add(len(ranges[index]))
+    return [parts[index] for index in range(len(ranges))]
 
 
-def _made(source: Source, numbers: range, tell: Any, head: Head) -> Part:
-    part = source.part(numbers, tell)
-    return replace(part, table=replace(part.table, about=head.about))
+@final
+class _Tally:
+    """Counts episodes.
+
+    Args:
+        total: How many there will be.
+        progress: Told how many there are.
+    """
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self._done, self._total, self._progress = 0, total, progress
+
+    def add(self, more: int) -> None:
+        """Count some more."""
+        self._done += more
+        if self._progress is not None and more:
+            self._progress(self._done, self._total)
 
 
-def _refuse_hopeless(parts: list[Part], done: int) -> None:
-    refused = [pair for part in parts for pair in part.refused]
+@final
+class Maker:
+    """Makes the rows of shards, wherever it is.
+
+    Args:
+        source: Of the episodes.
+        tell: Told how many further episodes are done; nobody is if None.
+    """
+
+    def __init__(self, source: Source, tell: Tell | None = None) -> None:
+        self._source, self._tell = source, tell or _silent
+
+    def __call__(self, numbers: range) -> Part:
+        """Let the episodes of a shard happen."""
+        part = self._source.part(numbers, self._tell)
+        return replace(part, table=replace(part.table, about={}))  # it is the same in all of them
+
+
+def _silent(more: int) -> None:
+    """Tell nobody."""
+
+
+def _refuse_hopeless(refused: list[tuple[int, str]], done: int) -> None:
     if done >= ENOUGH and 2 * len(refused) > done:
         number, why = refused[-1]
         raise InterventionError(

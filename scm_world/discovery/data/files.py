@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -14,14 +13,15 @@ from scm_world.discovery.data.folders import SHARD, Folder, Head, head_of, read_
 from scm_world.discovery.data.shards import check_kind, content_of
 from scm_world.discovery.data.sources import Part
 from scm_world.errors import ModelError, UnreadableFile
+from scm_world.output.locations import Location, located
 from scm_world.world.start import whole_number
 
 
-def load(folder: Path | str, *, trusted: Sequence[str] = (), partial: bool = False) -> Dataset:
+def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool = False) -> Dataset:
     """Read a dataset.
 
     Args:
-        folder: That ``collect`` or ``save`` wrote.
+        folder: That ``collect`` or ``save`` wrote; it may be a URL.
         trusted: Packages, besides this one, whose functions may be mechanisms of its plans.
         partial: Whether files may be missing, since a collection was interrupted.
 
@@ -31,13 +31,13 @@ def load(folder: Path | str, *, trusted: Sequence[str] = (), partial: bool = Fal
         ModelError: A plan names a function outside of the trusted packages.
         MissingExtra: A library that reads it is not installed.
     """
-    place = Path(folder)
+    place = located(folder)
     head = head_of(read_sidecar(place))
     check_kind(head.kind)
     files = Folder(place, head, trusted)
     parts, ranges = [], head.ranges()
     known = {files.shard(index) for index in range(len(ranges))}
-    for stranger in sorted(set(place.glob(f"shard-*.{head.kind}")) - known):
+    for stranger in sorted(set(place.glob(f"shard-*.{head.kind}")) - known, key=str):
         reason = f"the dataset has {len(ranges)} files, and it is none of them"
         raise UnreadableFile(str(stranger), reason, "remove it from the folder")
     for index, numbers in enumerate(ranges):
@@ -69,16 +69,17 @@ def refusals(parts: Sequence[Part]) -> dict[str, str]:
 
 def save(
     dataset: Dataset,
-    folder: Path | str,
+    folder: Location | str,
     *,
     shard: int = SHARD,
     format: str = "parquet",  # noqa: A002 # as other libraries call it
-) -> Path:
+) -> Location:
     """Write a dataset to a new folder, without loss.
 
     Args:
         dataset: Its ``about`` has to be plain data: what JSON can hold.
-        folder: New or empty, or one in which saving the same dataset was interrupted.
+        folder: New or empty, or one in which saving the same dataset was interrupted; it may be a
+            URL.
         shard: How many episodes are in a file.
         format: ``"parquet"`` or ``"csv"``.
 

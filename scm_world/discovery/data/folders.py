@@ -7,7 +7,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, final
 
 from scm_world.discovery.data.dataset import Column
@@ -15,7 +14,9 @@ from scm_world.discovery.data.shards import Place, check_kind, check_names, deco
 from scm_world.discovery.data.sources import FORMAT, Part
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
-from scm_world.output.durable import PARTIAL, draft_of, locked, write_durably
+from scm_world.output.durable import draft_of, locked, removed, write_durably
+from scm_world.output.locations import Location, located
+from scm_world.output.remote import PARTIAL, said
 from scm_world.world.start import whole_number
 
 SIDECAR = "dataset.json"
@@ -77,16 +78,16 @@ class Folder:
     """A folder that holds a dataset, or is about to.
 
     Args:
-        path: Of the folder.
+        path: Of the folder, or a URL.
         head: Of the dataset.
         trusted: Packages whose functions may be mechanisms of its plans.
     """
 
-    def __init__(self, path: Path | str, head: Head, trusted: Sequence[str] = ()) -> None:
-        self.path, self.head, self._trusted = Path(path), head, tuple(trusted)
+    def __init__(self, path: Location | str, head: Head, trusted: Sequence[str] = ()) -> None:
+        self.path, self.head, self._trusted = located(path), head, tuple(trusted)
         self._plan = head.plan
 
-    def shard(self, index: int) -> Path:
+    def shard(self, index: int) -> Location:
         """Name a file."""
         return self.path / f"shard-{index:05d}.{self.head.kind}"
 
@@ -103,7 +104,7 @@ class Folder:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise UnreadableFile(str(path), str(error), "make it readable") from None
+            raise UnreadableFile(str(path), said(error), "make it readable") from None
         try:
             place, part = decoded(
                 data, head.kind, self._plan, head.columns, head.about, self._trusted
@@ -116,7 +117,7 @@ class Folder:
         self._check_place(path, place, numbers)
         return part if place.stop >= numbers.stop else None
 
-    def _check_place(self, path: Path, place: Place, numbers: range) -> None:
+    def _check_place(self, path: Location, place: Place, numbers: range) -> None:
         reason = f"it holds the episodes from {place.first} to {place.stop - 1}"
         if place.first != numbers.start or place.stop > numbers.start + self.head.shard:
             raise UnreadableFile(str(path), reason, "put it back under its own name")
@@ -161,7 +162,7 @@ class Folder:
         sidecar = self.path / SIDECAR
         for stale in self.path.glob(f".*.*{PARTIAL}"):  # of a process that was killed
             if stale.name.startswith(".shard-") or stale == draft_of(sidecar):
-                stale.unlink(missing_ok=True)
+                removed(stale)
         if sidecar.exists():
             self._check_same(read_sidecar(self.path))
         elif any(not path.name.startswith(".") for path in self.path.iterdir()):
@@ -216,7 +217,7 @@ def _checksum(lines: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
-def read_sidecar(folder: Path) -> dict[str, Any]:
+def read_sidecar(folder: Location) -> dict[str, Any]:
     """Read what a folder says of itself.
 
     Raises:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from pathlib import Path
 
 from scm_world.discovery.exam.html_style import SCRIPT, STYLE, verdicts
 from scm_world.discovery.exam.pictures import budget_png
@@ -22,6 +21,7 @@ from scm_world.discovery.exam.tables import (
     by_subject,
 )
 from scm_world.output.durable import write_whole
+from scm_world.output.locations import Location
 from scm_world.output.pages import Entry, facts, folded, page, picture, section, table
 
 PICTURES = 150  # runs: of an exam with more of them, only one per learner and subject is drawn
@@ -30,7 +30,7 @@ NAMED = 25  # wrong edges of a kind that are named in words
 SHORT = ("shd", "f1", "precision", "recall")  # scores beside a single run
 
 
-def write_report(exam: Exam, path: Path | str) -> None:
+def write_report(exam: Exam, path: Location | str) -> None:
     """Write the report: tables, the picture of the budgets, and the graphs side by side.
 
     Of each learner on each subject the first seed of the largest budget is drawn, and the other

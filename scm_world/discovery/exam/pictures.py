@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 from scm_world.discovery.exam.results import Exam
 from scm_world.discovery.exam.tables import Row, by_subject, table_rows
 from scm_world.output.canvas import FAINT, INK, PALETTE, blank, save, small_png
+from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,7 +72,7 @@ def _way(row: Row) -> Way:
     return (row.learner, row.data, row.standardised)
 
 
-def draw_budget(exam: Exam, path: Path | str) -> None:
+def draw_budget(exam: Exam, path: Location | str) -> None:
     """Draw SHD and F1 against the budget, two panels per subject.
 
     Bars reach from the lowest to the highest seed. Runs that were not done are not drawn; the

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, TypeVar, final
 
 import numpy as np
@@ -17,6 +16,7 @@ from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import SOURCES
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_whole
+from scm_world.output.locations import Location, located
 from scm_world.queries.experiments.effects import EdgeKey
 
 CELL, TRUTH, EXAM = "scm_world/exam-cell/1", "scm_world/exam-truth/1", "scm_world/exam/1"
@@ -256,7 +256,7 @@ class Exam:
 # --- files ----------------------------------------------------------------------------------------
 
 
-def read_cell(path: Path | str) -> Cell:
+def read_cell(path: Location | str) -> Cell:
     """Read the file of a cell.
 
     Raises:
@@ -265,7 +265,7 @@ def read_cell(path: Path | str) -> Cell:
     return _read(path, Cell.from_dict, "delete it, and this cell is run again")
 
 
-def read_truth(path: Path | str) -> Truth:
+def read_truth(path: Location | str) -> Truth:
     """Read the file of a subject.
 
     Raises:
@@ -274,7 +274,7 @@ def read_truth(path: Path | str) -> Truth:
     return _read(path, Truth.from_dict, "delete it, and the exam writes it again")
 
 
-def write_json(thing: Cell | Truth | Exam, path: Path | str) -> None:
+def write_json(thing: Cell | Truth | Exam, path: Location | str) -> None:
     """Write a cell, a subject or an exam as JSON, whole or not at all."""
     write_whole(as_text(thing), path)
 
@@ -289,9 +289,9 @@ def as_text(thing: Cell | Truth | Exam) -> str:
     return json.dumps(thing.as_dict(), indent=1, allow_nan=False, default=_plain) + "\n"
 
 
-def _read(path: Path | str, make: Callable[[Mapping[str, Any]], _T], advice: str) -> _T:
+def _read(path: Location | str, make: Callable[[Mapping[str, Any]], _T], advice: str) -> _T:
     try:
-        return make(json.loads(Path(path).read_text(encoding="utf-8")))
+        return make(json.loads(located(path).read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError) as error:
         raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from error
 

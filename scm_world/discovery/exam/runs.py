@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import re
 import time
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -18,6 +20,7 @@ from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import Learner, learn, learner
 from scm_world.discovery.metrics import effect_rmse, evaluate
 from scm_world.errors import EngineFailure, MissingExtra, ScmWorldError, UnknownOption
+from scm_world.output.locations import Location
 from scm_world.tasks import TASKS
 from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
 
@@ -49,7 +52,7 @@ class Job:
     seed: int
     standardised: bool = False
     view: TaskView = field(default_factory=TaskView)
-    folder: Path | None = None
+    folder: Location | None = None
 
     def cell(self, **what: Any) -> Cell:
         """Write down how it ended."""
@@ -79,6 +82,18 @@ def shown_name(name: str, view: TaskView) -> str:
     if name in TASKS:
         return f"{name}/step" if view.view == "step" else name
     return Path(name).stem if name.endswith(".json") else name
+
+
+def slug(name: str) -> str:
+    """Turn a name into one of a file, another one for each name.
+
+    Example:
+        >>> slug("er2:20"), slug("pcmci+")
+        ('er2_20-45d3', 'pcmci_-be55')
+    """
+    plain = re.sub(r"[^A-Za-z0-9.-]", "_", name)
+    mark = hashlib.sha256(name.encode()).hexdigest()[:4]
+    return plain if plain == name else f"{plain}-{mark}"
 
 
 def source_for(chosen: Learner, wanted: str | None) -> str:
@@ -255,6 +270,10 @@ class Runner:
         self._ready.add((job.subject, job.seed, job.data))
         return truth
 
+    def __call__(self, job: Job) -> Cell:
+        """Run a job; see ``run``."""
+        return self.run(job)
+
     def interrupt(self) -> None:
         """End the process from another thread; who waits for an answer gets an error."""
         self._worker.interrupt()
@@ -263,3 +282,5 @@ class Runner:
         """End the process."""
         self._worker.stop()
         self._ready.clear()
+
+    close = stop

@@ -6,27 +6,28 @@ import hashlib
 import inspect
 import json
 import math
-import re
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from threading import Event
 from typing import Any, final
 
 from scm_world.discovery.exam.html import write_report
 from scm_world.discovery.exam.pictures import draw_budget
-from scm_world.discovery.exam.results import Cell, Exam, Truth, read_cell, write_json
-from scm_world.discovery.exam.runs import Job, Runner, shown_name, source_for
+from scm_world.discovery.exam.results import Exam, write_json
+from scm_world.discovery.exam.runs import Job, shown_name, slug, source_for
+from scm_world.discovery.exam.sittings import Sitting
 from scm_world.discovery.exam.subjects import VIEWS, TaskView, check_subject, subject, subject_mark
 from scm_world.discovery.exam.tables import write_tables
 from scm_world.discovery.learners.registry import SOURCES, Learner, learner
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile
-from scm_world.output.durable import draft_of, locked, write_whole
+from scm_world.output.durable import draft_of, locked, made, write_whole
+from scm_world.output.locations import Location, located
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.policies import as_policy
 from scm_world.queries.progress import Progress
 from scm_world.tasks import TASKS
+from scm_world.work.executors import Executor, opened
+from scm_world.work.processes import PROCESS
 from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/study/1"
@@ -106,13 +107,13 @@ class Study:
         only = self.budgets[0]
         return tuple(sorted({max(1, only // share) for share in SHARES}))
 
-    def jobs(self, folder: Path | None) -> Iterator[tuple[Job, ...]]:
+    def jobs(self, folder: Location | None) -> Iterator[tuple[Job, ...]]:
         """List the runs, those of one subject and seed together."""
         for name in self.subjects:
             for seed in range(self.seeds):
                 yield tuple(self._jobs(name, seed, folder))
 
-    def _jobs(self, name: str, seed: int, folder: Path | None) -> Iterator[Job]:
+    def _jobs(self, name: str, seed: int, folder: Location | None) -> Iterator[Job]:
         place = None if folder is None else folder / "data" / slug(shown_name(name, self.view))
         for who in self.learners:
             chosen = learner(who)
@@ -149,27 +150,14 @@ def _check_fit(chosen: Learner, name: str) -> None:
         raise UnknownOption(f"subject of {chosen.name}", name, models)
 
 
-def slug(name: str) -> str:
-    """Turn a name into one of a file, another one for each name.
-
-    Example:
-        >>> slug("er2:20"), slug("pcmci+")
-        ('er2_20-45d3', 'pcmci_-be55')
-    """
-    plain = re.sub(r"[^A-Za-z0-9.-]", "_", name)
-    mark = hashlib.sha256(name.encode()).hexdigest()[:4]
-    return plain if plain == name else f"{plain}-{mark}"
-
-
-def cell_path(folder: Path, job: Job) -> Path:
-    """Say where the result of a run is kept."""
-    even = "-standardised" if job.standardised else ""
-    run = f"{slug(job.learner)}-{job.data}-{job.budget}-seed{job.seed}{even}.json"
-    return folder / "cells" / slug(job.truth_name) / run
-
-
 def examine(
-    study: Study, out: Path | str, *, workers: int = 1, progress: Progress | None = None
+    study: Study,
+    out: Location | str,
+    *,
+    workers: int | None = None,
+    engine: Executor | str | None = None,
+    address: str | None = None,
+    progress: Progress | None = None,
 ) -> Exam:
     """Let learners sit an exam, and write down how they did.
 
@@ -179,8 +167,13 @@ def examine(
 
     Args:
         study: What is examined.
-        out: Folder: new, empty, or one of the same study.
-        workers: Processes that run learners; the graphs found do not depend on how many.
+        out: Folder, or a URL: new, empty, or one of the same study.
+        workers: How many runs are done at the same time; the graphs found do not depend on how
+            many. None is one; with an engine it is as many as there are cores.
+        engine: What does them: ``"process"``, ``"serial"``, ``"ray"``, or an executor; see
+            ``engine_of``. A run has a process of its own on all of them, which ends when it takes
+            too long. On Ray, each worker collects data for itself, and keeps no file of them.
+        address: Of a Ray cluster.
         progress: Told after each run.
 
     Returns:
@@ -192,90 +185,27 @@ def examine(
             process is writing to it.
         ScmWorldError: A subject cannot be made, or data cannot be collected or written.
     """
-    folder = Path(out)
-    whole_number("workers", workers, least=1)
-    _begun(study, folder)
-    with locked(folder):
-        return _examined(study, folder, workers, progress)
+    folder = located(out)
+    if engine is None:
+        engine, workers = PROCESS, 1 if workers is None else workers
+    with opened(engine, workers, address) as executor:
+        _begun(study, folder)
+        with locked(folder):
+            return _examined(study, folder, executor, progress)
 
 
-def _examined(study: Study, folder: Path, workers: int, progress: Progress | None) -> Exam:
-    groups = list(study.jobs(folder))
-    sitting = _Sitting(study, folder, sum(map(len, groups)), progress)
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(sitting.work, jobs) for jobs in groups]
-        try:
-            for future in futures:
-                future.result()
-        except BaseException:
-            sitting.stop()
-            raise
+def _examined(
+    study: Study, folder: Location, executor: Executor, progress: Progress | None
+) -> Exam:
+    sitting = Sitting(list(study.jobs(folder)), folder, study.timeout, progress)
+    sitting.hold(executor)
     names = [shown_name(name, study.view) for name in study.subjects]
     about = {"study": study.as_dict(), "versions": versions()}
     exam = Exam({n: sitting.truths[n] for n in names}, tuple(sitting.cells), about)
     return written(exam, folder)
 
 
-@final
-class _Sitting:
-    """What several threads do together: each has a process that runs jobs.
-
-    Attributes:
-        cells: What is done, in the order in which it was.
-        truths: Of the subjects; of a family, that of the first seed.
-    """
-
-    def __init__(self, study: Study, folder: Path, total: int, progress: Progress | None) -> None:
-        self.cells: list[Cell] = []
-        self.truths: dict[str, Truth] = {}
-        self._study, self._folder, self._total, self._progress = study, folder, total, progress
-        self._runners: list[Runner] = []
-        self._stopped = Event()
-
-    def work(self, jobs: Sequence[Job]) -> None:
-        """Run the jobs of one subject and seed."""
-        runner = Runner(self._study.timeout)
-        self._runners.append(runner)
-        try:
-            for job in jobs:
-                if self._stopped.is_set():
-                    return
-                if job is jobs[0]:
-                    truth = runner.truth(job)
-                    if job.seed == 0 or truth.name not in self.truths:
-                        self.truths[truth.name] = truth
-                self._tell(_ran(runner, self._folder, job))
-        finally:
-            runner.stop()
-
-    def stop(self) -> None:
-        """End all processes; jobs that have not begun are not run."""
-        self._stopped.set()
-        for runner in tuple(self._runners):
-            runner.interrupt()
-
-    def _tell(self, cell: Cell) -> None:
-        self.cells.append(cell)
-        if self._progress is not None:
-            self._progress(len(self.cells), self._total)
-
-
-def _ran(runner: Runner, folder: Path, job: Job) -> Cell:
-    """Read the result of a run, or run it and write it."""
-    path = cell_path(folder, job)
-    if path.exists():
-        cell = read_cell(path)
-        if cell.key != job.cell(status="failed").key:
-            reason, advice = "it is of another run", "delete it, and this run is done again"
-            raise UnreadableFile(str(path), reason, advice)
-        return cell
-    cell = runner.run(job)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(cell, path)
-    return cell
-
-
-def _begun(study: Study, folder: Path) -> None:
+def _begun(study: Study, folder: Location) -> None:
     """Begin a folder, or check that it is one of the same study."""
     marks = {name: subject_mark(name, study.view) for name in study.subjects}
     marks |= {name: _source_mark(learner(name)) for name in study.learners}
@@ -290,7 +220,7 @@ def _begun(study: Study, folder: Path) -> None:
         as_policy(study.view.acts)
         for name in study.subjects:
             subject(name, view=study.view).close()
-        folder.mkdir(parents=True, exist_ok=True)
+        made(folder)
         write_whole(json.dumps(head, indent=1) + "\n", path)
         return
     try:
@@ -316,13 +246,13 @@ def _source_mark(chosen: Learner) -> str:
     return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
 
 
-def _is_free(folder: Path) -> bool:
+def _is_free(folder: Location) -> bool:
     """Tell whether a folder holds nothing, but for a beginning that was interrupted."""
     drafts = {draft_of(folder / "study.json").name}
     return folder.is_dir() and {path.name for path in folder.iterdir()} <= drafts
 
 
-def written(exam: Exam, folder: Path) -> Exam:
+def written(exam: Exam, folder: Location) -> Exam:
     """Write the table, the picture and the report."""
     write_json(exam, folder / "exam.json")
     write_tables(exam, folder)

@@ -8,11 +8,11 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
 from typing import Literal, final
 
 from scm_world.discovery.exam.results import Cell, Exam, Number
 from scm_world.output.durable import write_whole
+from scm_world.output.locations import Location, located
 
 NONE = "–"
 
@@ -215,7 +215,7 @@ def by_subject(exam: Exam) -> dict[str, list[Row]]:
 # --- files ----------------------------------------------------------------------------------------
 
 
-def write_tables(exam: Exam, folder: Path | str) -> tuple[Path, Path]:
+def write_tables(exam: Exam, folder: Location | str) -> tuple[Location, Location]:
     """Write ``results.csv``, a line per run, and ``results.md``, the means.
 
     A missing number is an empty field of the one, and a dash in the other.
@@ -223,7 +223,8 @@ def write_tables(exam: Exam, folder: Path | str) -> tuple[Path, Path]:
     Returns:
         The two files.
     """
-    table, summary = Path(folder) / "results.csv", Path(folder) / "results.md"
+    place = located(folder)
+    table, summary = place / "results.csv", place / "results.md"
     write_whole(_csv(exam), table)
     write_whole(_markdown(exam), summary)
     return table, summary

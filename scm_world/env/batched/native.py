@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._types import Floats
 from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.env.batched.commands import Commands
 from scm_world.env.batched.crew import located
@@ -135,6 +137,28 @@ class NativeCrew:
         """Set an attribute of some of them."""
         self._bring(values)
         self._members.assign(name, values)
+
+    @contextmanager
+    def alone(self, index: int) -> Iterator[ScmWorldEnv]:
+        """Let one of them be used by itself; what it shows afterwards is in its row.
+
+        Unlike ``do`` and ``reset``, this takes nothing back if something is refused.
+        """
+        env = self._envs[index]
+        self._bring([index])
+        try:
+            yield env
+        finally:
+            self._look([index])
+        self.sheet.write(index, *env.present())
+
+    def state(self, index: int) -> Floats:
+        """Give where everything is in one that was just stepped, as ``PhysicalState.vector``.
+
+        It holds until the next step.
+        """
+        numbers = self._batch.table(index).matrix[index]
+        return numbers[: self._envs[index].world.current()[1].vector.size]
 
     def close(self) -> None:
         """Free their engines."""

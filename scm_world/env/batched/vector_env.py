@@ -107,6 +107,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(form.observation_space, self.num_envs)
         self.action_space = batch_space(form.action_space, self.num_envs)
         self._all = range(self.num_envs)
+        self._nothing = [None] * self.num_envs, [None] * self.num_envs  # seeds and options
         self._everyone = np.ones(self.num_envs, bool)
         self._begun = np.zeros(self.num_envs, bool)
         self._ended = np.zeros(self.num_envs, bool)
@@ -145,24 +146,29 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
                 nothing resets it.
             NotReset: One of them has no episode yet.
         """
-        crew, sheet, ended = self.crew, self.crew.sheet, self._ended
+        sheet, stepping = self.crew.sheet, self._stepping(actions)
+        given = actions_of(actions, stepping)
+        if not stepping.all():
+            self._begin_next(~stepping)
+        self.crew.step(stepping, given)
+        ended = sheet.terminations | sheet.truncations
         infos: dict[str, Any] = {}
-        stepping = self._stepping(actions)
-        crew.step(stepping, actions_of(actions, stepping))
-        if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            ended = sheet.terminations | sheet.truncations
-            if ended.any():
-                infos = self._final(ended)
-        if self.autoreset_mode is not AutoresetMode.DISABLED and ended.any():
-            crew.reset(ended, [None] * self.num_envs, [None] * self.num_envs)
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            sheet.rewards[ended] = 0.0
-            sheet.terminations[ended] = sheet.truncations[ended] = False
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
-            self._ended = sheet.terminations | sheet.truncations
+            self._ended = ended
+        elif ended.any():
+            infos = self._final(ended)
+            self.crew.reset(ended, *self._nothing)
         flags = sheet.terminations.copy(), sheet.truncations.copy()
         infos |= self._infos(self._everyone)
         return self._observations(), sheet.rewards.copy(), *flags, infos
+
+    def _begin_next(self, which: NDArray[np.bool_]) -> None:
+        """Begin the next episode of some of them, which takes the place of a step."""
+        sheet = self.crew.sheet
+        self.crew.reset(which, *self._nothing)
+        sheet.rewards[which] = 0.0
+        sheet.terminations[which] = sheet.truncations[which] = False
+        self._ended &= ~which
 
     def _stepping(self, actions: Any) -> NDArray[np.bool_]:
         """Tell which environments take a step."""

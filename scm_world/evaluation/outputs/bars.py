@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scm_world.evaluation.outputs.looks import (
@@ -19,6 +18,7 @@ from scm_world.evaluation.outputs.strips import Strips, value_axis
 from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.evaluation.statistics import Interval
 from scm_world.output.canvas import INK, save
+from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,7 @@ BETWEEN = 0.28  # [inches] between the bars of two protocols
 NUMBER = 7.0  # [points]
 
 
-def draw_bars(evaluation: Evaluation, path: Path | str, metric: str = SCORE) -> None:
+def draw_bars(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
     """Draw the mean score in each protocol, a bar for each agent and engine.
 
     Whiskers are 95 % intervals; a bar has none if the data say nothing about it. Where an agent

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scm_world.evaluation.outputs.looks import metric_words, protocol_words
@@ -12,6 +11,7 @@ from scm_world.evaluation.outputs.sheets import GAP, MARGIN, PLAIN, Sheet, text_
 from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.evaluation.statistics import Cause, Causes
 from scm_world.output.canvas import INK, PALETTE, save
+from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +43,7 @@ def causes_of(
 
 def draw_causes(
     evaluation: Evaluation,
-    path: Path | str,
+    path: Location | str,
     agent: str | None = None,
     engine: str | None = None,
     metric: str = SCORE,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scm_world.errors import UnknownOption
@@ -19,6 +18,7 @@ from scm_world.evaluation.outputs.strips import Strips
 from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.evaluation.statistics import Interval
 from scm_world.output.canvas import INK, save
+from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +50,7 @@ def gaps_of(evaluation: Evaluation, metric: str = SCORE) -> Gaps:
     return found
 
 
-def draw_gap(evaluation: Evaluation, path: Path | str, metric: str = SCORE) -> None:
+def draw_gap(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
     """Draw the gap between engines in each protocol, with paired 95 % intervals.
 
     Args:

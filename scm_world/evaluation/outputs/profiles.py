@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -26,6 +25,7 @@ from scm_world.evaluation.statistics import (
     probability_of_improvement,
 )
 from scm_world.output.canvas import INK, PALETTE, save
+from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,7 +92,7 @@ def _thresholds(metric: str, scores: list[Floats]) -> Floats:
     return np.linspace(low - room, high + room, 101)
 
 
-def draw_profile(evaluation: Evaluation, path: Path | str, metric: str = SCORE) -> None:
+def draw_profile(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
     """Draw the share of scores above each threshold, and who is better with what probability.
 
     For each engine one panel of profiles with their 95 % bands, and with several agents one of

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -26,6 +25,7 @@ from scm_world.evaluation.outputs.sheets import GAP, MARGIN, Sheet, balanced, te
 from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.evaluation.statistics import Interval
 from scm_world.output.canvas import INK, save
+from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +39,7 @@ WIDEST = 20.0  # [inches] of radars side by side
 OUT = 0.1  # [inches] from the outer ring to the names
 
 
-def draw_radar(evaluation: Evaluation, path: Path | str, metric: str = SCORE) -> None:
+def draw_radar(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
     """Draw the mean scores as polygons, with bands of their 95 % intervals.
 
     Up to six lines share a radar. With more of them every agent has a radar of its own; none is

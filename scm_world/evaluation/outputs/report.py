@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
+import posixpath
 from collections.abc import Sequence
 from html import escape
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -32,6 +31,7 @@ from scm_world.evaluation.results import SCORE, Evaluation
 from scm_world.evaluation.statistics import Causes
 from scm_world.output.canvas import small_png
 from scm_world.output.durable import write_whole
+from scm_world.output.locations import Location, located
 from scm_world.output.pages import Entry, embedded, facts, folded, page, picture, section, table
 
 if TYPE_CHECKING:
@@ -43,9 +43,9 @@ Section = tuple[str, str, str]
 
 def write_report(
     evaluation: Evaluation,
-    path: Path | str,
+    path: Location | str,
     *,
-    videos: Sequence[Path | str] = (),
+    videos: Sequence[Location | str] = (),
     metric: str = SCORE,
 ) -> None:
     """Write the report: scores, pictures, differences, causes, and how to check all of it.
@@ -74,7 +74,7 @@ def write_report(
         *_differences(pairs),
         *_gap(evaluation, metric),
         _causes(evaluation, metric),
-        *_videos(videos, Path(path).parent),
+        *_videos(videos, located(path).parent),
         _numbers(evaluation, scores),
         _about(evaluation),
     ]
@@ -214,17 +214,17 @@ def _left_out(found: dict[str, Causes]) -> str:
 # --- the rest ---------------------------------------------------------------------------------
 
 
-def _videos(videos: Sequence[Path | str], folder: Path) -> list[Section]:
+def _videos(videos: Sequence[Location | str], folder: Location) -> list[Section]:
     links = "".join(
-        f'<li><a href="{escape(quote(_relative(video, folder)))}">{escape(Path(video).name)}</a>'
+        f'<li><a href="{escape(quote(_relative(video, folder)))}">{escape(located(video).name)}</a>'
         "</li>"
         for video in videos
     )
     return [("videos", "Videos", f"<ul>{links}</ul>")] if links else []
 
 
-def _relative(video: Path | str, folder: Path) -> str:
-    return Path(os.path.relpath(Path(video), folder)).as_posix()
+def _relative(video: Location | str, folder: Location) -> str:
+    return posixpath.relpath(str(located(video)), str(folder))
 
 
 def _numbers(evaluation: Evaluation, scores: Scores) -> Section:

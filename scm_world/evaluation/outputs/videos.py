@@ -22,6 +22,7 @@ from scm_world.evaluation.results import DRAWN, KEYS, SCORE, Evaluation
 from scm_world.evaluation.setups import Setup
 from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import write_durably
+from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
 from scm_world.scene.camera import OVERVIEW, Camera
 
@@ -32,7 +33,7 @@ FASTEST = 25.0  # frames per second
 def record_videos(
     given: Setup | Bench,
     evaluation: Evaluation,
-    folder: Path | str,
+    folder: Location | str,
     *,
     agent: str | None = None,
     engine: str | None = None,
@@ -40,7 +41,7 @@ def record_videos(
     which: Sequence[str] = WHICH,
     camera: Camera = OVERVIEW,
     progress: Progress | None = None,
-) -> list[Path]:
+) -> list[Location]:
     """Record the best, the median and the worst episode of an agent on an engine.
 
     They are chosen over all runs and protocols; among equal scores the return decides, and then
@@ -80,7 +81,7 @@ def record_videos(
             )
             film.tell = lambda steps, so_far=done: progress and progress(so_far + steps, total)
             _play(bench, evaluation, place, film)
-            made.append(_keep(Path(folder) / name, film.path))
+            made.append(_keep(located(folder) / name, film.path))
             done += int(evaluation.columns["steps"][place])
     return made
 
@@ -150,7 +151,7 @@ def _play(bench: Bench, evaluation: Evaluation, place: int, film: Film) -> None:
         )
 
 
-def _keep(path: Path, draft: Path) -> Path:
+def _keep(path: Location, draft: Path) -> Location:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         data = draft.read_bytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from typing import Any, final
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scm_world.env import ScmWorldEnv
 from scm_world.env.delta import PREFIX
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.evaluation.policies.players import Actions, Playing
+from scm_world.evaluation.policies.players import Actions, Player, Playing
 from scm_world.world import World
 
 
@@ -48,6 +49,15 @@ class OpenLoop(Playing):
             self._checked(action)
         self._given, self._mode, self._normalized = given, action_mode, normalized
         self._actions, self._step = given, 0
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether its actions depend on nothing but the control step: they do."""
+        return True
+
+    def twin(self) -> Player:
+        """Give another player of the same actions."""
+        return copy(self)
 
     def begin(self, env: ScmWorldEnv) -> None:
         """Begin with the first action.

@@ -9,7 +9,7 @@ import numpy as np
 
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, UnreadableFile
-from scm_world.evaluation.policies.players import About, Actions, Playing
+from scm_world.evaluation.policies.players import About, Actions, Player, Playing
 from scm_world.graph.exchange.libraries import load
 
 TYPES = {
@@ -60,6 +60,15 @@ class ByNetwork(Playing):
     def __reduce__(self) -> Any:
         """Let a copy read the file again."""
         return type(self), (self._path, self._about)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether its actions follow from what it observes: they do."""
+        return True
+
+    def twin(self) -> Player:
+        """Give itself: it remembers nothing."""
+        return self
 
     def begin(self, env: ScmWorldEnv) -> None:
         """Check that the network takes what the environment gives.

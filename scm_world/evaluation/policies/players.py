@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scm_world.env import ScmWorldEnv
 from scm_world.env.delta import MODES, PREFIX
 from scm_world.errors import ActionError, UnknownOption
+from scm_world.evaluation.policies.mlp import MlpPolicy
 from scm_world.queries.policies import Policy
 
 Actions = NDArray[Any]
@@ -134,6 +135,19 @@ class Playing:
         """What the policy is, as plain data."""
         return dict(self._about)
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether its actions are known to follow from what it observed in the episode alone."""
+        return False
+
+    def twin(self) -> Player | None:
+        """Give a player of the same policy for another episode at the same time.
+
+        Returns:
+            None if the policy plays one episode at a time.
+        """
+        return None
+
     def _checked(self, action: Any) -> Actions:
         return checked(action, self._env, self._name)
 
@@ -168,6 +182,10 @@ class ByObservation(Playing):
         self._env = env
         forget(self._policy)
 
+    def twin(self) -> Player | None:
+        """Give another player of the policy, unless that has to be told when an episode begins."""
+        return None if _forgets(self._policy) else ByObservation(self._policy, self._about)
+
     def act(self, observation: Any) -> Actions:
         """Choose an action, shape (9,)."""
         return self._checked(self._policy(observation))
@@ -175,9 +193,16 @@ class ByObservation(Playing):
 
 def forget(policy: Any) -> None:
     """Call the method ``reset`` of a policy, if it has one."""
-    reset = getattr(policy, "reset", None)
-    if callable(reset):
-        reset()
+    if _forgets(policy):
+        policy.reset()
+
+
+def _forgets(policy: Any) -> bool:
+    return callable(getattr(policy, "reset", None))
+
+
+_LIBRARIES = ("stable_baselines3", "sb3_contrib")
+"""Whose models are told what they remember, and keep nothing to themselves."""
 
 
 @final
@@ -198,6 +223,16 @@ class ByPrediction(Playing):
     def begin(self, env: ScmWorldEnv) -> None:
         """Forget the last episode."""
         self._env, self._state, self._first = env, None, True
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is a policy of this package, or a model of Stable-Baselines3 itself."""
+        package = type(self._model).__module__.partition(".")[0]
+        return isinstance(self._model, MlpPolicy) or package in _LIBRARIES
+
+    def twin(self) -> Player:
+        """Give another player of the model; what is remembered is the player's."""
+        return ByPrediction(self._model, self._about)
 
     def act(self, observation: Any) -> Actions:
         """Choose an action, shape (9,)."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any, final
 
 import gymnasium
@@ -13,6 +11,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.env.given import doubles, names_of
 from scm_world.env.observer import Observation
@@ -22,14 +21,18 @@ from scm_world.evaluation.policies.players import inner
 from scm_world.evaluation.recording.environments import environment
 from scm_world.evaluation.recording.episodes import Recorded, summed
 from scm_world.evaluation.recording.recording import Recording
+from scm_world.output.locations import Location
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
+from scm_world.scene import PhysicalState
+from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.world.start import whole_number
 
 INFOS = ("success", "fractional_success")
 ALL = "all"
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
-_NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
+_PLAIN = (bool, int, float)
+_NUMBERS = (*_PLAIN, np.bool_, np.integer, np.floating)
 
 
 @dataclass
@@ -40,7 +43,7 @@ class _Episode:
     number: int
     observations: list[Observation] = field(default_factory=list)
     infos: list[dict[str, Any]] = field(default_factory=list)
-    states: list[int] = field(default_factory=list)
+    states: list[Floats] = field(default_factory=list)
     actions: list[NDArray[Any]] = field(default_factory=list)
     returns: list[tuple[float, bool, bool]] = field(default_factory=list)
     interventions: tuple[tuple[int, Mapping[str, Any]], ...] = ()
@@ -103,14 +106,15 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Raises:
             NotReset: There is no episode.
         """
-        if self._now is None:
+        episode = self._now
+        if episode is None:
             raise NotReset
-        self._look_again(self._now)
+        self._look_again(episode)
         taken = _as_given(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._now.actions.append(taken)
-        self._now.returns.append((float(reward), bool(terminated), bool(truncated)))
-        self._write(self._now, observation, info)
+        episode.actions.append(taken)
+        episode.returns.append((float(reward), bool(terminated), bool(truncated)))
+        self._write(episode, observation, info)
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
@@ -136,14 +140,14 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         episode: _Episode,
         observation: Any,
         info: Mapping[str, Any],
-        before: Mapping[str, Any] = MappingProxyType({}),
+        before: Mapping[str, Any] | None = None,
     ) -> None:
         """Write down an instant; ``before`` is what ``info`` said of it earlier."""
         world = self._inner.world
         self._version = world.version
-        episode.infos.append(self._selected({**before, **dict(_numbers(info))}))
+        episode.infos.append(self._plain(info) or self._selected(info, before or {}))
         episode.observations.append(_copied(observation))
-        episode.states.append(summed(world.current()[1]))
+        episode.states.append(world.current()[1].vector.copy())
         episode.interventions = self._inner.interventions
 
     def _look_again(self, episode: _Episode) -> None:
@@ -153,13 +157,23 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             del episode.observations[-1], episode.states[-1]
             self._write(episode, observation, info, before=episode.infos.pop())
 
-    def _selected(self, info: dict[str, Any]) -> dict[str, Any]:
+    def _plain(self, info: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Pick what is wanted if that is easy: every name stands for a number. Else give None."""
+        found = {}
+        for name in () if self._wanted == ALL else self._wanted:
+            found[name] = value = info.get(name)
+            if type(value) not in _PLAIN:
+                return None
+        return found
+
+    def _selected(self, info: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+        numbers = {**before, **dict(_numbers(info))}
         if self._wanted == ALL:
-            return info
-        missing = [name for name in self._wanted if name not in info]
+            return numbers
+        missing = [name for name in self._wanted if name not in numbers]
         if missing:
-            raise UnknownOption("info", missing[0], info)
-        return {name: info[name] for name in self._wanted}
+            raise UnknownOption("info", missing[0], numbers)
+        return {name: numbers[name] for name in self._wanted}
 
     def _keep(self) -> None:
         made = self._recorded()
@@ -186,7 +200,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             terminations=np.array(ends, dtype=np.bool_),
             truncations=np.array(cuts, dtype=np.bool_),
             infos={name: _column(info[name] for info in episode.infos) for name in names},
-            states=np.array(episode.states, dtype=np.int64),
+            states=np.array(list(map(_sum, episode.states)), dtype=np.int64),
         )
 
 
@@ -199,7 +213,7 @@ def record(
     first: int = 0,
     do: Mapping[str, Any] | None = None,
     infos: Sequence[str] | str = INFOS,
-    out: Path | str | None = None,
+    out: Location | str | None = None,
 ) -> Recording:
     """Let a policy act for some episodes, and record them.
 
@@ -283,3 +297,8 @@ def _copied(observation: Any) -> Observation:
     if isinstance(observation, dict):
         return {name: np.array(part) for name, part in observation.items()}
     return np.array(observation)
+
+
+def _sum(vector: Floats) -> int:
+    """Sum up a state, which costs less after the episode than between two steps."""
+    return summed(PhysicalState((vector.size - ROBOT_SIZE) // BLOCK_SIZE, vector))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -19,6 +18,8 @@ from scm_world.evaluation.recording.minari_datasets import from_dataset, to_data
 from scm_world.evaluation.recording.parquet import decoded, encoded
 from scm_world.evaluation.recording.replaying import first_difference
 from scm_world.output.durable import write_durably
+from scm_world.output.locations import Location, located
+from scm_world.output.remote import said
 from scm_world.tasks import Task
 
 Singles = NDArray[np.float32]
@@ -106,7 +107,7 @@ class Recording:
             env.close()
         return sum(len(self.episodes[number]) for number in numbers)
 
-    def save(self, path: Path | str) -> Path:
+    def save(self, path: Location | str) -> Location:
         """Write a Parquet file, whole or not at all: one row for each instant.
 
         Args:
@@ -117,14 +118,14 @@ class Recording:
             ModelError: Something cannot be written: a function without a name, say.
             UnwritableFolder: There is no such folder, no room, or no permission.
         """
-        target = Path(path)
+        target = located(path)
         if target.suffix != SUFFIX:
             target = target.with_name(target.name + SUFFIX)
         write_durably(target, encoded(self._header(), self.episodes))
         return target
 
     @classmethod
-    def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Recording:
+    def load(cls, path: Location | str, *, trusted: Sequence[str] = ()) -> Recording:
         """Read what ``save`` wrote.
 
         Args:
@@ -137,9 +138,9 @@ class Recording:
             ModelError: A mechanism is a function of no trusted package.
         """
         try:
-            data = Path(path).read_bytes()
+            data = located(path).read_bytes()
         except OSError as error:
-            raise UnreadableFile(str(path), error.strerror or str(error), ADVICE) from None
+            raise UnreadableFile(str(path), said(error), ADVICE) from None
         header, episodes = decoded(data, str(path), trusted)
         return cls(header.environment, tuple(episodes), header.versions, header.policy)
 

@@ -1,0 +1,220 @@
+"""Episodes that are played side by side, on an engine that steps many worlds in one call."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world.env import ScmWorldEnv
+from scm_world.env.batched.inside import Inside
+from scm_world.env.batched.native import NativeCrew
+from scm_world.env.batched.sheet import FLAGS, FRACTION
+from scm_world.evaluation.arena import Arena, Game, Row
+from scm_world.evaluation.policies import Player
+from scm_world.evaluation.policies.players import Actions, Playing
+from scm_world.evaluation.protocols import Protocol
+
+SIDE_BY_SIDE = 13
+"""Episodes at the same time: a shard has two such groups; more are no faster."""
+
+LONG = 0.1
+"""Part of the time from which on asking a policy twice costs more than is gained here."""
+
+Seen = list[tuple[Any, bytes]]
+"""Every observation of an episode, and the action that followed."""
+
+
+@final
+@dataclass(frozen=True)
+class Episodes:
+    """Some episodes in a row.
+
+    Attributes:
+        who: Agent and run.
+        protocol: What is done.
+        seed: Of the noise.
+        numbers: Of the episodes, within the noise.
+    """
+
+    who: tuple[str, int]
+    protocol: Protocol
+    seed: int
+    numbers: range
+
+
+@dataclass
+class _Seat:
+    """One of the episodes that are under way.
+
+    Attributes:
+        game: What is kept of it.
+        place: Agent, run, engine, protocol, seed and episode.
+        seen: What is needed to ask the policy again, if that has to be done.
+        success: Whether the last control step was a success.
+    """
+
+    game: Game
+    place: tuple[str, int, str, str, int, int]
+    seen: Seen | None
+    success: bool = False
+
+    def act(self, shown: Callable[[int], Any], row: int) -> Actions:
+        """Let the player choose an action, shape (9,).
+
+        Args:
+            shown: Gives a copy of the observation of a row.
+            row: Of this episode.
+        """
+        action = self.game.act(shown(row))
+        if self.seen is not None:
+            self.seen.append((shown(row), action.tobytes()))
+        return action
+
+    @property
+    def row(self) -> Row:
+        """What is kept in the end."""
+        return self.game.row(self.place, success=self.success)
+
+
+def _groups(numbers: range, most: int) -> list[range]:
+    """Split some episodes into groups that are about as large.
+
+    Example:
+        >>> _groups(range(25, 50), 13)
+        [range(25, 38), range(38, 50)]
+    """
+    count = -(-len(numbers) // most)
+    size = -(-len(numbers) // count)
+    return [numbers[first : first + size] for first in range(0, len(numbers), size)]
+
+
+@final
+class Lockstep:
+    """Plays episodes of one engine side by side; the rows are, bit for bit, those of ``Arena``.
+
+    Only a policy whose actions follow from what it observed in the same episode can play several
+    of them at once. Where that is not known of a policy, it is asked again: for each episode
+    alone, for the same observations. If it acts in another way, or if asking it takes long, its
+    episodes are played one after another from then on.
+
+    Args:
+        env: One like those that are played in.
+        most: How many episodes there are at the same time, at most.
+        threads: Of the engine; as many as there are cores if None. Results do not depend on it.
+    """
+
+    def __init__(self, env: ScmWorldEnv, most: int, threads: int | None) -> None:
+        self._env, self._most, self._threads = env, min(most, SIDE_BY_SIDE), threads
+        self._crew: NativeCrew | None = None
+        self._arenas: dict[int, Arena] = {}
+        self._apart: list[Player] = []  # who plays one episode at a time
+
+    def play(self, player: Player, episodes: Episodes) -> list[Row] | None:
+        """Play some episodes.
+
+        Args:
+            player: Who acts.
+            episodes: Which ones.
+
+        Returns:
+            A row for each; None if they have to be played one after another. That is so, too,
+            where anything goes wrong: an arena says in which episode.
+        """
+        if not self._takes(player) or len(episodes.numbers) < 2:
+            return None
+        try:
+            return self._played(player, episodes)
+        except Exception:  # whatever it was: it happens again in the arena, which tells the place
+            self.close()
+            return None
+
+    def _takes(self, player: Player) -> bool:
+        world = self._env.world
+        return (
+            world.backend.capabilities.batch
+            and not len(world.family.head)  # else bodies may come and go in some of them
+            and not Inside.of(self._env).is_partial
+            and isinstance(player, Playing)
+            and not any(player is one for one in self._apart)
+            and player.twin() is not None
+        )
+
+    def _played(self, player: Any, episodes: Episodes) -> list[Row] | None:
+        began, asked, rows = time.perf_counter(), 0.0, list[Row]()
+        for group in _groups(episodes.numbers, self._most):
+            seats = self._seats(player, episodes, group)
+            self._go(seats)
+            now = time.perf_counter()
+            if not all(self._acts_alike_alone(player, seat) for seat in seats):
+                self._apart.append(player)
+                return None
+            asked += time.perf_counter() - now
+            rows += [seat.row for seat in seats]
+        if asked > LONG * (time.perf_counter() - began):
+            self._apart.append(player)
+        return rows
+
+    def _seats(self, player: Any, episodes: Episodes, group: range) -> list[_Seat]:
+        """Begin some episodes."""
+        crew = self._ready()
+        engine, seats = self._env.world.backend.name, []
+        for index, number in enumerate(group):
+            with crew.alone(index) as env:
+                arena = self._arenas.setdefault(index, Arena(env))
+                turn, _ = arena.begin(episodes.protocol, seed=episodes.seed, episode=number)
+                game = Game(env, player.twin(), turn)
+            place = (*episodes.who, engine, episodes.protocol.name, episodes.seed, number)
+            seats.append(_Seat(game, place, None if player.is_plain else []))
+        return seats
+
+    def _go(self, seats: list[_Seat]) -> None:
+        """Play episodes that have begun."""
+        crew = self._ready()
+        which = np.arange(crew.num_envs) < len(seats)
+        actions = np.zeros((crew.num_envs, 9))
+        while which.any():
+            rows = np.flatnonzero(which).tolist()
+            for row in rows:
+                actions[row] = seats[row].act(crew.sheet.observation, row)
+            crew.step(which, actions)
+            self._note(seats, rows)
+            which[rows] &= ~crew.sheet.truncations[rows]
+            for row in rows:
+                if which[row] and seats[row].game.is_due:
+                    with crew.alone(row) as env:
+                        seats[row].game.intervene(env)
+                        seats[row].game.mark.look()
+                else:
+                    seats[row].game.mark.look(crew.state(row))
+
+    def _note(self, seats: list[_Seat], rows: list[int]) -> None:
+        """Take down what a control step gave."""
+        sheet = self._ready().sheet
+        rewards, infos = sheet.rewards.tolist(), sheet.infos
+        fractions, successes = infos[FRACTION], infos[FLAGS[0]]
+        for row in rows:
+            seats[row].game.stepped(rewards[row], float(fractions[row]))
+            seats[row].success = bool(successes[row])
+
+    def _acts_alike_alone(self, player: Any, seat: _Seat) -> bool:
+        """Tell whether a policy does what it did, with nobody else to act for."""
+        if seat.seen is None:
+            return True
+        twin = player.twin()
+        twin.begin(self._env)
+        return all(twin.act(observation).tobytes() == action for observation, action in seat.seen)
+
+    def _ready(self) -> NativeCrew:
+        if self._crew is None:
+            self._crew = NativeCrew(self._env.sibling, self._most, threads=self._threads)
+        return self._crew
+
+    def close(self) -> None:
+        """Free the engines."""
+        if self._crew is not None:
+            self._crew.close()
+        self._crew, self._arenas = None, {}

@@ -1,0 +1,191 @@
+"""Jobs on Ray: a cluster, or processes that Ray starts on this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import pickle
+import socket
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from typing import Any, TypeVar, final
+
+from scm_world.errors import EngineFailure, MissingExtra, UnknownOption
+from scm_world.work.executors import RAY, Executor
+from scm_world.work.jobs import Bag
+from scm_world.work.processes import DONE, UNMADE
+from scm_world.work.ray_worker import Luggage, answer, versions
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # nothing is reported to anybody
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # or it warns of a change of its own
+}
+PATIENCE = 10.0  # [s] for the head of a cluster to answer
+ADDRESSES = ("auto", "host:port of the head of a running cluster")
+
+
+def connected(workers: int | None, address: str | None) -> RayEngine:
+    """Connect to a cluster, or start one of this machine alone.
+
+    Where this process is connected already, that connection is used, and left open.
+
+    Args:
+        workers: How many jobs are done at the same time; as many as there are cores if None.
+        address: Of the cluster; None to start one.
+
+    Raises:
+        MissingExtra: Ray is not installed.
+        UnknownOption: The address is none.
+        EngineFailure: There is no cluster that one can work with.
+    """
+    for name, value in QUIET.items():
+        os.environ.setdefault(name, value)
+    try:
+        ray = import_module("ray")
+    except ImportError as error:
+        raise MissingExtra("ray", "ray") from error
+    if ray.is_initialized():
+        _check_same(ray, address)
+        return RayEngine(ray, workers, is_mine=False)
+    _check_answers(address)
+    how: dict[str, Any] = {"address": address}
+    if address is None:
+        how = {"address": "local", "num_cpus": workers, "include_dashboard": False}
+    try:
+        ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, RuntimeError, ValueError) as error:
+        where = "on this machine" if address is None else f"at {address}"
+        raise EngineFailure(f"there is no Ray {where}: {error}", RAY) from None
+    return RayEngine(ray, workers, is_mine=True)
+
+
+def _check_answers(address: str | None) -> None:
+    """Refuse an address at which nobody is; Ray would wait for somebody for long."""
+    if address in (None, "auto"):
+        return
+    host, _, port = str(address).rpartition(":")
+    if not host or not port.isdecimal():
+        raise UnknownOption("address", address, ADDRESSES)
+    try:
+        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
+    except (OSError, OverflowError) as error:
+        raise EngineFailure(f"there is no Ray at {address}: {error}", RAY) from None
+
+
+def _check_same(ray: Any, address: str | None) -> None:
+    there = ray.get_runtime_context().gcs_address
+    if address not in (None, "auto", there):
+        raise UnknownOption("address", address, (f"{there}, where this process is connected",))
+
+
+@final
+class RayEngine(Executor):
+    """Does jobs as tasks of Ray, one core each; a worker or a node that is lost is replaced.
+
+    Tasks are not tried again by Ray but from here, so that a job that kills its workers is put
+    aside after as many tries as anywhere else.
+
+    Args:
+        ray: The package, connected.
+        workers: How many jobs are done at the same time; as many as there are cores if None.
+        is_mine: Whether the connection ends with this executor.
+    """
+
+    engine = RAY
+
+    def __init__(self, ray: Any, workers: int | None, *, is_mine: bool) -> None:
+        self._ray, self._is_mine = ray, is_mine
+        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self._task = ray.remote(num_cpus=1, max_retries=0)(answer)
+        self._run: object = None
+
+    @property
+    def where(self) -> str:
+        """Where the work is done, in words."""
+        nodes = sum(node["Alive"] for node in self._ray.nodes())
+        address = self._ray.get_runtime_context().gcs_address
+        workers = f"{self.workers} worker{'s' * (self.workers > 1)}"
+        return f"on Ray at {address}, {workers} on {nodes} node{'s' * (nodes > 1)}"
+
+    def check(self, what: str, thing: object) -> None:
+        """Check that something can be pickled; what the main module defines can be, too."""
+        self._pickled(what, thing)
+
+    def _pickled(self, what: str, thing: object) -> bytes:
+        try:
+            return bytes(self._ray.cloudpickle.dumps(thing))
+        except Exception as error:
+            allowed = ("a function or class, functools.partial of one, or plain data",)
+            raise UnknownOption(what, thing, allowed) from error
+
+    def run(
+        self, make: Callable[[], Callable[[Job], Result]], jobs: Sequence[Job]
+    ) -> Iterator[tuple[int, Result]]:
+        """Do jobs; see ``Executor.run``."""
+        made = self._pickled("make", make)
+        given = [self._pickled(f"job {number}", (job,)) for number, job in enumerate(jobs)]
+        return self._results(made, given, Bag(jobs, RAY))
+
+    def _results(self, made: bytes, given: list[bytes], bag: Bag[Job]) -> Iterator[tuple[int, Any]]:
+        if self._run is not None:
+            raise EngineFailure("it is at work; read all results of it first", RAY)
+        mine = self._run = object()
+        key = hashlib.sha256(made).hexdigest()
+        luggage = self._ray.put(Luggage(key, made, tuple(sys.path), os.getcwd(), versions()))
+        flying: dict[Any, int] = {}
+        try:
+            while bag.waiting or flying:
+                self._hand_out(bag, flying, given, luggage)
+                (ref,), _ = self._ray.wait(list(flying), num_returns=1)
+                answered = self._answer(ref, flying.pop(ref), bag)
+                self._hand_out(bag, flying, given, luggage)
+                yield from answered
+                if self._run is not mine:
+                    raise EngineFailure("it was closed before its work was done", RAY)
+        finally:
+            if self._run is mine:
+                self._run = None
+                for ref in flying:
+                    self._ray.cancel(ref, force=True)
+        bag.settle()
+
+    def _hand_out(
+        self, bag: Bag[Job], flying: dict[Any, int], given: list[bytes], luggage: Any
+    ) -> None:
+        """Have as many jobs done as there are workers."""
+        while bag.waiting and len(flying) < self.workers:
+            number = bag.waiting.popleft()
+            flying[self._task.remote(luggage, given[number])] = number
+
+    def _answer(self, ref: Any, number: int, bag: Bag[Job]) -> tuple[tuple[int, Any], ...]:
+        """Take a result; none if the job failed, or its worker or node was lost."""
+        known = self._ray.exceptions
+        try:
+            said = self._ray.get(ref)
+        except (known.RayTaskError, known.RuntimeEnvSetupError) as error:
+            raise EngineFailure(f"a worker of Ray cannot work: {error}", RAY) from None
+        except known.RayError as lost:
+            bag.put_back(number, lost)
+            return ()
+        how, result = pickle.loads(said)  # noqa: S301 # written by our own worker
+        if how == DONE:
+            return ((number, result),)
+        if how == UNMADE:
+            raise result
+        bag.put_aside(number, result)
+        return ()
+
+    def close(self) -> None:
+        """End the work; Ray, too, if it was started here, and else the connection to it."""
+        self._run = None
+        if self._is_mine and self._ray.is_initialized():
+            with warnings.catch_warnings():
+                # It leaves processes to the system that it has told to end.
+                warnings.simplefilter("ignore", ResourceWarning)
+                self._ray.shutdown()

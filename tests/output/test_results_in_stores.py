@@ -1,0 +1,202 @@
+"""Results in stores: the same bytes as in a folder, also after interruptions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stores import everything, fresh
+
+from scm_world.discovery import discover
+from scm_world.discovery.data import Dataset, Design, collect, load, save
+from scm_world.discovery.exam.results import Exam
+from scm_world.discovery.exam.study import Study, examine
+from scm_world.discovery.run import Checkpoint
+from scm_world.errors import UnreadableFile, UnwritableFolder
+from scm_world.evaluation import Evaluation, evaluate
+from scm_world.evaluation.files import merge
+from scm_world.evaluation.recording.recording import Recording
+from scm_world.evaluation.reporting import write_outputs
+from scm_world.output.remote import Remote
+from scm_world.queries import World
+
+HOW: dict[str, Any] = {"n": 60, "backend": "fake", "env": {"max_episode_length": 3}}
+DESIGN = Design("half", ("tool_block.mass", "floor_friction", "gravity"), seen=0.3)
+WHERE = ("memory", "shelf")
+"""A store of objects, and one in which files are moved to their place."""
+
+
+def below(folder: Path) -> dict[str, bytes]:
+    """Read all files below a folder of this machine."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def stop_at(number: int) -> Any:
+    """Interrupt once so many are done."""
+
+    def told(done: int, _: int) -> None:
+        if done >= number:
+            raise KeyboardInterrupt
+
+    return told
+
+
+def evaluated(out: Path | str, *, drawn: bool = False, **more: Any) -> Evaluation:
+    """Evaluate, and write the results; plots and report take longer."""
+    found = evaluate({"one": "still", "other": "random"}, "P0,P5", out=out, **HOW, **more)
+    found.save(out, kind="csv")
+    if drawn:
+        write_outputs(found, out)
+    return found
+
+
+def collected(out: Path | str, n: int = 10, **more: Any) -> Dataset:
+    """Collect some episodes, four in a file."""
+    world = World("pushing", backend="fake")
+    options: dict[str, Any] = {"steps": 2, "seed": 5, "shard": 4, "format": "csv"}
+    return collect(world, DESIGN, n, out=out, **options, **more)
+
+
+# --- the same bytes -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("protocol", WHERE)
+def test_an_evaluation_is_the_same_in_a_store(protocol: str, tmp_path: Path) -> None:
+    """Interrupted, gone on with, and saved: every file is that of a folder, and is read back."""
+    drawn = protocol == WHERE[0]
+    local, folder = evaluated(tmp_path, drawn=drawn), fresh(protocol)
+    with pytest.raises(KeyboardInterrupt):
+        evaluated(str(folder), progress=stop_at(100))
+    safe = everything(folder)
+    assert 0 < len(safe) < len(below(tmp_path / "parts"))
+    assert evaluated(str(folder), drawn=drawn) == local
+    assert everything(folder) == below(tmp_path)
+    assert Evaluation.load(str(folder)) == Evaluation.load(f"{folder}/results.json") == local
+    assert merge([Evaluation.load(str(folder)), Evaluation.load(f"file://{tmp_path}")]) == local
+
+
+@pytest.mark.parametrize("protocol", WHERE)
+def test_a_dataset_is_the_same_in_a_store(protocol: str, tmp_path: Path) -> None:
+    """Interrupted, gone on with, and made larger: every file is that of a folder."""
+    local, folder = collected(tmp_path / "local"), fresh(protocol)
+    with pytest.raises(KeyboardInterrupt):
+        collected(str(folder), progress=stop_at(6))
+    assert "shard-00001.csv" not in everything(folder)
+    assert len(load(str(folder), partial=True)) == 4
+    assert collected(str(folder)) == local == load(str(folder))
+    assert everything(folder) == below(tmp_path / "local")
+    collected(tmp_path / "local", 13)
+    collected(str(folder), 13)
+    assert everything(folder) == below(tmp_path / "local")
+
+
+def test_a_url_of_this_machine_is_a_folder(tmp_path: Path) -> None:
+    """The same files are in it, with the same lock."""
+    collected(tmp_path / "path")
+    collected(f"file://{tmp_path}/url")
+    assert below(tmp_path / "url") == below(tmp_path / "path")
+
+
+def test_a_saved_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
+    """And a second one beside it is refused."""
+    table, folder = collected(tmp_path / "whole"), fresh()
+    save(table, tmp_path / "saved", format="csv")
+    assert str(save(table, str(folder), format="csv")) == str(folder)
+    assert everything(folder) == below(tmp_path / "saved")
+    with pytest.raises(UnreadableFile, match=r"memory://.* another dataset"):
+        save(table.first(3), str(folder), format="csv")
+
+
+def test_an_exam_goes_on_from_a_store() -> None:
+    """Run once, it is only read the second time; tables, pictures and report are there."""
+    study = Study(("er2:4",), ("do_order",), budgets=(40, 80), seeds=1, standardised=False)
+    folder = fresh()
+    done = examine(study, str(folder))
+    first = everything(folder)
+    again = examine(study, str(folder))
+    assert [cell.as_dict() for cell in again.ordered] == [cell.as_dict() for cell in done.ordered]
+    assert everything(folder) == first
+    assert sum(name.startswith("cells/") for name in first) == 2
+    names = {"budget.png", "exam.json", "report.html", "results.csv", "results.md", "study.json"}
+    assert {name for name in first if "/" not in name} == names
+    assert Exam.from_dict(json.loads(first["exam.json"])).subjects.keys() == {"er2:4"}
+    with pytest.raises(UnreadableFile, match="another exam: seeds"):
+        examine(Study(("er2:4",), ("do_order",), budgets=(40, 80), seeds=2), str(folder))
+
+
+def test_a_discovery_goes_on_from_a_store() -> None:
+    """What is found is the same, and nothing is left in the end."""
+    file = fresh() / "progress.json"
+    whole = discover("reaching", probes=2, backend="fake")
+    world = World("reaching", backend="fake")
+    discover(world, probes=1, checkpoint=str(file))
+    assert not file.exists()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpoint, "end", lambda _: None)
+        discover(world, probes=1, checkpoint=file)
+    assert file.exists()
+    assert set(discover(world, probes=2, checkpoint=file).found) == set(whole.found)
+    assert not file.exists()
+
+
+def test_a_recording_is_read_from_a_store() -> None:
+    """It is a file like any other."""
+    pytest.importorskip("pyarrow")
+    import gymnasium
+
+    from scm_world.evaluation.recording.recorder import record
+
+    env = gymnasium.make("scm_world/Reaching-v0", backend="fake", max_episode_length=3)
+    file = fresh() / "episodes.parquet"
+    made = record("random", env, 2, out=str(file))
+    env.close()
+    assert len(Recording.load(str(file))) == len(made) == 2
+
+
+# --- faults ---------------------------------------------------------------------------------------
+
+
+def spoil(folder: Remote, pattern: str) -> str:
+    """Cut the end of a file off; give its name."""
+    file = next(folder.glob(pattern))
+    file.put(file.read_bytes()[:-9])
+    return file.name
+
+
+def test_damaged_objects_are_named() -> None:
+    """The error says which, and what to do; nothing else is touched."""
+    folder, data = fresh(), fresh()
+    evaluated(str(folder))
+    part = spoil(folder, "parts/*.json")
+    with pytest.raises(UnreadableFile, match=rf"memory://.*{part}.*damaged.*delete this file"):
+        evaluated(str(folder))
+    spoil(folder, "results.json")
+    with pytest.raises(UnreadableFile, match=r"memory://.*results\.json"):
+        Evaluation.load(str(folder))
+    collected(str(data))
+    shard = spoil(data, "shard-00001.csv")
+    with pytest.raises(UnreadableFile, match=rf"{shard}.*delete it, and collect again"):
+        load(str(data))
+    (data / shard).unlink()
+    assert collected(str(data)) == load(str(data))
+
+
+def test_nothing_is_done_where_nobody_may_write() -> None:
+    """The error comes before the first episode."""
+    told: list[int] = []
+    for do in (evaluated, collected):
+        with pytest.raises(UnwritableFolder, match=r"closed://.*Access Denied"):
+            do(str(fresh("closed")), progress=lambda done, _: told.append(done))
+    assert not any(told)
+
+
+def test_there_is_nothing_to_read() -> None:
+    """The error names the URL."""
+    with pytest.raises(UnreadableFile, match=r"memory://.*cannot be read"):
+        Evaluation.load(str(fresh()))
+    with pytest.raises(UnreadableFile, match=r"memory://.*dataset\.json"):
+        load(str(fresh()))

@@ -1,0 +1,131 @@
+"""Many worlds for Stable-Baselines3."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import scm_world  # noqa: F401 # registers the environments
+from scm_world.errors import UnknownOption
+from scm_world.training.sb3 import make_sb3, sb3_vec_env
+
+sb3 = pytest.importorskip("stable_baselines3")
+PUSHING = "scm_world/Pushing-v0"
+GOALS: dict[str, Any] = {"goal_env": True, "task_options": {"weights": "sparse"}}
+
+
+def both(n: int = 4, **options: Any) -> tuple[Any, Any]:
+    """Make many worlds, and Stable-Baselines3's own kind of as many."""
+    crew = options.pop("crew", "loop")
+    options = {"backend": "fake", "max_episode_length": 5, **options}
+    mine = make_sb3(PUSHING, n, infos=None, crew=crew, **options)
+    make = [lambda: gymnasium.make(PUSHING, **options)] * n
+    return mine, sb3.common.vec_env.DummyVecEnv(make)
+
+
+def check_equal(mine: Any, other: Any) -> None:
+    """Assert that two things are equal, all the way down."""
+    if isinstance(mine, dict):
+        assert mine.keys() == other.keys()
+        for name in mine:
+            check_equal(mine[name], other[name])
+    elif isinstance(mine, list | tuple):
+        for one, two in zip(mine, other, strict=True):
+            check_equal(one, two)
+    else:
+        np.testing.assert_array_equal(mine, other)
+        assert np.asarray(mine).dtype == np.asarray(other).dtype
+
+
+@pytest.mark.parametrize("crew", ["loop", "processes"])
+@pytest.mark.parametrize("options", [{}, GOALS], ids=["vector", "goals"])
+def test_it_says_what_its_own_kind_says(options: dict[str, Any], crew: str) -> None:
+    """Observations, rewards, flags and infos, over the ends of episodes, value by value."""
+    mine, other = both(crew=crew, **options)
+    assert isinstance(mine, sb3.common.vec_env.VecEnv)
+    assert mine.observation_space == other.observation_space
+    assert mine.action_space == other.action_space
+    assert mine.seed(3) == other.seed(3)
+    wishes: list[Any] = [{"do": {"floor_friction": 0.4}}, {}, {"episode": 3}, {}]
+    for envs in (mine, other):
+        envs.set_options(wishes)
+    for _ in range(2):
+        check_equal(mine.reset(), other.reset())
+        check_equal(mine.reset_infos, other.reset_infos)
+        for action in np.random.default_rng(0).uniform(-1, 1, (12, 4, 9)).astype(np.float32):
+            check_equal(mine.step(action), other.step(action))
+            check_equal(mine.reset_infos, other.reset_infos)
+        for envs in (mine, other):
+            envs.seed(8)
+    mine.close()
+
+
+def test_worlds_can_be_asked_one_by_one() -> None:
+    """Attributes and methods of some of them."""
+    mine, other = both(**GOALS)
+    mine.seed(0)
+    shown = mine.reset()
+    assert mine.get_attr("action_mode", 1) == other.get_attr("action_mode", 1)
+    assert mine.has_attr("compute_reward")
+    assert not mine.has_attr("no_such_name")
+    goals = shown["achieved_goal"], shown["desired_goal"]
+    found = mine.env_method("compute_reward", *goals, [{}] * 4, indices=[0])
+    check_equal(found, other.env_method("compute_reward", *goals, [{}] * 4, indices=[0]))
+    mine.set_attr("remark", "some", indices=[1, 3])
+    assert mine.get_attr("remark", [3, -3]) == ["some", "some"]
+    assert mine.env_is_wrapped(gymnasium.Wrapper) == [False] * 4
+    mine.envs.do({2: {"floor_friction": 0.3}})
+    assert [len(done) for done in mine.get_attr("interventions")] == [0, 0, 1, 0]
+
+
+def test_pictures_are_put_side_by_side() -> None:
+    """``render`` tiles them, as with its own kind."""
+    mine, other = both(2, render_mode="rgb_array")
+    for envs in (mine, other):
+        envs.seed(0)
+        envs.reset()
+    check_equal(mine.render(), other.render())
+
+
+def test_infos_are_as_short_as_they_may_be() -> None:
+    """Only what is asked for is told at every step; what ends an episode always is."""
+    envs = make_sb3(PUSHING, 2, backend="fake", crew="loop", max_episode_length=2)
+    envs.reset()
+    still = np.zeros((2, 9), np.float32)
+    *_, told = envs.step(still)
+    assert told == [{"is_success": False, "TimeLimit.truncated": False}] * 2
+    *_, told = envs.step(still)
+    assert told[0].keys() == {"is_success", "TimeLimit.truncated", "terminal_observation"}
+    more = sb3_vec_env(envs.envs, infos=("fractional_success", "reward_terms"))
+    more.reset()
+    *_, told = more.step(still)
+    assert told[0].keys() == {"fractional_success", "reward_terms", "TimeLimit.truncated"}
+
+
+def test_what_it_cannot_adapt_is_refused() -> None:
+    """Another autoreset mode, worlds of another kind, and infos that nobody tells."""
+    with pytest.raises(UnknownOption, match="SameStep"):
+        sb3_vec_env(gymnasium.make_vec(PUSHING, 2, backend="fake"))
+    how = {"autoreset_mode": "SameStep"}
+    with pytest.raises(UnknownOption, match="make_vec"):
+        sb3_vec_env(gymnasium.make_vec("CartPole-v1", 2, vector_kwargs=how))
+    with pytest.raises(UnknownOption, match="is_success"):
+        make_sb3(PUSHING, 2, infos=["success_rate"], backend="fake")
+
+
+def test_it_learns_and_counts_episodes() -> None:
+    """PPO with its own statistics, and SAC with hindsight."""
+    options: dict[str, Any] = {"backend": "fake", "crew": "loop", "max_episode_length": 8}
+    envs = sb3.common.vec_env.VecMonitor(make_sb3(PUSHING, 4, **options))
+    model = sb3.PPO("MlpPolicy", envs, n_steps=16, batch_size=32, n_epochs=1, seed=0)
+    model.learn(128)
+    assert len(model.ep_info_buffer) == len(model.ep_success_buffer) == 16
+    assert {info["l"] for info in model.ep_info_buffer} == {8}
+    envs = make_sb3(PUSHING, 4, **options, **GOALS)
+    replay = sb3.HerReplayBuffer
+    sac = sb3.SAC("MultiInputPolicy", envs, replay_buffer_class=replay, learning_starts=40, seed=0)
+    sac.learn(56)
+    assert sac.replay_buffer.size() == 14
