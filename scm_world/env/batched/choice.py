@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 from collections.abc import Callable
 
@@ -10,7 +11,7 @@ from scm_world.env.batched.loop import LoopCrew
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import UnknownOption
 
-CREWS = ("loop", "processes")
+CREWS = ("native", "processes", "loop")
 
 
 def made_crew(
@@ -45,12 +46,21 @@ def made_crew(
         from scm_world.env.batched.processes import ProcessCrew
 
         return ProcessCrew(make, num_envs, workers=workers)
+    if kind == "native":
+        from scm_world.env.batched.native import NativeCrew
+
+        return NativeCrew(make, num_envs, threads=threads)
     return LoopCrew(make, num_envs)
 
 
 def fastest(backend: str, num_envs: int, *, workers: int | None) -> str:
-    """Name the crew that is fastest, which is the one with processes if their number is asked."""
-    several = num_envs > 1 and cores() > 1
+    """Name the crew that is fastest, which is the one with processes if their number is asked.
+
+    A process of a pool starts none of its own.
+    """
+    if backend == "mujoco" and workers is None:
+        return "native"
+    several = num_envs > 1 and cores() > 1 and not multiprocessing.current_process().daemon
     return "processes" if workers is not None or (backend == "bullet" and several) else "loop"
 
 

@@ -1,0 +1,179 @@
+"""Environments that the engine steps together are, bit for bit, environments that take turns."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.env import ScmWorldEnv
+from scm_world.env.batched.loop import LoopCrew
+from scm_world.env.batched.native import NativeCrew
+from scm_world.errors import ActionError, InterventionError, ModelError
+from scm_world.tasks import Pushing
+from scm_world.tasks.rewards import term
+
+COUNT = 4
+EVERYONE = np.ones(COUNT, dtype=np.bool_)
+
+OPTIONS: list[dict[str, Any]] = [
+    {},
+    {"action_mode": "joint_torques"},
+    {"action_mode": "end_effector_positions"},
+    {"action_mode": "delta_joint_positions"},
+    {"action_mode": "delta_joint_torques"},
+    {"action_mode": "delta_end_effector_positions"},
+    {"goal_env": True},
+    {"context": "privileged"},
+    {"context": "observation"},
+    {"observation_mode": "full"},
+    {"keypoints": True},
+    {"observation_mode": "pixel", "image_size": 12, "cameras": ["60"]},
+    {"info_contacts": True, "info_state": True},
+    {"conventions": "causal_world"},
+    {"normalize_actions": False, "normalize_observations": False},
+    {"task": "stacking2"},
+    {"task": "reaching"},
+    {"task": "general", "task_options": {}},
+    {"backend": "bullet"},
+]
+
+
+def crews(threads: int = 2, count: int = COUNT, **options: Any) -> tuple[LoopCrew, NativeCrew]:
+    """Make both kinds, at the beginning of the same episodes."""
+    make = partial(ScmWorldEnv, **options)
+    loop, native = LoopCrew(make, count), NativeCrew(make, count, threads=threads)
+    first = {"do": {"floor_friction": 0.5}}
+    for crew in (loop, native):
+        given = [first, *[None] * (count - 1)]
+        crew.reset(np.ones(count, dtype=np.bool_), range(3, 3 + count), given)
+    return loop, native
+
+
+def same(one: Any, other: Any, where: str) -> None:
+    """Compare what two crews say, with every bit and type."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys(), where
+        for name in one:
+            same(one[name], other[name], f"{where}, {name}")
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other), where
+        for mine, its in zip(one, other, strict=True):
+            same(mine, its, where)
+    else:
+        np.testing.assert_array_equal(one, other, err_msg=where)
+        assert getattr(one, "dtype", None) == getattr(other, "dtype", None), where
+
+
+def compare(loop: LoopCrew, native: NativeCrew, where: str) -> None:
+    """Compare their sheets."""
+    for field in (
+        "observations",
+        "rewards",
+        "terminations",
+        "truncations",
+        "infos",
+        "extras",
+    ):
+        same(getattr(loop.sheet, field), getattr(native.sheet, field), f"{where}: {field}")
+
+
+def actions(crew: Any, steps: int) -> Any:
+    """Draw actions from the whole space, shape (steps, n, 9)."""
+    space: Any = crew.form.action_space
+    generator = np.random.default_rng(0)
+    bounds = np.clip(space.low, -1e3, 1e3), np.clip(space.high, -1e3, 1e3)
+    drawn = generator.uniform(*bounds, (steps, crew.num_envs, 9))
+    return drawn.astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_every_kind_of_environment(options: dict[str, Any]) -> None:
+    """Whatever is observed and however it is commanded, a native crew says the same."""
+    loop, native = crews(**options)
+    compare(loop, native, "reset")
+    for step, asked in enumerate(actions(loop, 6)):
+        which = EVERYONE.copy()
+        which[1] = step != 4
+        for crew in (loop, native):
+            crew.step(which, asked)
+        compare(loop, native, f"step {step}")
+    loop.close()
+    native.close()
+
+
+def test_everything_that_can_be_done_to_one() -> None:
+    """Interventions, resets and branches of single environments leave all others alone."""
+    loop, native = crews(action_mode="delta_joint_positions", max_episode_length=9)
+    joints = [0.0, 0.9, -1.7] * 3
+    meddling = {
+        2: lambda crew: crew.do({0: {"gravity": [0, 0, -8.0]}, 2: {"joint_positions": joints}}),
+        4: lambda crew: crew.restore({1: crew.snapshot([0])[0]}),
+        5: lambda crew: crew.reset(np.arange(COUNT) == 1, [None] * COUNT, [None] * COUNT),
+        6: lambda crew: crew.do({0: {"sensor_noise": 0.05}, 1: {"actuator_noise": 0.1}}),
+        8: lambda crew: crew.call([3], "do", {"tool_block.mass": 0.05}),
+    }
+    for step, asked in enumerate(actions(loop, 11)):
+        for crew in (loop, native):
+            crew.step(EVERYONE, asked)
+            meddling.get(step, lambda _: None)(crew)
+        compare(loop, native, f"step {step}")
+    same(
+        loop.call(range(COUNT), "interventions"),
+        native.call(range(COUNT), "interventions"),
+        "interventions",
+    )
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+@pytest.mark.parametrize("count", [1, 2, 7, 64])
+def test_numbers_of_environments_and_threads(count: int, threads: int) -> None:
+    """What the first environment does depends on neither number."""
+    alone, _ = crews(count=1)
+    _, native = crews(count=count, threads=threads)
+    for asked in actions(native, 4):
+        alone.step(np.ones(1, dtype=np.bool_), asked)
+        native.step(np.ones(count, dtype=np.bool_), asked)
+        np.testing.assert_array_equal(native.sheet.observations[0], alone.sheet.observations[0])
+        assert native.sheet.rewards[0] == alone.sheet.rewards[0]
+
+
+def test_a_refused_intervention_changes_nothing() -> None:
+    """If one of them refuses, all are as they were, in the sheet and in the world."""
+    loop, native = crews()
+    first, second, *_ = actions(loop, 3)
+    for crew in (loop, native):
+        crew.step(EVERYONE, first)
+    with pytest.raises(InterventionError, match="environment 2"):
+        native.do({0: {"floor_friction": 0.7}, 2: {"tool_block.mass": -1.0}})
+    compare(loop, native, "after the refusal")
+    for crew in (loop, native):
+        crew.step(EVERYONE, second)
+    compare(loop, native, "a step later")
+
+
+def test_errors_name_the_environment() -> None:
+    """An action that is no number is refused before anything moves, with the index."""
+    loop, native = crews()
+    asked = actions(loop, 1)[0]
+    asked[2, 3] = np.nan
+    with pytest.raises(ActionError, match="environment 2"):
+        native.step(EVERYONE, asked)
+    compare(loop, native, "after the refusal")
+
+
+def test_a_reward_that_is_no_number() -> None:
+    """A term that fails in one environment says so as it does in a single one."""
+    own = term("reward.own", _late, ("control_index",), "Of mine.")
+    task = Pushing(terms=[own], weights={"reward.own": 1.0})
+    _, native = crews(task=task)
+    asked = actions(native, 3)
+    native.step(EVERYONE, asked[0])
+    with pytest.raises(ModelError, match=r"(?s)environment 0.*reward\.own"):
+        native.step(EVERYONE, asked[1])
+
+
+def _late(index: Any) -> float:
+    return float("nan") if int(index) == 2 else 0.0
