@@ -104,7 +104,9 @@ def requests(case: Case, env: ScmWorldEnv, turn: int) -> dict[str, Callable[[], 
 def making(settings: Settings) -> dict[str, Any]:
     """Time construction and first reset in fresh processes, and a second time in each [ms]."""
     return {
-        engine: {case.name: made(case, engine, settings.rounds(3)) for case in cases(settings)}
+        engine: {
+            case.name: made(case, engine, 1 if settings.quick else 3) for case in cases(settings)
+        }
         for engine in ENGINES
     }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from numba import njit
@@ -82,7 +82,8 @@ def tips(joint_positions: Floats, robot_height: Value) -> Floats:
     return found
 
 
-tips.into = tips_into  # a loop that keeps the array calls this instead
+_tips: Any = tips
+_tips.into = tips_into  # a loop that keeps the array calls this instead
 
 
 @final

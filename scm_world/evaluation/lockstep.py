@@ -18,9 +18,6 @@ from scm_world.evaluation.policies import Player
 from scm_world.evaluation.policies.players import Actions, Playing
 from scm_world.evaluation.protocols import Protocol
 
-SIDE_BY_SIDE = 13
-"""Episodes at the same time: a shard has two such groups; more are no faster."""
-
 LONG = 0.1
 """Part of the time from which on asking a policy twice costs more than is gained here."""
 
@@ -80,18 +77,6 @@ class _Seat:
         return self.game.row(self.place, success=self.success)
 
 
-def _groups(numbers: range, most: int) -> list[range]:
-    """Split some episodes into groups that are about as large.
-
-    Example:
-        >>> _groups(range(25, 50), 13)
-        [range(25, 38), range(38, 50)]
-    """
-    count = -(-len(numbers) // most)
-    size = -(-len(numbers) // count)
-    return [numbers[first : first + size] for first in range(0, len(numbers), size)]
-
-
 @final
 class Lockstep:
     """Plays episodes of one engine side by side; the rows are, bit for bit, those of ``Arena``.
@@ -99,16 +84,17 @@ class Lockstep:
     Only a policy whose actions follow from what it observed in the same episode can play several
     of them at once. Where that is not known of a policy, it is asked again: for each episode
     alone, for the same observations. If it acts in another way, or if asking it takes long, its
-    episodes are played one after another from then on.
+    episodes are played one after another from then on. With one thread all of them are: many
+    worlds at once do not fit into its cache, and that costs as much as is gained.
 
     Args:
         env: One like those that are played in.
         most: How many episodes there are at the same time, at most.
-        threads: Of the engine; as many as there are cores if None. Results do not depend on it.
+        threads: Of the engine.
     """
 
-    def __init__(self, env: ScmWorldEnv, most: int, threads: int | None) -> None:
-        self._env, self._most, self._threads = env, min(most, SIDE_BY_SIDE), threads
+    def __init__(self, env: ScmWorldEnv, most: int, threads: int) -> None:
+        self._env, self._most, self._threads = env, most, threads
         self._crew: NativeCrew | None = None
         self._arenas: dict[int, Arena] = {}
         self._apart: list[Player] = []  # who plays one episode at a time
@@ -124,7 +110,7 @@ class Lockstep:
             A row for each; None if they have to be played one after another. That is so, too,
             where anything goes wrong: an arena says in which episode.
         """
-        if not self._takes(player) or len(episodes.numbers) < 2:
+        if not self._takes(player) or not 1 < len(episodes.numbers) <= self._most:
             return None
         try:
             return self._played(player, episodes)
@@ -135,7 +121,8 @@ class Lockstep:
     def _takes(self, player: Player) -> bool:
         world = self._env.world
         return (
-            world.backend.capabilities.batch
+            self._threads > 1
+            and world.backend.capabilities.batch
             and not len(world.family.head)  # else bodies may come and go in some of them
             and not Inside.of(self._env).is_partial
             and isinstance(player, Playing)
@@ -144,25 +131,21 @@ class Lockstep:
         )
 
     def _played(self, player: Any, episodes: Episodes) -> list[Row] | None:
-        began, asked, rows = time.perf_counter(), 0.0, list[Row]()
-        for group in _groups(episodes.numbers, self._most):
-            seats = self._seats(player, episodes, group)
-            self._go(seats)
-            now = time.perf_counter()
-            if not all(self._acts_alike_alone(player, seat) for seat in seats):
-                self._apart.append(player)
-                return None
-            asked += time.perf_counter() - now
-            rows += [seat.row for seat in seats]
-        if asked > LONG * (time.perf_counter() - began):
+        began = time.perf_counter()
+        seats = self._seats(player, episodes)
+        self._go(seats)
+        played = time.perf_counter()
+        is_alike = all(self._acts_alike_alone(player, seat) for seat in seats)
+        now = time.perf_counter()
+        if not is_alike or now - played > LONG * (now - began):
             self._apart.append(player)
-        return rows
+        return [seat.row for seat in seats] if is_alike else None
 
-    def _seats(self, player: Any, episodes: Episodes, group: range) -> list[_Seat]:
+    def _seats(self, player: Any, episodes: Episodes) -> list[_Seat]:
         """Begin some episodes."""
         crew = self._ready()
         engine, seats = self._env.world.backend.name, []
-        for index, number in enumerate(group):
+        for index, number in enumerate(episodes.numbers):
             with crew.alone(index) as env:
                 arena = self._arenas.setdefault(index, Arena(env))
                 turn, _ = arena.begin(episodes.protocol, seed=episodes.seed, episode=number)

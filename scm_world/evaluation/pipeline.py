@@ -20,6 +20,7 @@ from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.work.executors import Executor, Serial, opened
+from scm_world.world.batch import cores
 
 
 @final
@@ -30,13 +31,12 @@ class Bench:
     Attributes:
         setup: Of the evaluation.
         trusted: Packages whose functions may be policies.
-        threads: Of an engine that steps many worlds in one call; as many as there are cores if
-            None. Results do not depend on it.
+        threads: Of an engine that steps many worlds in one call; results do not depend on it.
     """
 
     setup: Setup
     trusted: Sequence[str] | None = None
-    threads: int | None = 1
+    threads: int = 1
     arenas: dict[str, Arena] = field(default_factory=dict)
     locksteps: dict[str, Lockstep] = field(default_factory=dict)
     players: dict[int, Player] = field(default_factory=dict)
@@ -82,8 +82,10 @@ class Bench:
 
     def close(self) -> None:
         """Free the engines."""
-        for place in (*self.locksteps.values(), *self.arenas.values()):
-            place.close()
+        for lockstep in self.locksteps.values():
+            lockstep.close()
+        for arena in self.arenas.values():
+            arena.close()
         self.locksteps.clear()
         self.arenas.clear()
 
@@ -197,7 +199,7 @@ def played(
     with opened(executor) as player:
         for seat in setup.seats:
             player.check(f"policy {seat.agent!r} with several workers", seat.policy)
-        threads = None if isinstance(player, Serial) else 1  # else workers share the cores
+        threads = cores() if isinstance(player, Serial) else 1  # workers share the cores
         make = partial(Bench, setup, trusted, threads)
         for index, rows in player.run(make, [shards[place] for place in missing]):
             place = missing[index]

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
+from weakref import WeakKeyDictionary
 
+import numpy as np
 from numba import typeof
 from numba.extending import is_jitted
+
+_MADE: WeakKeyDictionary[Any, dict[tuple[Hashable, ...], Callable[..., Any]]] = WeakKeyDictionary()
+"""What was given before: asking numba takes longer than most of these functions."""
 
 
 def direct(function: Callable[..., Any], *like: Any) -> Callable[..., Any]:
@@ -30,5 +35,17 @@ def direct(function: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     if not is_jitted(function):
         return function
     compiled: Any = function
-    found: Callable[..., Any] = compiled.compile(tuple(map(typeof, like)))
+    made = _MADE.setdefault(compiled, {})
+    kinds = tuple(map(_kind, like))
+    found = made.get(kinds)
+    if found is None:
+        found = made[kinds] = compiled.compile(tuple(map(typeof, like)))
+    return found
+
+
+def _kind(value: Any) -> Hashable:
+    """Give something that is the same for two values only if their types are."""
+    if type(value) is np.ndarray:
+        return value.dtype, value.ndim, value.flags.num
+    found: Hashable = float if type(value) is float else typeof(value)
     return found

@@ -32,11 +32,13 @@ def _scalar(value: Any) -> Any:
     return of_array if isinstance(value, types.Array) else of_number
 
 
-@intrinsic
-def fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Compute ``a * b + c`` with one rounding, in compiled code, on every processor alike."""
+def _fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
 
     def write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.fma(*arguments)
 
     return types.float64(types.float64, types.float64, types.float64), write
+
+
+fused: Any = intrinsic(_fused)
+"""Computes ``a * b + c`` with one rounding, in compiled code, on every processor alike."""

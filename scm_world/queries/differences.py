@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import WORKERS, Episode
+from scm_world.queries.episodes import Episode
 from scm_world.queries.outcomes import as_outcome, read
 from scm_world.variables import Draw, Natural
 
@@ -169,7 +169,7 @@ def but_for(
     *,
     at: int = 0,
     most: int = 1,
-    workers: int = WORKERS,
+    workers: int | None = None,
 ) -> tuple[ButFor, ...]:
     """Ask, for each cause, whether the outcome would have been the same without it.
 
@@ -182,7 +182,7 @@ def but_for(
         at: The control step from which the causes are other ones.
         most: How many causes are taken away together, at most. A set counts only where no part of
             it matters by itself.
-        workers: Threads.
+        workers: Threads, see ``Setting``.
 
     Returns:
         One entry for each set of causes, those that matter first, the largest first.

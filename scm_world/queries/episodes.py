@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, final
 
 import numpy as np
@@ -12,14 +14,12 @@ from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.queries.courses import Course, Layer
 from scm_world.queries.plans import Plan
 from scm_world.queries.policies import Sequence as Given
-from scm_world.queries.policies import as_policy
-from scm_world.queries.stages import Stage, threaded
-from scm_world.queries.traces import ALL, Trace, as_names, begin, run
+from scm_world.queries.rollouts import Ending, lived
+from scm_world.queries.stages import Stage
+from scm_world.queries.traces import ALL, EVERY, Trace, as_names, begin, run
+from scm_world.queries.units import Unit
 from scm_world.world import Audit, World
 from scm_world.world.start import whole_number
-
-WORKERS = 2
-"""Threads that parallel worlds use by default."""
 
 
 @final
@@ -168,41 +168,63 @@ class Episode:
             InterventionError: The intervention was refused.
             UnknownOption: There is no such control step.
         """
+        unit = self._unit(do, self._instant(at), actions, as_names(record))
+        with self.stage.twin() as world:
+            trace = unit.lived(world, lambda twin: self._arrive(twin, unit.first))
+        return episode_of(self.stage, unit, trace)
+
+    def _instant(self, at: Any) -> int:
         if isinstance(at, bool) or not isinstance(at, int | np.integer) or not 0 <= at < self.steps:
             raise UnknownOption("at", at, (f"a control step from 0 to {self.steps - 1}",))
-        step = int(at)
-        layers = (*self.layers, (step, Plan(do)))
-        with self.stage.twin() as world:
-            trace = self._branch(world, Course(layers), step, actions, as_names(record))
-        return Episode(
-            self.stage,
+        return int(at)
+
+    def _unit(
+        self, do: Mapping[str, Any] | None, at: int, actions: Any, names: tuple[str, ...]
+    ) -> Unit:
+        """Say what is to happen from an instant on."""
+        whole = tuple(name for name in names if self._is_whole(name, at))
+        past = self.trace.until(at)
+        past.values = {name: list(self[name][:at]) for name in whole}
+        return Unit(
             seed=self.seed,
             number=self.number,
-            layers=layers,
+            layers=(*self.layers, (at, Plan(do))),
+            policy=Given(self.trace.actions) if _is_replay(actions) else actions,
             steps=self.steps,
-            trace=trace,
+            names=whole,
+            first=at,
+            past=past,
         )
 
-    def _branch(
-        self, world: World, course: Course, at: int, actions: Any, names: tuple[str, ...]
-    ) -> Trace:
-        past = Given(self.trace.actions)
-        trace = self.trace.until(at)
+    def _arrive(self, world: World, at: int) -> None:
+        """Bring a twin to an instant, before anything is done then that the past does not know."""
         if at == 0:
             world.reset(seed=self.seed, episode=self.number)
-        else:  # snapshots are taken after what was done: go on from an earlier one
+            return
+        near = self._near(world, at)  # snapshots are taken after what was done: an earlier one
+        world.restore(self.trace.snapshots[near])
+        self._go_through(world, near, at)
+
+    def _near(self, world: World, at: int) -> int:
+        """Find the last snapshot before an instant; take those that were not taken on the way."""
+        near = max((step for step in self.trace.snapshots if step < at), default=-1)
+        if near < (at - 1) // EVERY * EVERY:
+            if near < 0:
+                near = 0
+                begin(world, self.seed, self.number, Course(self.layers), Trace())
+            else:
+                world.restore(self.trace.snapshots[near])
+            found = self._go_through(world, near, at).snapshots
+            self.trace.snapshots = {**self.trace.snapshots, **found}
             near = max(step for step in self.trace.snapshots if step < at)
-            world.restore(self.trace.snapshots[near])
-            before, scratch = Course(self.layers), Trace(fired=dict(self.trace.fired))
-            run(world, scratch, before, past, first=near, steps=at, begun=True)
-        names = tuple(name for name in names if self._is_whole(name, at))
-        trace.values = {name: list(self[name][:at]) for name in names}
-        due = course.due(world, at, trace.fired)
-        if due:
-            trace.audits[at] = world.do(due)
-        policy = past if _is_replay(actions) else as_policy(actions)
-        run(world, trace, course, policy, first=at, steps=self.steps, names=names, begun=True)
-        return trace
+        return near
+
+    def _go_through(self, world: World, first: int, last: int) -> Trace:
+        """Let the same happen again, from after what was done at an instant."""
+        again = Trace(fired=dict(self.trace.fired))
+        past = Given(self.trace.actions)
+        run(world, again, Course(self.layers), past, first=first, steps=last, begun=True)
+        return again
 
     def _is_whole(self, name: str, at: int) -> bool:
         """Tell whether a variable is there at every instant before one."""
@@ -216,7 +238,7 @@ class Episode:
         at: int = 0,
         actions: Any = "replay",
         record: Iterable[str] = (),
-        workers: int = WORKERS,
+        workers: int | None = None,
     ) -> tuple[Episode, ...]:
         """Let parallel worlds run with the same noise, one for each intervention.
 
@@ -225,14 +247,22 @@ class Episode:
             at: Number of the control step, as in ``counterfactual``; also what follows.
             actions: ``"replay"`` or a policy.
             record: Variables to write down on the way.
-            workers: Threads; the result does not depend on how many.
+            workers: Threads, see ``Setting``; the result does not depend on how many.
         """
-        names = as_names(record)
+        at, names = self._instant(at), as_names(record)
+        given = list(dos)
+        start = None
+        if at > 0 and given:
+            with self.stage.twin() as world:
+                self._arrive(world, at)
+                start = world.snapshot()
+        units = [replace(self._unit(do, at, actions, names), start=start) for do in given]
+        return tuple(lived(self.stage, units, partial(self._ended, units), workers))
 
-        def one(do: Mapping[str, Any]) -> Episode:
-            return self.counterfactual(do, at=at, actions=actions, record=names)
-
-        return tuple(threaded(one, list(dos), workers))
+    def _ended(self, units: Sequence[Unit], place: int, ending: Ending) -> Episode:
+        if isinstance(ending, Exception):
+            raise ending
+        return episode_of(self.stage, units[place], ending)
 
 
 def rollout(
@@ -261,15 +291,29 @@ def rollout(
         InterventionError: An intervention was refused.
         UnknownOption: The number of steps is none.
     """
-    plan = Plan(do)
-    course, trace = Course([(0, plan)]), Trace()
     with stage.twin() as world:
-        begin(world, seed, number, course, trace)
         length = world.max_episode_length if steps is None else steps
-        count = whole_number("steps", length, least=1)
-        names = as_names(record)
-        run(world, trace, course, as_policy(policy), first=0, steps=count, names=names, begun=True)
-    return Episode(stage, seed=seed, number=number, layers=[(0, plan)], steps=count, trace=trace)
+        unit = Unit(
+            seed=seed,
+            number=number,
+            layers=((0, Plan(do)),),
+            policy=policy,
+            steps=whole_number("steps", length, least=1),
+            names=as_names(record),
+        )
+        return episode_of(stage, unit, unit.lived(world))
+
+
+def episode_of(stage: Stage, unit: Unit, trace: Trace) -> Episode:
+    """Give the episode that a unit has become."""
+    return Episode(
+        stage,
+        seed=unit.seed,
+        number=unit.number,
+        layers=unit.layers,
+        steps=unit.steps,
+        trace=trace,
+    )
 
 
 def _is_replay(actions: Any) -> bool:

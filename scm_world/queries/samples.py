@@ -13,11 +13,14 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import Episode, rollout
+from scm_world.queries.episodes import Episode, episode_of
 from scm_world.queries.outcomes import Outcome, as_outcome, column, read, watched
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.stages import Stage, threaded
+from scm_world.queries.rollouts import Ending, lived
+from scm_world.queries.stages import Stage
+from scm_world.queries.traces import as_names
+from scm_world.queries.units import Unit
 from scm_world.world import World
 from scm_world.world.requests import merged
 from scm_world.world.start import whole_number
@@ -35,16 +38,54 @@ class Setting:
         policy: Who acts; see ``rollout``.
         nature: What varies from episode to episode by itself: interventions that are drawn at the
             beginning, such as ``{"tool_block.mass": "A"}``. What is done counts more.
-        steps: Control steps of an episode.
+        steps: Control steps of an episode; as many as the task has if None.
         seed: Of the noise; episode i of one seed is the same unit in every question.
-        workers: Threads; the result does not depend on how many.
+        workers: Threads; the result does not depend on how many. Where the engine steps many
+            worlds in one call, and the policy does not look at the world (``"random"``,
+            ``"sweep"``, ``"across"``, given actions, None), these are threads of the engine, as
+            many as there are cores if None. Else None is one.
     """
 
     policy: Any = "random"
     nature: Mapping[str, Any] | None = None
-    steps: int = STEPS
+    steps: int | None = STEPS
     seed: int = 0
-    workers: int = 1
+    workers: int | None = None
+
+    def plan(self, world: World, do: Mapping[str, Any] | None) -> Plan:
+        """Say what happens to a unit: what is done to it, and what varies by itself.
+
+        Args:
+            world: Knows which names are coordinates of one quantity.
+            do: What is done.
+        """
+        nature, acts = Plan(self.nature), Plan(do)
+        for name in acts:
+            if name in nature and name not in acts.at_first():
+                acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
+        return Plan(merged(world.declaration, nature, acts))
+
+    def unit(self, world: World, plan: Plan, number: int, names: Iterable[str] = ()) -> Unit:
+        """Say what is to happen in an episode.
+
+        Args:
+            world: Knows how long an episode is.
+            plan: As ``plan`` gave it.
+            number: Which unit.
+            names: Variables to write down.
+
+        Raises:
+            UnknownOption: The number of steps is none.
+        """
+        steps = world.max_episode_length if self.steps is None else self.steps
+        return Unit(
+            seed=self.seed,
+            number=number,
+            layers=((0, plan),),
+            policy=self.policy,
+            steps=whole_number("steps", steps, least=1),
+            names=as_names(names),
+        )
 
     def episode(
         self, stage: Stage, world: World, do: Mapping[str, Any] | None, number: int, names: Any
@@ -58,20 +99,9 @@ class Setting:
             number: Which unit.
             names: Variables to write down.
         """
-        nature, acts = Plan(self.nature), Plan(do)
-        for name in acts:
-            if name in nature and name not in acts.at_first():
-                acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
-        plan = Plan(merged(world.declaration, nature, acts))
-        return rollout(
-            stage,
-            self.policy,
-            seed=self.seed,
-            number=number,
-            do=plan,
-            steps=self.steps,
-            record=names,
-        )
+        unit = self.unit(world, self.plan(world, do), number, names)
+        with stage.twin() as twin:
+            return episode_of(stage, unit, unit.lived(twin))
 
 
 @final
@@ -166,17 +196,20 @@ def sample(
     names = tuple(dict.fromkeys(name for outcome in wanted for name in watched(outcome)))
     done = 0
 
-    def one(number: int) -> list[Floats]:
+    def finish(place: int, ending: Ending) -> list[Floats]:
         nonlocal done
-        episode = setting.episode(stage, world, do, number, names)
+        if isinstance(ending, Exception):
+            raise ending
+        episode = episode_of(stage, units[place], ending)
         found = [read(outcome, episode) for outcome in wanted]
         done += 1
         if progress is not None:
             progress(done, count)
         return found
 
-    numbers = range(first, first + count)
-    rows = threaded(one, numbers, setting.workers)
+    numbers, plan = range(first, first + count), setting.plan(world, do)
+    units = [setting.unit(world, plan, number, names) for number in numbers]
+    rows = lived(stage, units, finish, setting.workers)
     try:
         found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
     except ValueError:

@@ -11,6 +11,8 @@ from typing import Any, TypeVar, final
 from weakref import WeakKeyDictionary
 
 from scm_world.world import World
+from scm_world.world.batch import Batch
+from scm_world.world.family import Family
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -26,20 +28,29 @@ class Stage:
     Attributes:
         task: Of the world.
         options: What a twin is made with besides.
+        batches: Whether the engine steps many worlds in one call.
     """
 
     def __init__(self, world: World) -> None:
         self._build, (self._kind, self.task, self.options, _), *_ = world.__reduce__()
+        self.batches = world.backend.capabilities.batch
+        self._clear()
+
+    def _clear(self) -> None:
         self._free: list[World] = []
         self._lock = threading.Lock()
+        self._choir: list[World] = []
+        self._singing = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the twins."""
-        return {**self.__dict__, "_free": [], "_lock": None}
+        private = ("_free", "_lock", "_choir", "_singing")
+        return {name: value for name, value in self.__dict__.items() if name not in private}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Begin without twins."""
-        self.__dict__.update(state, _lock=threading.Lock())
+        self.__dict__.update(state)
+        self._clear()
 
     @contextmanager
     def twin(self) -> Iterator[World]:
@@ -52,8 +63,35 @@ class Stage:
             with self._lock:
                 self._free.append(world)
 
-    def _make(self) -> World:
-        made: World = self._build(self._kind, copy.copy(self.task), dict(self.options), None)
+    @contextmanager
+    def together(self, n: int, names: tuple[str, ...], threads: int) -> Iterator[Batch]:
+        """Lend twins that are stepped together; one thread at a time.
+
+        They share what is declared, which twins that are lent to several threads cannot.
+
+        Args:
+            n: How many.
+            names: What has to be computed in every step.
+            threads: Of the engine.
+        """
+        with self._singing:
+            worlds, self._choir = self._choir[:n], self._choir[n:]
+            while len(worlds) < n:
+                worlds.append(self._make(worlds[0].family if worlds else None))
+            batch = Batch(worlds, threads=threads, names=names)
+            yield batch
+            for world in worlds:
+                world.backend.state()  # the state comes back, and the batch can be forgotten
+            self._choir = worlds + self._choir
+
+    @property
+    def at_hand(self) -> int:
+        """How many twins there are that can be stepped together."""
+        return len(self._choir)
+
+    def _make(self, family: Family | None = None) -> World:
+        task = copy.copy(self.task) if family is None else family
+        made: World = self._build(self._kind, task, dict(self.options), None)
         return made
 
 

@@ -91,9 +91,7 @@ def run(
     version = -1
     for step in range(first, steps + 1):
         if (step < steps or step == first) and not (begun and step == first):
-            due = course.due(world, step, trace.fired)
-            if due:
-                trace.audits[step] = world.do(due)
+            intervene(world, course, step, trace)
         if world.version != version:
             version = world.version
             note_parameters(world, trace, step)
@@ -138,9 +136,14 @@ def begin(world: World, seed: int, number: int, course: Course, trace: Trace) ->
         trace: Still empty.
     """
     world.reset(seed=seed, episode=number)
-    due = course.due(world, 0, trace.fired)
+    intervene(world, course, 0, trace)
+
+
+def intervene(world: World, course: Course, step: int, trace: Trace) -> None:
+    """Do what is due at an instant."""
+    due = course.due(world, step, trace.fired)
     if due:
-        trace.audits[0] = world.do(due)
+        trace.audits[step] = world.do(due)
 
 
 def note_parameters(world: World, trace: Trace, step: int) -> None:

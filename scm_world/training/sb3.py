@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -86,7 +86,7 @@ class _Adapted:
         infos: What is told of ``info``.
 
     Attributes:
-        envs: The worlds, for all that Stable-Baselines3 knows nothing of: ``do``, ``branch``, …
+        worlds: For all that Stable-Baselines3 knows nothing of: ``do``, ``branch``, …
         reset_infos: What was told at the last reset of each.
     """
 
@@ -95,11 +95,14 @@ class _Adapted:
     reset_infos: list[dict[str, Any]]
     _seeds: list[int | None]
     _options: list[dict[str, Any]]
+    _reset_seeds: Callable[[], None]
+    _reset_options: Callable[[], None]
+    _get_indices: Callable[[Indices], Iterable[int]]
 
     def __init__(self, envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None) -> None:
-        self.envs = envs
-        worlds: Any = envs.unwrapped
-        self._crew: Crew = worlds.crew
+        self.worlds: Any = envs
+        bare: Any = envs.unwrapped
+        self._crew: Crew = bare.crew
         self._names = None if infos is None else tuple(infos)
         if self._names is not None:
             form = self._crew.sheet.infos
@@ -113,11 +116,10 @@ class _Adapted:
         """Begin an episode in all of them, with the seeds and options that were set before."""
         names = {name: None for mine in self._options for name in mine}
         given = {name: [mine.get(name) for mine in self._options] for name in names}
-        observations, infos = self.envs.reset(seed=list(self._seeds), options=given or None)  # type: ignore[arg-type]
+        observations, infos = self.worlds.reset(seed=list(self._seeds), options=given or None)
         self.reset_infos = _rows(infos, None, self.num_envs)
-        reset_seeds, reset_options = self._reset_seeds, self._reset_options  # type: ignore[attr-defined]
-        reset_seeds()
-        reset_options()
+        self._reset_seeds()
+        self._reset_options()
         return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -126,7 +128,7 @@ class _Adapted:
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Advance all of them one control step; what is done begins anew at once."""
-        observations, rewards, terminated, truncated, infos = self.envs.step(self._actions)
+        observations, rewards, terminated, truncated, infos = self.worlds.step(self._actions)
         done = terminated | truncated
         told = _rows(infos, self._names, self.num_envs)
         for info in told:
@@ -145,7 +147,7 @@ class _Adapted:
 
     def close(self) -> None:
         """Free what simulates."""
-        self.envs.close()
+        self.worlds.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """Look an attribute of some worlds up."""
@@ -167,11 +169,10 @@ class _Adapted:
 
     def get_images(self) -> list[Any]:
         """Draw every world."""
-        return list(self.envs.render() or ())
+        return list(self.worlds.render() or ())
 
     def _chosen(self, indices: Indices) -> list[int]:
-        chosen = self._get_indices(indices)  # type: ignore[attr-defined]
-        return [range(self.num_envs)[index] for index in chosen]
+        return [range(self.num_envs)[index] for index in self._get_indices(indices)]
 
 
 def _rows(infos: Mapping[str, Any], names: Sequence[str] | None, size: int) -> list[dict[str, Any]]:

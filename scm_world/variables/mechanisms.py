@@ -42,7 +42,12 @@ class Stacked:
 
     def __init__(self, kernel: Callable[..., Any]) -> None:
         self.kernel = kernel
+        self.__qualname__ = ""
         update_wrapper(self, kernel)
+
+    def __reduce__(self) -> str:
+        """Copy and pickle it as what its name stands for."""
+        return str(self.__qualname__)
 
     def __call__(self, *parents: Value, **constants: Any) -> Any:
         """Compute from values of the parents."""

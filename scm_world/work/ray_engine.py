@@ -70,7 +70,7 @@ def _check_answers(address: str | None) -> None:
     if address in (None, "auto"):
         return
     host, _, port = str(address).rpartition(":")
-    if not host or not port.isdecimal():
+    if not host or "/" in host or not port.isdecimal():
         raise UnknownOption("address", address, ADDRESSES)
     try:
         socket.create_connection((host, int(port)), timeout=PATIENCE).close()

@@ -9,7 +9,6 @@ from operator import is_, itemgetter
 from typing import Any, final
 
 import numpy as np
-from numba.extending import is_jitted
 
 from scm_world._types import Value
 from scm_world.geometry.direct import direct
@@ -91,10 +90,6 @@ class Bound:
         if isinstance(function, Stacked):
             states = [self._is_state(key) for key in keys]
             return _Stack(function, given, states, constants)
-        if is_jitted(function):  # numbers cost less than arrays of shape ()
-            states = [self._is_state(key) for key in keys]
-            pairs = zip(given, states, strict=True)
-            given = [value if moves or value.ndim else value.item() for value, moves in pairs]
         if hasattr(function, "into"):
             self._now[mechanism.name] = written = np.empty(mechanism.shape)
             return _Written(function.into, (*given, *constants, written))
@@ -204,7 +199,7 @@ def _only(name: str, now: Now) -> tuple[Value]:
 
 
 def _is_number(variable: Any) -> bool:
-    return variable.shape == () and variable.dtype == "real"
+    return bool(variable.shape == () and variable.dtype == "real")
 
 
 def _parents(model: SCM, name: str) -> tuple[Parent, ...]:

@@ -20,7 +20,6 @@ from benchmarks.speed.parts import PARTS, split, split_batch  # noqa: E402
 from benchmarks.speed.scenes import CASES, GROWING, PUSHING, actions, bare, commands  # noqa: E402
 from benchmarks.speed.stopwatch import Stopwatch  # noqa: E402
 from benchmarks.speed.timing import Settings, in_turns, medians, ratio  # noqa: E402
-from scm_world.env.batched.choice import CREWS  # noqa: E402
 
 QUICK = Settings(quick=True)
 PAGE = f"before\n{tables.BEGIN}\nwhat stood here\n{tables.END}\nafter\n"
@@ -167,7 +166,6 @@ def test_stopwatch_gives_time_to_the_part_that_takes_it(monkeypatch: pytest.Monk
     assert watch.spent() == {"inner": 5.0, "outer": 1.0}
 
 
-@pytest.mark.skipif("native" not in CREWS, reason="no crew steps worlds in one call")
 def test_profile_of_a_batch_has_every_part() -> None:
     """What the engine, the mechanisms, the reading and the loop take is told apart."""
     found = split_batch(PUSHING, 4, QUICK)
@@ -176,7 +174,6 @@ def test_profile_of_a_batch_has_every_part() -> None:
     assert all(found[part] > 0.0 for part in ("physics", "mechanisms", "observation", "the rest"))
 
 
-@pytest.mark.skipif("native" not in CREWS, reason="no crew steps worlds in one call")
 def test_batch_and_plain_loop_live_the_same_episodes() -> None:
     """A batch is compared with single worlds of the same seeds and actions."""
     found = beside_the_engine(PUSHING, 3, QUICK)
@@ -193,8 +190,9 @@ def test_profile_has_every_part() -> None:
     assert max(found, key=found.__getitem__) == "physics"
 
 
-def test_memory_is_read() -> None:
+def test_memory_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process has megabytes, and resets are counted."""
+    monkeypatch.setattr("benchmarks.speed.memory.LOOKS", 4)  # each collects all garbage
     before = resident()
     found = resets(PUSHING, "fake", 40)
 

@@ -77,7 +77,7 @@ def test_worlds_can_be_asked_one_by_one() -> None:
     mine.set_attr("remark", "some", indices=[1, 3])
     assert mine.get_attr("remark", [3, -3]) == ["some", "some"]
     assert mine.env_is_wrapped(gymnasium.Wrapper) == [False] * 4
-    mine.envs.do({2: {"floor_friction": 0.3}})
+    mine.worlds.do({2: {"floor_friction": 0.3}})
     assert [len(done) for done in mine.get_attr("interventions")] == [0, 0, 1, 0]
 
 
@@ -99,7 +99,7 @@ def test_infos_are_as_short_as_they_may_be() -> None:
     assert told == [{"is_success": False, "TimeLimit.truncated": False}] * 2
     *_, told = envs.step(still)
     assert told[0].keys() == {"is_success", "TimeLimit.truncated", "terminal_observation"}
-    more = sb3_vec_env(envs.envs, infos=("fractional_success", "reward_terms"))
+    more = sb3_vec_env(envs.worlds, infos=("fractional_success", "reward_terms"))
     more.reset()
     *_, told = more.step(still)
     assert told[0].keys() == {"fractional_success", "reward_terms", "TimeLimit.truncated"}
@@ -109,9 +109,10 @@ def test_what_it_cannot_adapt_is_refused() -> None:
     """Another autoreset mode, worlds of another kind, and infos that nobody tells."""
     with pytest.raises(UnknownOption, match="SameStep"):
         sb3_vec_env(gymnasium.make_vec(PUSHING, 2, backend="fake"))
-    how = {"autoreset_mode": "SameStep"}
+    how: dict[str, Any] = {"vectorization_mode": "sync", "backend": "fake"}
+    others = gymnasium.make_vec(PUSHING, 2, vector_kwargs={"autoreset_mode": "SameStep"}, **how)
     with pytest.raises(UnknownOption, match="make_vec"):
-        sb3_vec_env(gymnasium.make_vec("CartPole-v1", 2, vector_kwargs=how))
+        sb3_vec_env(others)
     with pytest.raises(UnknownOption, match="is_success"):
         make_sb3(PUSHING, 2, infos=["success_rate"], backend="fake")
 

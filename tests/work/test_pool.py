@@ -17,7 +17,8 @@ import pytest
 from work_samples import Task, make, no_bench
 
 from scm_world.errors import ActionError, EngineFailure, UnknownOption
-from scm_world.work.pool import TRIES, Pool
+from scm_world.work.jobs import TRIES
+from scm_world.work.pool import Pool
 
 
 def wait_for(what: Callable[[], Any], seconds: float = 60.0) -> None:
@@ -61,15 +62,6 @@ def pool() -> Iterator[Pool[Task, Any]]:
 # --- results --------------------------------------------------------------------------------------
 
 
-def test_results_do_not_depend_on_the_number_of_workers(pool: Pool[Task, Any]) -> None:
-    """To the last bit: in this process, in one other, and in two."""
-    jobs = [Task(number, "product") for number in range(5)]
-    with Pool(make, 1, inline=True) as here, Pool(make, 1) as one:
-        ways = [dict(way.run(jobs)) for way in (here, one, pool)]
-    assert ways[0] == ways[1] == ways[2]
-    assert sorted(ways[0]) == list(range(5))
-
-
 def test_the_order_of_jobs_does_not_matter(pool: Pool[Task, Any]) -> None:
     """Each result belongs to its job, each comes once, and there may be more jobs than workers."""
     jobs = [Task(number) for number in range(40)]
@@ -84,16 +76,13 @@ def test_no_job_is_no_result(pool: Pool[Task, Any]) -> None:
 
 
 def test_each_worker_is_made_once(tmp_path: Path) -> None:
-    """However many jobs and runs there are; and in this process, too."""
-    for name, workers, inline in (("there", 2, False), ("here", 1, True)):
-        folder = tmp_path / name
-        folder.mkdir()
-        with Pool(partial(make, folder), workers, inline=inline) as pool:
-            for _ in range(2):
-                assert len(list(pool.run([Task(number) for number in range(12)]))) == 12
-        made = [int(path.name.split("-")[1]) for path in folder.iterdir()]
-        assert len(made) == len(set(made)) == workers
-        assert (os.getpid() in made) is inline
+    """However many jobs and runs there are."""
+    with Pool(partial(make, tmp_path), 2) as pool:
+        for _ in range(2):
+            assert len(list(pool.run([Task(number) for number in range(12)]))) == 12
+    made = [int(path.name.split("-")[1]) for path in tmp_path.iterdir()]
+    assert len(made) == len(set(made)) == 2
+    assert os.getpid() not in made
 
 
 # --- killed ---------------------------------------------------------------------------------------
@@ -129,45 +118,53 @@ def test_a_worker_that_was_killed_at_rest_is_replaced(tmp_path: Path) -> None:
     assert tries(tmp_path) == {0: 1, 1: 1}
 
 
-def test_a_job_that_always_kills_is_given_up(tmp_path: Path) -> None:
-    """After three tries, with its number and what it is."""
-    jobs = [Task(0), Task(1, "die", tmp_path)]
-    with Pool(make, 2) as pool, pytest.raises(EngineFailure) as caught:
-        list(pool.run(jobs))
+def test_a_job_that_always_kills_is_put_aside(tmp_path: Path) -> None:
+    """After three tries, and the others are done; the error has its number and what it is."""
+    jobs = [Task(0, "die", tmp_path), *(Task(number) for number in range(1, 9))]
+    found: dict[int, int] = {}
+    with Pool(make, 2) as pool:
+        with pytest.raises(EngineFailure) as caught:
+            found.update(pool.run(jobs[:1]))
+        with pytest.raises(EngineFailure, match="job 0"):
+            found.update(pool.run(jobs))
+        assert list(pool.run([Task(3)])) == [(0, 9)]
     said = str(caught.value)
-    assert said.startswith("job 1, Task(")
+    assert said.startswith("job 0, Task(")
     assert said.endswith("was tried 3 times, and then its process ended with exit code -9")
-    assert tries(tmp_path) == {1: TRIES}
+    assert found == {number: number**2 for number in range(1, 9)}
+    assert tries(tmp_path) == {0: 2 * TRIES}
 
 
 # --- errors ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("inline", [False, True])
-def test_an_error_of_a_job_is_raised(inline: bool, tmp_path: Path) -> None:
-    """With class and attributes and the name of the job; the others are given up."""
-    jobs = [Task(7, "refuse"), *(Task(number, "sleep", tmp_path) for number in range(3))]
-    with Pool(make, 1 if inline else 2, inline=inline) as pool:
+def test_an_error_of_a_job_waits_for_the_others() -> None:
+    """With class and attributes and the name of the job, when all that can be done is done."""
+    jobs = [Task(7, "refuse"), Task(1), Task(8, "refuse"), Task(2)]
+    found: dict[int, int] = {}
+    with Pool(make, 2) as pool:
         with pytest.raises(ActionError, match="no 7") as caught:
-            list(pool.run(jobs))
-        assert not any(map(is_alive, pids(tmp_path)))
-        assert caught.value.action == 7
-        assert caught.value.__notes__[-1].startswith("in job 0, Task(")
+            found.update(pool.run(jobs))
         assert list(pool.run([Task(3)])) == [(0, 9)]
+    assert found == {1: 1, 3: 4}
+    assert caught.value.action == 7
+    first, second, last = caught.value.__notes__
+    assert first.startswith("in job 0, Task(")
+    assert second.startswith("so did job 2, Task(")
+    assert second.endswith("ActionError: no 8")
+    assert last == "2 of 4 jobs are done"
 
 
-@pytest.mark.parametrize("inline", [False, True])
-def test_an_error_of_make_is_raised(inline: bool) -> None:
-    """As it is."""
-    with (
-        Pool(no_bench, 1, inline=inline) as pool,  # type: ignore[arg-type] # it gives nothing
-        pytest.raises(ActionError, match="there is no room"),
-    ):
-        list(pool.run([Task(0)]))
+def test_an_error_of_make_ends_it_at_once(tmp_path: Path) -> None:
+    """As it is: nothing can do any job."""
+    made: Any = no_bench
+    with Pool(made, 1) as pool, pytest.raises(ActionError, match="there is no room") as caught:
+        list(pool.run([Task(number, folder=tmp_path) for number in range(9)]))
+    assert not hasattr(caught.value, "__notes__")
 
 
 def test_what_cannot_be_sent_is_refused_before_anything_starts(tmp_path: Path) -> None:
-    """What makes workers at once, a job before any is begun; in this process all is allowed."""
+    """What makes workers at once, a job before any is begun."""
     with pytest.raises(UnknownOption, match="make cannot be <function"):
         Pool(lambda: len, 2)
     with Pool(make, 2) as pool:
@@ -175,18 +172,14 @@ def test_what_cannot_be_sent_is_refused_before_anything_starts(tmp_path: Path) -
         with pytest.raises(UnknownOption, match=r"job 1 cannot be .* a function or class of"):
             pool.run(jobs)
         assert not any(worker._process for worker in pool._workers)
-    with Pool(lambda: lambda job: job(), 1, inline=True) as here:
-        assert list(here.run([lambda: "done"])) == [(0, "done")]
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("workers", "inline"), [(0, False), (1.5, False), (True, False), (2, True)]
-)
-def test_workers_are_counted(workers: Any, inline: bool) -> None:
-    """None are too few; in this process there is one."""
+@pytest.mark.parametrize("workers", [0, 1.5, True])
+def test_workers_are_counted(workers: Any) -> None:
+    """None are too few."""
     with pytest.raises(UnknownOption, match="workers"):
-        Pool(make, workers, inline=inline)
+        Pool(make, workers)
 
 
 # --- ended ----------------------------------------------------------------------------------------

@@ -203,6 +203,7 @@ def _gathered(
             tally.add(len(numbers))
     missing = [index for index in range(len(ranges)) if index not in parts]
     serial = isinstance(executor, Serial)
+    executor.check("source of episodes with several workers", source)
     make = partial(Maker, source, tally.add if serial else None)
     refused = [pair for part in parts.values() for pair in part.refused]
     made = sum(len(ranges[index]) for index in parts)

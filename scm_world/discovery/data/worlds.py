@@ -24,11 +24,14 @@ from scm_world.discovery.data.sensors import Sensors
 from scm_world.discovery.data.sources import FORMAT, Part, Tell, plain_options, policy_name
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph.structure import Edge
+from scm_world.queries.episodes import episode_of
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.plans import Plan
+from scm_world.queries.rollouts import Ending, lived
 from scm_world.queries.samples import Setting
-from scm_world.queries.stages import stage_of, threaded
+from scm_world.queries.stages import stage_of
+from scm_world.queries.units import Unit
 from scm_world.world import World
 from scm_world.world.requests import merged
 
@@ -105,28 +108,33 @@ class Episodes:
         regimes = [self._design.regime_of(kind) for kind in chosen]
         lock = threading.Lock()
 
-        def one(index: int) -> Floats | str:
-            try:
-                found: Floats | str = self._episode(numbers[index], regimes[index])
-            except InterventionError as problem:
-                found = str(problem)
+        def finish(place: int, ending: Ending) -> Floats | str:
+            found: Floats | str
+            if isinstance(ending, InterventionError):
+                found = str(ending)
+            elif isinstance(ending, Exception):
+                raise ending
+            else:
+                episode = episode_of(self._stage, units[place], ending)
+                found = self._rows.rows(episode, self._sensors)
             with lock:
                 tell(1)
             return found
 
-        found = threaded(one, range(len(numbers)), self._setting.workers)
-        lived = [
-            (number, regime, rows)
-            for number, regime, rows in zip(numbers, regimes, found, strict=True)
-            if not isinstance(rows, str)
-        ]
-        refused = [(n, why) for n, why in zip(numbers, found, strict=True) if isinstance(why, str)]
-        return Part(self._table(lived), tuple(refused))
+        units = [self._unit(n, regime) for n, regime in zip(numbers, regimes, strict=True)]
+        found = lived(self._stage, units, finish, self._setting.workers)
+        return self._part(list(zip(numbers, regimes, found, strict=True)))
 
-    def _episode(self, number: int, regime: Regime) -> Floats:
-        plan = Plan(merged(self._world.declaration, self._given, regime.plan))
-        episode = self._setting.episode(self._stage, self._world, plan, number, self._written)
-        return self._rows.rows(episode, self._sensors)
+    def _unit(self, number: int, regime: Regime) -> Unit:
+        given = Plan(merged(self._world.declaration, self._given, regime.plan))
+        plan = self._setting.plan(self._world, given)
+        return self._setting.unit(self._world, plan, number, self._written)
+
+    def _part(self, found: Sequence[tuple[int, Regime, Floats | str]]) -> Part:
+        """Tell rows from refusals."""
+        rows = [(number, done, rows) for number, done, rows in found if not isinstance(rows, str)]
+        refused = tuple((number, why) for number, _, why in found if isinstance(why, str))
+        return Part(self._table(rows), refused)
 
     @property
     def _written(self) -> tuple[str, ...]:

@@ -82,7 +82,10 @@ def options_of(
     for name, value in given.items():
         if name not in PER_WORLD:
             raise UnknownOption("reset option", name, (*PER_WORLD, MASK))
-        for index, one in spread(name, value, which.size).items():
+        wanted = spread(name, value, which.size)
+        if _is_by_index(value) and not which[list(wanted)].all():
+            raise UnknownOption(f"environments for {name}", [*wanted], ("those that are reset",))
+        for index, one in wanted.items():
             mine = found[index]
             if mine is not None:
                 mine[name] = one
@@ -106,14 +109,33 @@ def spread(what: str, given: Any, size: int) -> dict[int, Any]:
         >>> spread("do", {"floor_friction": 0.4}, 2)
         {0: {'floor_friction': 0.4}, 1: {'floor_friction': 0.4}}
     """
-    by_index = isinstance(given, Mapping) and any(not isinstance(key, str) for key in given)
-    if by_index:
+    if _is_by_index(given):
         return {index_of(key, size): one for key, one in given.items() if one is not None}
     if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
         if len(given) != size:
             raise UnknownOption(f"list for {what}", given, (f"one of length {size}",))
         return {index: one for index, one in enumerate(given) if one is not None}
     return {} if given is None else dict.fromkeys(range(size), given)
+
+
+def _is_by_index(given: Any) -> bool:
+    return isinstance(given, Mapping) and any(not isinstance(key, str) for key in given)
+
+
+def chosen_of(into: Any, size: int) -> list[int]:
+    """Read indices, or a mask.
+
+    Raises:
+        UnknownOption: There is no such environment, or the mask has another shape.
+
+    Example:
+        >>> chosen_of([1], 2), chosen_of(np.array([False, True]), 2)
+        ([1], [1])
+    """
+    given = np.asarray(into)
+    if given.dtype == np.bool_:
+        return [int(index) for index in np.flatnonzero(masked(given, size))]
+    return [index_of(index, size) for index in np.atleast_1d(given).tolist()]
 
 
 def index_of(index: Any, size: int) -> int:

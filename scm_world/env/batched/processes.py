@@ -66,7 +66,11 @@ class ProcessCrew:
         self._bells: list[Bell] = []
         self._lost = ""
         self._end = weakref.finalize(self, _stop, self._workers, self._bells)
-        self._share()
+        try:
+            self._share()
+        except BaseException:
+            self._end()
+            raise
 
     def _share(self) -> None:
         """Start the processes, and let all of them write into one memory."""

@@ -182,3 +182,31 @@ def _part(column: Any, where: slice) -> Any:
     if isinstance(column, dict):
         return {name: _part(one, where) for name, one in column.items()}
     return column[where]
+
+
+def told(columns: Mapping[str, Column], which: NDArray[np.bool_]) -> dict[str, Any]:
+    """Copy what some environments said, in Gymnasium's form.
+
+    Args:
+        columns: What all of them said.
+        which: Those that are meant, shape (n,).
+
+    Returns:
+        Every column, zeros elsewhere; and beside each, after a ``_``, which ones are meant.
+
+    Example:
+        >>> told({"x": np.array([1.0, 2.0])}, np.array([False, True]))
+        {'x': array([0., 2.]), '_x': array([False,  True])}
+    """
+    found: dict[str, Any] = {}
+    everyone = bool(which.all())
+    for name, column in columns.items():
+        if isinstance(column, dict):
+            found[name] = told(column, which)
+        elif everyone:
+            found[name] = column.copy()
+        else:
+            found[name] = np.zeros_like(column)
+            found[name][which] = column[which]
+        found[f"_{name}"] = which.copy()
+    return found

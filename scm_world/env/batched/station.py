@@ -55,7 +55,7 @@ class Station:
         self._where = slice(first, first + size)
         self._crew = LoopCrew(make, size, first=first)
         self._none = [None] * size
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
 
     def form(self) -> Said:
         """Tell what the environments have in common."""
@@ -82,7 +82,7 @@ class Station:
                 self._crew.step(self._which, self._actions)
             else:
                 self._crew.reset(self._which, self._none, self._none)
-        except Exception as error:
+        except BaseException as error:  # else nobody would answer
             self._error = error
         return DONE if self._error is None and not any(self._crew.sheet.extras) else MORE
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scm_world.env.batched.asking import (
     MASK,
     actions_of,
+    chosen_of,
     index_of,
     masked,
     options_of,
@@ -23,7 +24,7 @@ from scm_world.env.batched.asking import (
 )
 from scm_world.env.batched.choice import made_crew
 from scm_world.env.batched.crew import Crew, located
-from scm_world.env.batched.sheet import Column, Sheet
+from scm_world.env.batched.sheet import told
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
@@ -303,7 +304,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             UnknownOption: There is no such environment.
         """
         number = index_of(source, self.num_envs)
-        chosen = self._all if into is None else _chosen(into, self.num_envs)
+        chosen = self._all if into is None else chosen_of(into, self.num_envs)
         others = [index for index in chosen if index != number]
         (snapshot,) = self.crew.snapshot([number])
         self.crew.restore(dict.fromkeys(others, snapshot))
@@ -321,34 +322,11 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
     def _infos(self, which: NDArray[np.bool_]) -> dict[str, Any]:
         """Give the infos of some of them, in Gymnasium's form: each with a mask."""
         sheet = self.crew.sheet
-        infos = _columns(sheet.infos, which, bool(which.all()))
+        infos = told(sheet.infos, which)
         if any(sheet.extras):
             for index in np.flatnonzero(which).tolist():
                 infos = self._add_info(infos, sheet.extras[index], index)
         return infos
-
-
-def _columns(
-    columns: Mapping[str, Column], which: NDArray[np.bool_], everyone: bool
-) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, column in columns.items():
-        if isinstance(column, dict):
-            found[name] = _columns(column, which, everyone)
-        elif everyone:
-            found[name] = column.copy()
-        else:
-            found[name] = np.zeros_like(column)
-            found[name][which] = column[which]
-        found[f"_{name}"] = which.copy()
-    return found
-
-
-def _chosen(into: Any, size: int) -> list[int]:
-    given = np.asarray(into)
-    if given.dtype == np.bool_:
-        return [int(index) for index in np.flatnonzero(masked(given, size))]
-    return [index_of(index, size) for index in np.atleast_1d(given).tolist()]
 
 
 def _mode(given: AutoresetMode | str) -> AutoresetMode:
@@ -357,6 +335,3 @@ def _mode(given: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         modes = [mode.value for mode in AutoresetMode]
         raise UnknownOption("autoreset_mode", given, modes) from None
-
-
-__all__ = ["ScmWorldVectorEnv", "Sheet", "VectorSnapshot"]

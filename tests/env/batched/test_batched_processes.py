@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 from crews import LENGTH, actions, check_alike, check_same, kept, make
 
-from scm_world.env.batched.memory import IN_MEMORY
-from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption
+from scm_world.env.batched.choice import cores, fastest
+from scm_world.env.batched.memory import IN_MEMORY, Bell, meeting_place, share
+from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption, UnwritableFolder
 from scm_world.work.processes import Worker
 
 
@@ -39,9 +41,9 @@ def test_how_many_processes_there_are_changes_nothing() -> None:
 
 
 def test_the_fastest_crew_is_taken() -> None:
-    """Bullet takes processes if there is more than one environment, and more than one core."""
-    from scm_world.env.batched.choice import cores, fastest
-
+    """MuJoCo steps them itself; Bullet takes processes if there are several, and several cores."""
+    assert fastest("mujoco", 1, workers=None) == "native"
+    assert fastest("mujoco", 2, workers=2) == "processes"
     assert fastest("bullet", 2, workers=None) == ("processes" if cores() > 1 else "loop")
     assert fastest("bullet", 1, workers=None) == "loop"
     assert fastest("fake", 2, workers=None) == "loop"
@@ -74,6 +76,31 @@ def test_a_process_that_is_killed_between_calls_is_an_error() -> None:
     envs.close()
 
 
+def test_an_interrupted_step_ends_the_crew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some environments may have stepped: it cannot go on, and no process stays."""
+
+    def interrupted(*_: Any) -> bytes:
+        raise KeyboardInterrupt
+
+    envs = make("processes", 1, workers=1)
+    envs.reset(seed=0)
+    pid = envs.crew._workers[0]._process.pid
+    with monkeypatch.context() as patched:
+        patched.setattr(Bell, "answer", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            envs.step(actions(1, 1)[0])
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    with pytest.raises(EngineFailure, match="interrupted by KeyboardInterrupt"):
+        envs.reset()
+
+
+def test_in_a_process_of_a_pool_no_process_is_started() -> None:
+    """One that ends with its parent may have no children."""
+    with Worker(partial(partial, fastest, "bullet", 4, workers=None)) as worker:
+        assert worker.ask("__call__") == "loop"
+
+
 def test_nothing_is_left_behind() -> None:
     """Memory has no name once all have it, and what was seen can be seen after the end."""
     envs = make("processes", 3, workers=2, copy=False)
@@ -88,6 +115,12 @@ def test_nothing_is_left_behind() -> None:
             os.kill(pid, 0)
     with pytest.raises(EngineFailure, match="closed; make the environments anew"):
         envs.step(actions(1, 3)[0])
+
+
+def test_too_little_memory_is_an_error() -> None:
+    """And not a process that is killed when it writes."""
+    with meeting_place() as place, pytest.raises(UnwritableFolder, match=str(place.parent)):
+        share(place, 2**50)
 
 
 def test_processes_end_with_the_crew_that_nobody_uses() -> None:

@@ -192,6 +192,7 @@ def test_what_cannot_be_reset_is_refused() -> None:
         ({"options": {"goal": 1}}, "reset option"),
         ({"options": {"do": [None]}}, "length 4"),
         ({"options": {"do": {9: {}}}}, "from 0 to 3"),
+        ({"options": {"do": {1: {}}, "reset_mask": mask | [1, 0, 0, 0] > 0}}, "that are reset"),
     ):
         with pytest.raises(UnknownOption, match=match):
             envs.reset(**given)

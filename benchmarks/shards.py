@@ -1,0 +1,203 @@
+"""What shards cost: overhead, efficiency, and whether workers may be killed while they work.
+
+Three measurements, each on every engine of work:
+
+- overhead: shards that do nothing. Goal: 5 ms each with processes, 10 ms with Ray.
+- efficiency: shards of one second of work each, against that work done in this process.
+- killed: so many interventional episodes, in shards, on Ray with three workers of which one is
+  killed (SIGKILL) again and again, at random; every file must be the one of the local run.
+
+    python benchmarks/shards.py --episodes 100000
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import signal
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from scm_world.discovery.data import Design, collect
+from scm_world.queries import World
+from scm_world.work.executors import Executor, engine_of
+
+TARGETS = ("tool_block.mass", "floor_friction", "gravity")
+
+
+# --- shards that measure --------------------------------------------------------------------------
+
+
+def nothing(job: int) -> int:
+    """Do a shard that costs nothing by itself."""
+    return job
+
+
+def second(job: int) -> int:
+    """Compute for a second of this core."""
+    end = time.process_time() + 1.0
+    while time.process_time() < end:
+        pass
+    return job
+
+
+def make_nothing() -> Callable[[int], int]:
+    """Give what does nothing."""
+    return nothing
+
+
+def make_second() -> Callable[[int], int]:
+    """Give what computes."""
+    return second
+
+
+def overhead(executor: Executor, shards: int) -> dict[str, float]:
+    """Measure shards that do nothing, once the workers are there."""
+    list(executor.run(make_nothing, range(4 * executor.workers)))
+    gaps = []
+    begun = before = time.perf_counter()
+    for _ in executor.run(make_nothing, range(shards)):
+        now = time.perf_counter()
+        gaps.append(now - before)
+        before = now
+    return {
+        "ms per shard": 1e3 * (before - begun) / shards,
+        "median ms between results": 1e3 * statistics.median(gaps),
+    }
+
+
+def efficiency(executor: Executor, shards: int) -> dict[str, float]:
+    """Measure shards of a second: their work over what the workers were there for."""
+    list(executor.run(make_second, range(executor.workers)))
+    begun = time.perf_counter()
+    list(executor.run(make_second, range(shards)))
+    seconds = time.perf_counter() - begun
+    return {"seconds": seconds, "efficiency": shards / (executor.workers * seconds)}
+
+
+# --- killed ---------------------------------------------------------------------------------------
+
+
+def workers_of_ray() -> list[int]:
+    """List the processes of Ray that are at work for this one."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            name = (entry / "cmdline").read_bytes().split(b"\0")[0]
+        except OSError:
+            continue
+        if name.startswith(b"ray::answer"):
+            found.append(int(entry.name))
+    return found
+
+
+@contextmanager
+def killing(every: float, seed: int) -> Iterator[list[int]]:
+    """Kill a worker again and again; the list says which."""
+    killed: list[int] = []
+    rng, stop = random.Random(seed), threading.Event()  # noqa: S311 # nothing secret
+
+    def kill() -> None:
+        while not stop.wait(every * rng.uniform(0.5, 1.5)):
+            there = workers_of_ray()
+            if there:
+                pid = rng.choice(there)
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    try:
+        yield killed
+    finally:
+        stop.set()
+        thread.join()
+
+
+def digest(folder: Path) -> tuple[str, int]:
+    """Sum up all files of a folder, and count them."""
+    total, files = hashlib.sha256(), sorted(folder.iterdir())
+    for path in files:
+        total.update(path.name.encode() + b"\0" + path.read_bytes())
+    return total.hexdigest(), len(files)
+
+
+def collected(out: Path, episodes: int, shard: int, engine: Executor | None) -> Any:
+    """Collect interventional episodes of pushing, of one control step each."""
+    design = Design("half", TARGETS, seen=0.3)
+    world = World("pushing", backend="fake")
+    return collect(
+        world, design, episodes, out=out, shard=shard, steps=1, seed=7, engine=engine,
+        causes=TARGETS, outcomes=["reward"],
+    )  # fmt: skip
+
+
+def killed(episodes: int, shard: int, workers: int, every: float) -> dict[str, Any]:
+    """Collect on Ray while workers are killed, and here; compare the files."""
+    with tempfile.TemporaryDirectory() as folder:
+        here, there = Path(folder) / "here", Path(folder) / "there"
+        with engine_of("ray", workers=workers) as ray, killing(every, seed=0) as dead:
+            begun = time.perf_counter()
+            table = collected(there, episodes, shard, ray)
+            seconds = time.perf_counter() - begun
+        begun = time.perf_counter()
+        with engine_of("process", workers=2) as local:
+            collected(here, episodes, shard, local)
+        alone = time.perf_counter() - begun
+        sums = digest(here), digest(there)
+    numbers = table.episode
+    return {
+        "episodes": episodes,
+        "shards": -(-episodes // shard),
+        "workers killed": len(dead),
+        "lost": episodes - len(set(numbers.tolist())) - len(table.about.get("refused", {})),
+        "twice": len(numbers) - len(set(numbers.tolist())),
+        "byte-identical to the local run": sums[0] == sums[1],
+        "sha256": sums[1][0][:16],
+        "seconds on Ray, three workers": seconds,
+        "seconds here, two processes": alone,
+    }
+
+
+# --- all ------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Measure, and print what was found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--episodes", type=int, default=100_000, help="0 to leave this out")
+    parser.add_argument("--shard", type=int, default=250, help="episodes in a shard")
+    parser.add_argument("--shards", type=int, default=2_000, help="that do nothing; 0: leave out")
+    parser.add_argument("--seconds", type=int, default=20, help="shards of a second; 0: leave out")
+    parser.add_argument("--workers", type=int, default=2, help="of processes, and of Ray")
+    parser.add_argument("--every", type=float, default=10.0, help="seconds between two kills")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    chosen = parser.parse_args()
+    found: dict[str, Any] = {}
+    for name in ("serial", "process", "ray"):
+        workers = 1 if name == "serial" else chosen.workers
+        with engine_of(name, workers=workers) as executor:
+            print(f"{name}: {executor.where}", flush=True)
+            if chosen.shards:
+                found[f"{name}, overhead"] = overhead(executor, chosen.shards)
+            if chosen.seconds:
+                found[f"{name}, efficiency"] = efficiency(executor, chosen.seconds)
+    if chosen.episodes:
+        found["killed"] = killed(chosen.episodes, chosen.shard, 3, chosen.every)
+    text = json.dumps(found, indent=1)
+    print(text)
+    if chosen.out is not None:
+        chosen.out.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,216 @@
+"""Real Ray on this machine: workers are killed, nothing is lost and nothing comes twice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from work_samples import Task, make, no_bench
+
+from scm_world.discovery.data import Design, collect, sweep
+from scm_world.discovery.exam.study import Study, examine
+from scm_world.errors import ActionError, EngineFailure, UnknownOption
+from scm_world.evaluation import evaluate
+from scm_world.queries import World
+from scm_world.work.executors import Executor, Serial, engine_of
+from scm_world.work.jobs import TRIES
+
+pytest.importorskip("ray")
+
+
+@pytest.fixture(scope="module")
+def ray() -> Iterator[Executor]:
+    """Two workers for all of them."""
+    with engine_of("ray", workers=2) as made:
+        yield made
+
+
+def pids(folder: Path, number: int) -> list[int]:
+    """List the processes that began a job."""
+    return [int(path.name.split("-")[3]) for path in sorted(folder.glob(f"try-{number}-*"))]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Read all files of a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+# --- jobs -----------------------------------------------------------------------------------------
+
+
+def test_ray_gives_the_same_bits(ray: Executor) -> None:
+    """As this process has; functions without a name are sent, too, and it says where it works."""
+    jobs = [Task(number, "product") for number in range(5)]
+    with Serial() as here:
+        assert dict(ray.run(make, jobs)) == dict(here.run(make, jobs))
+    assert list(ray.run(make, [])) == []
+    assert [*ray.run(lambda: lambda job: job + 1, [41])] == [(0, 42)]
+    assert ray.where.startswith("on Ray at ")
+    assert ray.where.endswith(", 2 workers on 1 node")
+
+
+def test_a_killed_worker_of_ray_costs_its_job(ray: Executor, tmp_path: Path) -> None:
+    """SIGKILL in the middle: it is done by another one, and no other is done twice."""
+    jobs = [Task(number, folder=tmp_path) for number in range(8)]
+    jobs[3] = Task(3, "sleep once", tmp_path)
+
+    def kill() -> None:
+        while not pids(tmp_path, 3):
+            time.sleep(0.01)
+        os.kill(pids(tmp_path, 3)[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    found = sorted(ray.run(make, jobs))
+    killer.join()
+    assert found == [(number, number**2) for number in range(8)]
+    assert [len(pids(tmp_path, number)) for number in range(8)] == [1, 1, 1, 2, 1, 1, 1, 1]
+
+
+def test_poison_jobs_are_put_aside(ray: Executor, tmp_path: Path) -> None:
+    """One that kills its workers and one that fails: the others are done before they are told."""
+    jobs = [Task(0, "die", tmp_path), Task(1, "refuse"), *(Task(n) for n in range(2, 8))]
+    found: dict[int, int] = {}
+    with pytest.raises(EngineFailure, match=r"job 0, .* was tried 3 times") as caught:
+        found.update(ray.run(make, jobs))
+    assert found == {number: number**2 for number in range(2, 8)}
+    assert len(pids(tmp_path, 0)) == TRIES
+    assert "so did job 1" in caught.value.__notes__[0]
+
+
+def test_errors_of_ray_are_told(ray: Executor) -> None:
+    """An error of ``make`` as it is; what cannot be sent, before anything is begun."""
+    made: Any = no_bench
+    with pytest.raises(ActionError, match="there is no room"):
+        list(ray.run(made, [Task(0)]))
+    with pytest.raises(UnknownOption, match="job 1 cannot be"):
+        ray.run(make, [Task(0), threading.Lock()])  # type: ignore[list-item] # it is none
+    with pytest.raises(UnknownOption, match="policy cannot be"):
+        ray.check("policy", threading.Lock())
+
+
+def test_results_of_ray_are_read_one_run_after_another(ray: Executor, tmp_path: Path) -> None:
+    """A second run is refused while the first goes on; who stops reading ends the work."""
+    first = ray.run(make, [Task(0), Task(1, "sleep", tmp_path)])
+    assert next(first) == (0, 0)
+    with pytest.raises(EngineFailure, match="at work"):
+        next(ray.run(make, [Task(0)]))
+    first.close()  # type: ignore[attr-defined] # it is a generator
+    assert sorted(ray.run(make, [Task(2), Task(3)])) == [(0, 4), (1, 9)]
+
+
+@pytest.mark.parametrize("address", ["", "ray://here:1", "here", "here:there", 7])
+def test_addresses_are_checked(address: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is no address is refused before anybody is asked."""
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    with pytest.raises(UnknownOption, match="auto, host:port"):
+        engine_of("ray", address=address)
+
+
+def test_a_cluster_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once; and a process that is connected cannot go elsewhere."""
+    with pytest.raises(UnknownOption, match="where this process is connected"):
+        engine_of("ray", address="127.0.0.1:9")
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    with pytest.raises(EngineFailure, match=r"there is no Ray at 127\.0\.0\.1:9"):
+        engine_of("ray", address="127.0.0.1:9")
+
+
+def test_a_connection_is_shared(ray: Executor) -> None:
+    """Another executor uses it, and leaves it open when it ends."""
+    with engine_of("ray", workers=1, address="auto") as other:
+        assert list(other.run(make, [Task(3)])) == [(0, 9)]
+    assert list(ray.run(make, [Task(4)])) == [(0, 16)]
+
+
+# --- what runs on it ------------------------------------------------------------------------------
+
+
+def test_a_collection_on_ray_has_the_same_files(ray: Executor, tmp_path: Path) -> None:
+    """Byte for byte those of this process; in memory it is the same table."""
+    design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
+    world = World("pushing", backend="fake")
+    how: Any = {"steps": 2, "shard": 4, "format": "csv", "nature": {"sensor_noise": 0.01}}
+    here = collect(world, design, 14, out=tmp_path / "here", **how)
+    there = collect(world, design, 14, out=tmp_path / "there", engine=ray, **how)
+    assert here == there == collect(world, design, 14, engine=ray, **how)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+
+
+def test_an_evaluation_on_ray_has_the_same_rows(ray: Executor, tmp_path: Path) -> None:
+    """And the same files."""
+    how: Any = {"n": 27, "backend": "fake", "env": {"max_episode_length": 3}}
+    here = evaluate("random", "P0,P9", out=tmp_path / "here", **how)
+    assert evaluate("random", "P0,P9", out=tmp_path / "there", engine=ray, **how) == here
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+
+
+def test_a_sweep_on_ray_has_the_same_files(ray: Executor, tmp_path: Path) -> None:
+    """The table, too."""
+    world, over = World("pushing", backend="fake"), {"tool_block.mass": [0.02, 0.08]}
+    how: Any = {"n": 5, "steps": 2, "shard": 3, "format": "csv"}
+    for name, engine in (("here", None), ("there", ray)):
+        sweep(world, over, ["reward"], out=tmp_path / name, engine=engine, **how)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+
+
+def test_an_exam_on_ray_finds_the_same_graphs(ray: Executor, tmp_path: Path) -> None:
+    """Only the seconds differ; each run is kept, and none is done again."""
+    study = Study(("er2:4",), ("pooled",), budgets=(40, 80), seeds=1, standardised=False)
+    told: list[tuple[int, int]] = []
+    here = examine(study, tmp_path / "here", workers=1)
+    there = examine(study, tmp_path / "there", engine=ray, progress=lambda *at: told.append(at))
+    graphs = [{c.key: c.found.edges.tolist() for c in exam.cells} for exam in (here, there)]
+    assert graphs[0] == graphs[1]
+    assert here.subjects == there.subjects
+    assert told == [(1, 2), (2, 2)]
+    again = examine(study, tmp_path / "there", engine=ray)
+    assert {cell.key: cell.seconds for cell in again.cells} == {
+        cell.key: cell.seconds for cell in there.cells
+    }
+
+
+# --- the driver -----------------------------------------------------------------------------------
+
+PROGRAM = """
+import sys
+from scm_world.discovery.data import Design, collect
+from scm_world.queries import World
+if __name__ == "__main__":
+    design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
+    collect(World("pushing", backend="fake"), design, 480, out=sys.argv[1], shard=4, steps=2,
+            format="csv", engine="ray", workers=2)
+"""
+
+
+def test_a_killed_driver_goes_on_where_it_was(tmp_path: Path, ray: Executor) -> None:
+    """SIGKILL leaves no worker behind, and the same call makes the files that are missing."""
+    out, script = tmp_path / "out", tmp_path / "run.py"
+    script.write_text(PROGRAM)
+    process = subprocess.Popen([sys.executable, str(script), str(out)])  # noqa: S603 # our own
+    while len(list(out.glob("shard-*"))) < 20:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    before = contents(out)
+    assert 20 <= len(before) - 1 < 120
+    design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
+    how: Any = {"steps": 2, "shard": 4, "format": "csv"}
+    times = {path: path.stat().st_mtime_ns for path in out.glob("shard-*")}
+    world = World("pushing", backend="fake")
+    whole = collect(world, design, 480, out=out, engine=ray, **how)
+    assert all(path.stat().st_mtime_ns == time_ for path, time_ in times.items())
+    assert whole == collect(world, design, 480, steps=2)
