@@ -2,6 +2,7 @@
 
 import gymnasium
 
+from scm_world.env.batched import ScmWorldVectorEnv
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.observer import CONTEXTS, MODES, Observation
 from scm_world.env.wrappers import DeltaAction, MovingAverageAction, ObjectSelector
@@ -22,4 +23,5 @@ __all__ = [
     "ObjectSelector",
     "Observation",
     "ScmWorldEnv",
+    "ScmWorldVectorEnv",
 ]

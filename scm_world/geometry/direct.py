@@ -7,8 +7,10 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numba import typeof
+import numba
 from numba.extending import is_jitted
+
+typeof: Callable[[Any], Hashable] = numba.typeof  # numba is untyped
 
 _MADE: WeakKeyDictionary[Any, dict[tuple[Hashable, ...], Callable[..., Any]]] = WeakKeyDictionary()
 """What was given before: asking numba takes longer than most of these functions."""
@@ -47,5 +49,4 @@ def _kind(value: Any) -> Hashable:
     """Give something that is the same for two values only if their types are."""
     if type(value) is np.ndarray:
         return value.dtype, value.ndim, value.flags.num
-    found: Hashable = float if type(value) is float else typeof(value)
-    return found
+    return float if type(value) is float else typeof(value)

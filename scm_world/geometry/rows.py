@@ -149,6 +149,21 @@ def _example(kind: Any) -> Any:
 
 
 @njit(cache=True)
+def move_columns(matrix: Any, rows: Any, sources: Any, targets: Any) -> None:
+    """Copy some columns of some rows into others: ``matrix[rows, targets]`` of the sources.
+
+    Args:
+        matrix: The table, shape (n, w).
+        rows: Shape (m,).
+        sources: Shape (k,).
+        targets: Shape (k,).
+    """
+    for row in rows:
+        for j in range(sources.size):
+            matrix[row, targets[j]] = matrix[row, sources[j]]
+
+
+@njit(cache=True)
 def scale_rows(matrix: Any, rows: Any, sources: Any, shifts: Any, scale: Any, out: Any) -> None:
     """Gather numbers of some rows, saturate them at their bounds, and scale them.
 

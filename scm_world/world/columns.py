@@ -13,8 +13,10 @@ import numpy as np
 
 from scm_world._types import Floats, Integers, Value
 from scm_world.entities import CONTROL_INDEX
+from scm_world.geometry.gather import places
+from scm_world.geometry.rows import move_columns
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
-from scm_world.world.equations import Equation, equation
+from scm_world.world.equations import Columns, Equation, equation
 from scm_world.world.world import World
 
 ACTION = "action"
@@ -40,17 +42,17 @@ class Table:
     def __init__(self, world: World, names: Iterable[str], n: int) -> None:
         self.declaration = world.declaration
         self.lagged = world.lagged
-        self.names = tuple(dict.fromkeys((*names, *self.lagged)))
+        self._given = tuple(names)
+        self.names = tuple(dict.fromkeys((*self._given, *self.lagged)))
         self.computed = world.needed(self.names)
         self._width = ROBOT_SIZE + BLOCK_SIZE * self.declaration.n_blocks
         self.where: dict[str, slice] = dict(self.declaration.slices)
         self.earlier: dict[str, slice] = {}
         self._place_all()
-        constants: list[float] = []
-        self._equations = self._bound(constants)
-        first = self._width
-        self.matrix = np.zeros((n, first + len(constants)))
-        self.matrix[:, first:] = constants
+        more = Columns(self._width)
+        self._equations = self._bound(more)
+        self.matrix = np.zeros((n, self._width + len(more.values)))
+        self.matrix[:, self._width :] = more.values
         self._still = tuple(
             (name, self.where[name])
             for name in self.declaration.static_names
@@ -74,27 +76,24 @@ class Table:
         first, self._width = self._width, self._width + size
         return slice(first, self._width)
 
-    def _bound(self, constants: list[float]) -> tuple[Equation, ...]:
-        """Bind the mechanisms of what is computed; their constants become columns at the end."""
+    def _bound(self, more: Columns) -> tuple[Equation, ...]:
+        """Bind the mechanisms of what is computed."""
+        model = self.declaration.model
         return tuple(
-            equation(self.declaration.model, name, self.where, self.earlier, constants, self._width)
-            for name in self.computed
+            equation(model, name, self.where, self.earlier, more) for name in self.computed
         )
 
     def _memory(self) -> tuple[Integers, Integers]:
         """List the columns that a step remembers, and where it does."""
-        pairs = [(self.where[name], self.earlier[name]) for name in self.lagged]
-        sources = [np.arange(source.start, source.stop) for source, _ in pairs]
-        targets = [np.arange(target.start, target.stop) for _, target in pairs]
-        nothing = [np.empty(0, dtype=np.int64)]
-        return np.concatenate(nothing + sources), np.concatenate(nothing + targets)
+        present = places(self.where[name] for name in self.lagged)
+        return present, places(self.earlier[name] for name in self.lagged)
 
     # --- to and from single worlds ------------------------------------------------------------
 
     def load(self, row: int, world: World) -> None:
         """Take over the present of a world of this structure."""
         numbers = self.matrix[row]
-        now, (_, state) = world.evaluate(self.names), world.current()
+        now, (_, state) = world.evaluate(self._given), world.current()  # and what is remembered
         numbers[: state.vector.size] = state.vector
         for name, place in self._still:
             numbers[place] = np.ravel(now[name])
@@ -124,9 +123,7 @@ class Table:
 
     def remember(self, rows: Integers) -> None:
         """Let the present of some rows become what was one control step ago."""
-        sources, targets = self._remembered
-        if len(sources):
-            self.matrix[rows[:, None], targets] = self.matrix[rows[:, None], sources]
+        move_columns(self.matrix, rows, *self._remembered)
 
     def advance(self, rows: Integers, actions: Floats) -> None:
         """Write the actions of some rows, shape (n, 9), and let their clocks go on."""

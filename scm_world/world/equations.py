@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, Protocol, final
 
 import numpy as np
@@ -13,12 +11,37 @@ from numba.core.errors import NumbaError
 from numba.extending import is_jitted
 
 from scm_world._types import Floats, Integers, Value, Values
-from scm_world.geometry.rows import VECTOR, Each
+from scm_world.geometry.gather import places
+from scm_world.geometry.rows import VECTOR, Each, move_columns
 from scm_world.graph import SCM
 from scm_world.variables import Linear, Parent
 from scm_world.variables.kinds import Variable
+from scm_world.variables.mechanisms import Stacked
+from scm_world.world.bound import positional
 
 Places = Mapping[str, slice]
+
+
+@final
+class Columns:
+    """Columns at the end of a table, for what is no variable.
+
+    Args:
+        first: Number of the first one.
+
+    Attributes:
+        values: What stands in them at first.
+    """
+
+    def __init__(self, first: int) -> None:
+        self._first = first
+        self.values: list[float] = []
+
+    def take(self, value: Any) -> slice:
+        """Take as many as a number or vector needs."""
+        first = self._first + len(self.values)
+        self.values.extend(map(float, np.ravel(value)))
+        return slice(first, self._first + len(self.values))
 
 
 class Equation(Protocol):
@@ -48,6 +71,29 @@ class Compiled:
     def compute(self, matrix: Floats, rows: Integers) -> None:
         """Call it for each row."""
         self._each(matrix, rows)
+
+
+@final
+class Together:
+    """A compiled function of one vector, which is put together first.
+
+    Args:
+        function: Of the vector.
+        sources: Columns of its parts.
+        place: Its own columns.
+    """
+
+    def __init__(self, function: Compiled, sources: list[slice], place: slice) -> None:
+        self._function, self._sources = function, places(sources)
+        self._targets = places([place])
+
+    def begin(self, row: int, now: Values) -> None:
+        """Need nothing."""
+
+    def compute(self, matrix: Floats, rows: Integers) -> None:
+        """Collect the numbers of each row, and call it."""
+        move_columns(matrix, rows, self._sources, self._targets)
+        self._function.compute(matrix, rows)
 
 
 @final
@@ -131,8 +177,7 @@ def equation(
     name: str,
     where: Places,
     earlier: Places,
-    constants: list[float],
-    width: int,
+    more: Columns,
 ) -> Equation:
     """Bind the mechanism of a variable to columns.
 
@@ -141,8 +186,7 @@ def equation(
         name: Of the variable.
         where: Columns of present values.
         earlier: Columns of values of one control step ago.
-        constants: Values of columns that follow the others; those of this mechanism are added.
-        width: How many columns there are before them.
+        more: Columns for constants, and for vectors that are put together.
     """
     variable: Any = model.declared(name)
     parents: tuple[Parent, ...] = tuple(variable.all_parents)
@@ -151,55 +195,35 @@ def equation(
     place = where[name]
     if isinstance(variable.mechanism, Linear):
         return Weighted(variable.mechanism, columns, place)
-    function = variable.mechanism.bind()
-    found = _compiled(function, shapes, variable, len(constants) + width)
-    if found is None:
-        return Called(function, parents, columns, shapes, place)
-    signature, more, values = found
-    constants.extend(values)
-    return Compiled(Each(_inner(function), signature, columns + more, place))
+    bound = variable.mechanism.bind()
+    function, constants = positional(bound, len(parents))
+    stacked = isinstance(function, Stacked)
+    if stacked:
+        function, shapes = function.kernel, [(sum(c.stop - c.start for c in columns),)]
+    kinds = [VECTOR if shape else types.float64 for shape in (*shapes, *map(np.shape, constants))]
+    signature = None
+    if parents and all(len(shape) < 2 for shape in shapes):
+        signature = _signature(function, kinds, variable)
+    if signature is None:
+        shapes = [model.declared(p.name).shape for p in parents]
+        return Called(bound, parents, columns, shapes, place)
+    sources = columns
+    if stacked:
+        columns = [more.take(np.zeros(shapes[0]))]
+    columns = [*columns, *map(more.take, constants)]
+    compiled = Compiled(Each(function, signature, columns, place))
+    return Together(compiled, sources, columns[0]) if stacked else compiled
 
 
-def _inner(function: Any) -> Any:
-    return function.func if isinstance(function, partial) else function
-
-
-def _compiled(
-    function: Any, shapes: list[tuple[int, ...]], variable: Variable, width: int
-) -> tuple[Any, list[slice], list[float]] | None:
-    """Find the signature with which a dispatcher is called; None where it is none, or has none.
-
-    Returns:
-        The signature, the columns of the constants, and their values.
-    """
-    inner = _inner(function)
-    if not is_jitted(inner) or not shapes or any(len(shape) > 1 for shape in shapes):
+def _signature(function: Any, kinds: list[Any], variable: Variable) -> Any:
+    """Find the signature with which a dispatcher is called; None where it is none, or has none."""
+    if not is_jitted(function):
         return None
-    kinds = [VECTOR if shape else types.float64 for shape in shapes]
-    slices: list[slice] = []
-    values: list[float] = []
-    for value in _constants(function, len(shapes)):
-        numbers = np.ravel(value).tolist()
-        first = width + len(values)
-        slices.append(slice(first, first + len(numbers)))
-        values.extend(map(float, numbers))
-        kinds.append(VECTOR if np.ndim(value) else types.float64)
     try:
-        inner.compile(tuple(kinds))
-        made: Any = inner.overloads[tuple(kinds)]
-        result = made.signature.return_type
+        function.compile(tuple(kinds))
+        made: Any = function.overloads[tuple(kinds)]
     except (NumbaError, KeyError, RuntimeError):
         return None
+    result = made.signature.return_type
     one, several = isinstance(result, types.Number | types.Boolean), result == VECTOR
-    if not (several if variable.shape else one):
-        return None
-    return result(*kinds), slices, values
-
-
-def _constants(function: Any, count: int) -> list[Any]:
-    """Give the constants of a function in the order of its parameters, after the parents."""
-    if not isinstance(function, partial):
-        return []
-    inner: Any = function.func
-    names = list(inspect.signature(inner.py_func).parameters)[count:]
-    return [function.keywords[name] for name in names if name in function.keywords]
+    return result(*kinds) if (several if variable.shape else one) else None

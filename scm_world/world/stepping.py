@@ -112,7 +112,7 @@ class Stepped(Declared):
         """Be at another control step; where everything is has been written already."""
         self._index = index
         self._clock[...] = index
-        self._readouts.stale()
+        self._readouts.moved()
         self._instant = None
 
     def arrive(self, vector: Floats, index: int, action: Floats, earlier: Values) -> None:
