@@ -19,9 +19,6 @@ from scm_world.variables.mechanisms import Stacked
 
 Now = dict[str, Value]
 
-_Call = tuple[str, Callable[[], Any]]
-"""A variable, and how it is computed from what is where it always is."""
-
 _Step = tuple[str, Callable[..., Any], Callable[[Now], Iterable[Any]], tuple[Any, ...]]
 """A variable, its function, what picks the arguments, and constants that follow them."""
 
@@ -41,63 +38,85 @@ class Bound:
     """
 
     def __init__(self, model: SCM, now: Now, names: Iterable[str]) -> None:
-        self._model, self._now, self._names = model, now, tuple(names)
-        parents = [p for name in self._names for p in _parents(model, name)]
-        replaced = {*self._names, *(v.name for v in model.variables if isinstance(v, Action))}
-        self._lasting = tuple({key(p): None for p in parents if key(p) not in replaced})
-        self._known: list[Value] | None = None
-        self._calls: list[_Call] = []
+        self._now = now
+        rules = [_Rule(model, name) for name in names]
+        replaced = {rule.name for rule in rules}
+        replaced |= {v.name for v in model.variables if isinstance(v, Action)}
+        self._keys = tuple({k: None for rule in rules for k in rule.keys if k not in replaced})
+        lasting, self._once = set(self._keys), list[_Rule]()
         self._steps: list[_Step] = []
+        self._written: dict[str, Value] = {}
+        for rule in rules:
+            if not lasting.issuperset(rule.keys):
+                self._steps.append(rule.step())
+                continue
+            self._once.append(rule)
+            if rule.writes:  # into an array that is where it always is from then on
+                lasting.add(rule.name)
+                self._written[rule.name] = np.empty(rule.shape)
+        self._known: list[Value] | None = None
+        self._given: dict[str, list[Any]] = {}
+        self._calls: dict[str, Callable[[], Any]] = {}
 
     def check(self) -> None:
         """Look the arguments up again if one of them is another object now."""
-        found = [self._now[name] for name in self._lasting]
-        if self._known is None or not all(map(is_, found, self._known)):
-            self._known, self._calls, self._steps = found, [], []
-            lasting = set(self._lasting)
-            for name in self._names:
-                self._bind(name, lasting)
+        found = [self._now[name] for name in self._keys]
+        if self._known is not None and all(map(is_, found, self._known)):
+            return
+        self._known = found
+        for rule in self._once:
+            given = [self._written.get(name, self._now.get(name)) for name in rule.keys]
+            known = self._given.get(rule.name)
+            if known is None or not all(map(is_, given, known)):
+                self._given[rule.name] = given
+                self._calls[rule.name] = rule.call(given, self._written.get(rule.name))
 
     def run(self) -> None:
         """Compute everything, into the present values."""
         now = self._now
-        for name, call in self._calls:
+        for name, call in self._calls.items():
             now[name] = call()
         for name, function, pick, constants in self._steps:
             now[name] = function(*pick(now), *constants)
 
-    def _bind(self, name: str, lasting: set[str]) -> None:
-        """Bind one mechanism; an array that is written into is where it always is from then on."""
-        mechanism: Any = self._model.declared(name)
-        parents = _parents(self._model, name)
-        function, constants = positional(mechanism.mechanism.bind(), len(parents))
-        keys = tuple(map(key, parents))
-        if lasting.issuperset(keys):
-            self._calls.append((name, self._call(mechanism, function, keys, constants)))
-            if hasattr(function, "into"):
-                lasting.add(name)
-            return
-        if all(_is_number(self._model.declared(p.name)) for p in parents):
-            function = direct(function, *(0.0 for _ in parents), *constants)
-        pick = itemgetter(*keys) if len(keys) > 1 else partial(_only, keys[0])
-        self._steps.append((name, function, pick, constants))
 
-    def _call(
-        self, mechanism: Any, function: Any, keys: tuple[str, ...], constants: tuple[Any, ...]
-    ) -> Callable[[], Any]:
-        """Bind a function whose arguments stay the same objects."""
-        given = [self._now[key] for key in keys]
+@final
+class _Rule:
+    """A mechanism, and where its arguments are.
+
+    Attributes:
+        name: Of the variable.
+        keys: Of the parents.
+        shape: Of the value.
+        writes: Whether its function can write into an array.
+    """
+
+    def __init__(self, model: SCM, name: str) -> None:
+        variable: Any = model.declared(name)
+        parents: tuple[Parent, ...] = tuple(variable.all_parents)
+        self.name, self.shape = name, variable.shape
+        self.keys = tuple(map(key, parents))
+        self._function, self._constants = positional(variable.mechanism.bind(), len(parents))
+        self.writes = hasattr(self._function, "into")
+        self._moves = [k not in model or isinstance(model.declared(k), Measured) for k in self.keys]
+        self._numbers = all(_is_number(model.declared(p.name)) for p in parents)
+
+    def step(self) -> _Step:
+        """Bind it to what is looked up in every step."""
+        function, keys = self._function, self.keys
+        if self._numbers:
+            function = direct(function, *(0.0 for _ in keys), *self._constants)
+        pick = itemgetter(*keys) if len(keys) > 1 else partial(_only, keys[0])
+        return self.name, function, pick, self._constants
+
+    def call(self, given: list[Any], written: Value | None) -> Callable[[], Any]:
+        """Bind it to arguments that stay the same objects."""
+        function, constants = self._function, self._constants
         if isinstance(function, Stacked):
-            states = [self._is_state(key) for key in keys]
-            return _Stack(function, given, states, constants)
-        if hasattr(function, "into"):
-            self._now[mechanism.name] = written = np.empty(mechanism.shape)
+            return _Stack(function, given, self._moves, constants)
+        if self.writes:
             return _Written(function.into, (*given, *constants, written))
         return partial(direct(function, *given, *constants), *given, *constants)
-
-    def _is_state(self, name: str) -> bool:
-        """Tell whether a value that stays the same object is written into."""
-        return name not in self._model or isinstance(self._model.declared(name), Measured)
 
 
 @final
@@ -200,8 +219,3 @@ def _only(name: str, now: Now) -> tuple[Value]:
 
 def _is_number(variable: Any) -> bool:
     return bool(variable.shape == () and variable.dtype == "real")
-
-
-def _parents(model: SCM, name: str) -> tuple[Parent, ...]:
-    variable: Any = model.declared(name)
-    return tuple(variable.all_parents)

@@ -109,8 +109,12 @@ class Readouts:
 
     def _keep(self, name: str, value: Value) -> None:
         """Keep a value of one step ago, beside the present ones so that one look-up finds all."""
-        self._before[name] = self._now[key(Parent(name, 1))] = np.array(value)
-        self._sure = None
+        kept, found = self._before.get(name), np.asarray(value)
+        if kept is None or (kept.shape, kept.dtype) != (found.shape, found.dtype):
+            self._before[name] = self._now[key(Parent(name, 1))] = found.copy()
+            self._sure = None
+        else:  # the same array, so that nothing has to be bound anew
+            kept[...] = found
 
 
 def computed_order(model: SCM) -> tuple[str, ...]:
