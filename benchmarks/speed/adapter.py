@@ -9,14 +9,11 @@ from typing import Any
 from benchmarks.speed.subprocesses import asked
 from benchmarks.speed.timing import Settings
 
-ADAPTER, LIBRARY = "scm_world.training.sb3", "stable_baselines3"
+LIBRARY = "stable_baselines3"
 
 
 def adapting(settings: Settings) -> dict[str, Any]:
     """Measure with the interpreter that has the library; nothing if none has it."""
-    if importlib.util.find_spec(ADAPTER) is None:
-        print("the adapter to Stable-Baselines3 is left out: there is none")
-        return {}
     python = settings.sb3
     if python is None and importlib.util.find_spec(LIBRARY) is not None:
         python = sys.executable

@@ -18,7 +18,8 @@ from scm_world.env import IDS
 
 WORLDS, FEW = 64, 8
 STEPS, ROUNDS = 40, 7
-ENOUGH = 300  # control steps: every world ends an episode of 250 once
+LENGTH = 250  # of an episode [control steps]
+ENOUGH = 300  # control steps: every world ends an episode once
 SIZES = (1, 2, 4, 8, 16, 32, 64)
 NAMES = {task: name for name, task in IDS.items()}
 Clock = Callable[[], float]
@@ -96,8 +97,9 @@ def beside_the_engine(case: Case, worlds: int, settings: Settings) -> dict[str, 
 
 def living(case: Case, worlds: int, settings: Settings) -> dict[str, float]:
     """Count control steps in a second of the processor, with every reset that falls due."""
-    envs = vector(case, worlds, threads=1)
-    given = actions(settings.steps(ENOUGH), worlds)
+    length, steps = settings.steps(LENGTH), settings.steps(ENOUGH)
+    envs = vector(case, worlds, threads=1, max_episode_length=length)
+    given = actions(steps, worlds)
     ended, started = 0, time.process_time()
     for action in given:
         _, _, terminated, truncated, _ = envs.step(action)
@@ -128,7 +130,10 @@ def together(
         rows = in_turns(sides, settings.rounds(ROUNDS))
         for env in envs.values():
             env.close()
-    found = {f"{side}, wall [µs]": value for side, value in medians(rows).items()}
+    found = {
+        f"{side}, {'wall' if side[0].isdigit() else 'processor'} [µs]": value
+        for side, value in medians(rows).items()
+    }
     found[f"2 {hands} to 1: ratio"] = ratio(rows, f"1 {hands}", f"2 {hands}")
     if "predecessor" in rows:
         found["predecessor: ratio"] = ratio(rows, "predecessor", f"2 {hands}")

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, final
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from scm_world.curricula.choices import count
+from scm_world.curricula.crew import CurriculumCrew
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.situations import Memory
 from scm_world.curricula.wrapper import CurriculumEnv, place
+from scm_world.env import IDS
+from scm_world.env.batched.choice import fastest
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.world.start import whole_number
 
-MODES = ("sync", "async")
+NATIVE = "native"
+MODES = (NATIVE, "sync", "async")
+
+_TIME_LIMIT = "max_episode_steps"
+_OF_MAKE = (_TIME_LIMIT, "disable_env_checker")
+"""Options of ``gymnasium.make`` that are about its wrappers."""
 
 
 def make_vec(
@@ -25,7 +35,7 @@ def make_vec(
     num_envs: int,
     curriculum: Any,
     *,
-    vectorization_mode: str = "sync",
+    vectorization_mode: str | None = None,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     **options: Any,
 ) -> CurriculumVectorEnv:
@@ -35,12 +45,15 @@ def make_vec(
         env_id: Such as ``"scm_world/Pushing-v0"``.
         num_envs: How many.
         curriculum: What is done in each of them; see ``CurriculumEnv``.
-        vectorization_mode: ``"sync"``: in this process; ``"async"``: each in one of its own.
+        vectorization_mode: ``"native"``: many in one call of the engine; ``"sync"``: in this
+            process, one after another; ``"async"``: each in one of its own; None: native where
+            the engine has it, else sync. What comes out does not depend on it.
         autoreset_mode: When a member that is done begins anew, as in Gymnasium.
-        options: Of the environments.
+        options: Of the environments; ``threads`` with ``"native"``.
 
     Raises:
-        UnknownOption: There is no such mode, or the number is none.
+        UnknownOption: There is no such mode, the number is none, or ``max_episode_steps`` is
+            given with ``"native"``, which has ``max_episode_length``.
 
     Example:
         >>> envs = make_vec("scm_world/Pushing-v0", 2, {"floor_friction": 0.4}, backend="fake")
@@ -48,13 +61,37 @@ def make_vec(
         (2, 56)
         >>> envs.close()
     """
-    if vectorization_mode not in MODES:
-        raise UnknownOption("vectorization_mode", vectorization_mode, MODES)
+    mode = vectorization_mode or (NATIVE if _has_native(env_id, options) else "sync")
+    if mode not in MODES:
+        raise UnknownOption("vectorization_mode", mode, MODES)
     n = whole_number("num_envs", num_envs, least=1)
     made = as_curriculum(curriculum)
+    if mode == NATIVE:
+        return CurriculumVectorEnv(_native(env_id, n, made, autoreset_mode, options), made)
     one = partial(_one, env_id, made, options)
-    kind: Any = SyncVectorEnv if vectorization_mode == "sync" else AsyncVectorEnv
+    kind: Any = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
     return CurriculumVectorEnv(kind([one] * n, autoreset_mode=autoreset_mode), made)
+
+
+def _has_native(env_id: str, options: Mapping[str, Any]) -> bool:
+    """Tell whether the engine steps many worlds in one call, and nothing needs single ones."""
+    kind = fastest(str(options.get("backend", "mujoco")), 1, workers=None)
+    return kind == NATIVE and env_id in IDS and options.get(_TIME_LIMIT) is None
+
+
+def _native(
+    env_id: str, n: int, curriculum: Curriculum, mode: AutoresetMode, options: Mapping[str, Any]
+) -> Any:
+    if options.get(_TIME_LIMIT) is not None:
+        allowed = ("max_episode_length=…", "vectorization_mode='sync'")
+        raise UnknownOption(f"{_TIME_LIMIT} with {NATIVE!r}", options[_TIME_LIMIT], allowed)
+    own = {name: value for name, value in options.items() if name not in _OF_MAKE}
+    kind = VectorizeMode.VECTOR_ENTRY_POINT
+    envs: Any = gymnasium.make_vec(
+        env_id, n, vectorization_mode=kind, autoreset_mode=mode, crew=NATIVE, **own
+    )
+    envs.crew = CurriculumCrew(envs.crew, curriculum)
+    return envs
 
 
 def _one(env_id: str, curriculum: Curriculum, options: dict[str, Any]) -> CurriculumEnv:
@@ -73,7 +110,8 @@ class CurriculumVectorEnv(VectorWrapper):
     one began, and its stage is the one of before.
 
     Args:
-        env: A vector environment whose members are each in a ``CurriculumEnv``.
+        env: A vector environment whose members are each in a ``CurriculumEnv``, or are in a
+            ``CurriculumCrew``.
         curriculum: The same as theirs.
 
     Raises:

@@ -14,6 +14,7 @@ from scm_world.curricula.turns import Turn
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import flatten
+from scm_world.world import World
 from scm_world.world.start import whole_number
 
 
@@ -70,21 +71,11 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         self._inner = environment(env, "CurriculumEnv")
         _refuse_forgetful(self._layers())
-        self._checked = self._check(made)
+        self._checked = is_checked(made, self._inner.world)
         self._turn = Turn(made)
         self._begun = self._running = self._stepped = self._success = False
         self._next: tuple[int, Memory] | None = None
         self._place: tuple[int, int] | None = None
-
-    def _check(self, curriculum: Curriculum) -> bool:
-        """Look for what is wrong; tell whether all names are known already."""
-        try:
-            curriculum.check(self._inner.world)
-        except UnknownVariable:
-            if not len(self._inner.world.family.head):
-                raise
-            return False
-        return True
 
     def _layers(self) -> Iterator[gymnasium.Wrapper[Any, Any, Any, Any]]:
         """List the wrappers inside of this one, from the outermost on."""
@@ -212,6 +203,21 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             if isinstance(layer, gymnasium.ObservationWrapper):
                 seen = layer.observation(seen)
         return seen, {**info, **known}
+
+
+def is_checked(curriculum: Curriculum, world: World) -> bool:
+    """Look for what is wrong; tell whether all names are known already.
+
+    Raises:
+        InterventionError: The curriculum names something that does not exist.
+    """
+    try:
+        curriculum.check(world)
+    except UnknownVariable:
+        if not len(world.family.head):
+            raise
+        return False
+    return True
 
 
 def place(given: Any) -> tuple[int, int] | None:

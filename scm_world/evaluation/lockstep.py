@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -177,7 +177,8 @@ class Lockstep:
     def _note(self, seats: list[_Seat], rows: list[int]) -> None:
         """Take down what a control step gave."""
         sheet = self._ready().sheet
-        rewards, infos = sheet.rewards.tolist(), sheet.infos
+        infos: Mapping[str, Any] = sheet.infos
+        rewards = sheet.rewards.tolist()
         fractions, successes = infos[FRACTION], infos[FLAGS[0]]
         for row in rows:
             seats[row].game.stepped(rewards[row], float(fractions[row]))

@@ -6,8 +6,8 @@ from collections.abc import Callable, Hashable
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import numpy as np
 import numba
+import numpy as np
 from numba.extending import is_jitted
 
 typeof: Callable[[Any], Hashable] = numba.typeof  # numba is untyped

@@ -1,4 +1,4 @@
-"""Many episodes: together where the engine can, in threads, or one after another.
+"""Many episodes: together where the engine can; else in processes, threads, or one by one.
 
 What comes out depends on nothing of that.
 """
@@ -6,10 +6,13 @@ What comes out depends on nothing of that.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import multiprocessing
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from typing import TypeVar
 
 from scm_world.errors import EngineFailure
+from scm_world.queries.crews import crew, sent
 from scm_world.queries.lockstep import advanced, is_known
 from scm_world.queries.stages import Stage, threaded
 from scm_world.queries.traces import Trace
@@ -45,42 +48,57 @@ def lived(
         units: All of the same steps, with the same names and kind of policy.
         finish: Told the place of a unit, and how it ended; what it raises is raised. It may be
             called by several threads, in any order.
-        workers: Threads. Where the engine steps many worlds in one call and actions are known
-            beforehand these are its own, as many as there are cores if None; else None is one.
+        workers: Threads, see ``Setting``.
 
     Returns:
         What ``finish`` gave, in the order of the units.
     """
     given = None if workers is None else whole_number("workers", workers, least=1)
-    n = _together(stage, units, given or cores())
-    if n < LEAST:
+    endings = _elsewhere(stage, units, given)
+    if endings is None:
         return _apart(stage, units, finish, given or 1)
-    found: list[R] = []
-    for first in range(0, len(units), n):
-        endings = _advanced(stage, units[first : first + n], n, given or cores())
-        found += [finish(place, ending) for place, ending in enumerate(endings, first)]
-    return found
+    with closing(endings):
+        return [finish(place, ending) for place, ending in enumerate(endings)]
+
+
+Endings = Generator[Ending, None, None]
+
+
+def _elsewhere(stage: Stage, units: Sequence[Unit], workers: int | None) -> Endings | None:
+    """Let units happen together, or in processes; None where neither pays."""
+    is_child = multiprocessing.parent_process() is not None  # one of many that share the cores
+    threads = workers or (1 if is_child else cores())
+    n = _together(stage, units, threads)
+    if n:
+        return _stepped(stage, units, n, threads)
+    executor = None if stage.batches else crew(stage, units, workers or 1)
+    return None if executor is None else sent(executor, stage, units)
 
 
 def _together(stage: Stage, units: Sequence[Unit], threads: int) -> int:
-    """Say how many units are worth stepping together.
+    """Say how many units to step together; none if that does not pay.
 
     Each further world makes a step cheaper by less, and costs the same.
     """
     if not stage.batches or len(units) < LEAST or not is_known(units[0]):
         return 0
     steps = len(units) * (units[0].steps - units[0].first)
-    worth = max(math.isqrt(steps * threads // PRICE), stage.at_hand)
-    rounds = math.ceil(len(units) / min(worth, MOST)) if worth else 0
-    return math.ceil(len(units) / rounds) if rounds else 0
+    worth = math.isqrt(steps * threads // PRICE)
+    if worth < LEAST:
+        return 0
+    most = min(max(worth, stage.at_hand), MOST)
+    return math.ceil(len(units) / math.ceil(len(units) / most))
 
 
-def _advanced(stage: Stage, units: Sequence[Unit], n: int, threads: int) -> list[Ending]:
-    try:
-        with stage.together(n, units[0].names, threads) as batch:
-            return advanced(batch, units)
-    except EngineFailure:  # alone, it ends nothing but the unit in which it happens
-        return _apart(stage, units, lambda _, ending: ending, 1)
+def _stepped(stage: Stage, units: Sequence[Unit], n: int, threads: int) -> Endings:
+    """Let units happen together, some at a time."""
+    with stage.together(n, units[0].names, threads) as batch:
+        for first in range(0, len(units), n):
+            some = units[first : first + n]
+            try:
+                yield from advanced(batch, some)
+            except EngineFailure:  # alone, it ends nothing but the unit in which it happens
+                yield from _apart(stage, some, lambda _, ending: ending, 1)
 
 
 def _apart(
@@ -88,10 +106,7 @@ def _apart(
 ) -> list[R]:
     def one(place: int) -> R:
         with stage.twin() as world:
-            try:
-                ending: Ending = units[place].lived(world)
-            except Exception as error:
-                ending = error
+            ending = units[place].ended(world)
         return finish(place, ending)
 
     return threaded(one, range(len(units)), workers)

@@ -42,8 +42,10 @@ class Setting:
         seed: Of the noise; episode i of one seed is the same unit in every question.
         workers: Threads; the result does not depend on how many. Where the engine steps many
             worlds in one call, and the policy does not look at the world (``"random"``,
-            ``"sweep"``, ``"across"``, given actions, None), these are threads of the engine, as
-            many as there are cores if None. Else None is one.
+            ``"sweep"``, ``"across"``, given actions, None), these are threads of the engine; None
+            is as many as there are cores, or one in a worker process. Else None is one. On an
+            engine that steps one world at a time, two or more stand for processes as soon as
+            these pay; a script needs ``if __name__ == "__main__"`` then.
     """
 
     policy: Any = "random"

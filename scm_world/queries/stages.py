@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import threading
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar, final
 from weakref import WeakKeyDictionary
 
+from scm_world.work.executors import Executor, Processes
 from scm_world.world import World
 from scm_world.world.batch import Batch
 from scm_world.world.family import Family
@@ -40,11 +42,12 @@ class Stage:
         self._free: list[World] = []
         self._lock = threading.Lock()
         self._choir: list[World] = []
+        self._crew: Executor | None = None
         self._singing = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the twins."""
-        private = ("_free", "_lock", "_choir", "_singing")
+        private = ("_free", "_lock", "_choir", "_singing", "_crew")
         return {name: value for name, value in self.__dict__.items() if name not in private}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -78,16 +81,32 @@ class Stage:
             worlds, self._choir = self._choir[:n], self._choir[n:]
             while len(worlds) < n:
                 worlds.append(self._make(worlds[0].family if worlds else None))
-            batch = Batch(worlds, threads=threads, names=names)
-            yield batch
-            for world in worlds:
-                world.backend.state()  # the state comes back, and the batch can be forgotten
-            self._choir = worlds + self._choir
+            try:
+                yield Batch(worlds, threads=threads, names=names)
+            finally:
+                for world in worlds:
+                    if world.has_begun:
+                        world.backend.state()  # it comes back, and the batch can be forgotten
+                self._choir = worlds + self._choir
 
     @property
     def at_hand(self) -> int:
         """How many twins there are that can be stepped together."""
         return len(self._choir)
+
+    def has_crew(self, workers: int) -> bool:
+        """Tell whether there are processes already."""
+        return self._crew is not None and self._crew.workers == workers
+
+    def crew(self, workers: int) -> Executor:
+        """Give processes, which end with the stage."""
+        with self._lock:
+            if self._crew is None or self._crew.workers != workers:
+                if self._crew is not None:
+                    self._crew.close()
+                self._crew = Processes(workers)
+                weakref.finalize(self, self._crew.close)
+            return self._crew
 
     def _make(self, family: Family | None = None) -> World:
         task = copy.copy(self.task) if family is None else family

@@ -78,6 +78,13 @@ class Unit:
         )
         return trace
 
+    def ended(self, world: World) -> Trace | Exception:
+        """Let it happen in a world by itself; give what stopped it, if something did."""
+        try:
+            return self.lived(world)
+        except Exception as error:
+            return error
+
     def acts(self) -> Policy:
         """Make the policy, for one life."""
         return as_policy(self.policy)

@@ -27,6 +27,7 @@ QUIET = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # or it warns of a change of its own
 }
 PATIENCE = 10.0  # [s] for the head of a cluster to answer
+HINT = "; if the cluster asks for a token, set RAY_AUTH_MODE=token as well"
 ADDRESSES = ("auto", "host:port of the head of a running cluster")
 
 
@@ -61,7 +62,7 @@ def connected(workers: int | None, address: str | None) -> RayEngine:
         ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
         where = "on this machine" if address is None else f"at {address}"
-        raise EngineFailure(f"there is no Ray {where}: {error}", RAY) from None
+        raise EngineFailure(f"there is no Ray {where}: {error}{HINT}", RAY) from None
     return RayEngine(ray, workers, is_mine=True)
 
 

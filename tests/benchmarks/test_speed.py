@@ -13,7 +13,7 @@ sys.path.insert(0, str(ROOT))  # the scripts are no part of the package
 
 from benchmarks.speed import __main__ as command  # noqa: E402 # from there
 from benchmarks.speed import goals, tables  # noqa: E402
-from benchmarks.speed.batches import beside_the_engine, over_worlds  # noqa: E402
+from benchmarks.speed.batches import beside_the_engine, living, over_worlds  # noqa: E402
 from benchmarks.speed.growth import line  # noqa: E402
 from benchmarks.speed.memory import resets, resident  # noqa: E402
 from benchmarks.speed.parts import PARTS, split, split_batch  # noqa: E402
@@ -180,6 +180,11 @@ def test_batch_and_plain_loop_live_the_same_episodes() -> None:
 
     assert found["step of a world [µs]"] > 0.0 < found["raw physics [µs]"]
     assert set(over_worlds(PUSHING, QUICK)) >= {"1 [µs]", "8 [µs]", "R²"}
+
+
+def test_every_world_begins_anew_once() -> None:
+    """Control steps are counted with the resets that fall due."""
+    assert living(PUSHING, 3, QUICK)["episodes that ended"] == 3.0
 
 
 def test_profile_has_every_part() -> None:

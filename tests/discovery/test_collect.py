@@ -184,8 +184,8 @@ def test_a_row_of_a_world_is_its_episode(world: World) -> None:
     assert found.columns[1].unit == "kg"
 
 
-def test_order_shards_and_threads_do_not_matter(world: World) -> None:
-    """The same rows come out of one shard and one thread as of many."""
+def test_order_shards_and_workers_do_not_matter(world: World) -> None:
+    """The same rows come out of one shard and one worker as of many."""
     design = Design("half", (MASS, FRICTION, "gravity"))
     how: Any = {"steps": 2, "nature": {"sensor_noise": 0.01, "tool_block.friction": "A"}}
     whole = collect(world, design, 12, seed=1, **how)

@@ -119,6 +119,7 @@ def test_addresses_are_checked(address: Any, monkeypatch: pytest.MonkeyPatch) ->
         engine_of("ray", address=address)
 
 
+@pytest.mark.usefixtures("ray")
 def test_a_cluster_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """At once; and a process that is connected cannot go elsewhere."""
     with pytest.raises(UnknownOption, match="where this process is connected"):

@@ -85,6 +85,11 @@ class Episodes:
         self.edges: tuple[Edge, ...] | None = world.model.edges
         self.about: dict[str, Any] = self._about()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Go elsewhere, where workers share the cores: an engine has one thread there."""
+        setting = replace(self._setting, workers=self._setting.workers or 1)
+        return {**self.__dict__, "_setting": setting}
+
     def _about(self) -> dict[str, Any]:
         setting = self._setting
         return {

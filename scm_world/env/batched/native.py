@@ -143,22 +143,30 @@ class NativeCrew:
         """Let one of them be used by itself; what it shows afterwards is in its row.
 
         Unlike ``do`` and ``reset``, this takes nothing back if something is refused.
+
+        Raises:
+            InterventionError: It is not observed like the others any more.
         """
         env = self._envs[index]
+        seen = env.observation_space
         self._bring([index])
         try:
             yield env
         finally:
             self._look([index])
-        self.sheet.write(index, *env.present())
+        shown = env.present()
+        if env.observation_space is not seen:
+            self.form.check(env, "what was done")
+        self.sheet.write(index, *shown)
 
     def state(self, index: int) -> Floats:
         """Give where everything is in one that was just stepped, as ``PhysicalState.vector``.
 
         It holds until the next step.
         """
-        numbers = self._batch.table(index).matrix[index]
-        return numbers[: self._envs[index].world.current()[1].vector.size]
+        size = self._envs[index].world.current()[1].vector.size
+        found: Floats = self._batch.table(index).matrix[index, :size]
+        return found
 
     def close(self) -> None:
         """Free their engines."""

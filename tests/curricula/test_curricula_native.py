@@ -1,0 +1,177 @@
+"""A curriculum for environments that are stepped in one call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from curriculum_envs import PUSHING
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from scm_world.curricula import (
+    at_step,
+    during,
+    every,
+    goals,
+    interpolate,
+    make_vec,
+    physics,
+    resample,
+    stages,
+    together,
+)
+from scm_world.errors import InterventionError, UnknownOption
+
+FRICTION, MASS = "floor_friction", "tool_block.mass"
+GOAL, TOOL = "goal_block.cartesian_position", "tool_block.cartesian_position"
+CENTER = [0.0, 0.0, 0.0325]
+CURRICULA: dict[str, Any] = {
+    "at resets": together(goals("A"), physics("B"), resample(MASS, "B")),
+    "within episodes": together(
+        interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100),
+        every(2, resample(MASS, "B"), first=1),
+        at_step(3, resample("@goals")),
+    ),
+    "with stages": together(
+        stages({MASS: 0.02}, {MASS: 0.03}, up=1.0, window=3),
+        during(range(3), together(at_step(1, {GOAL: CENTER}), at_step(1, {TOOL: CENTER}))),
+    ),
+}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "delta": {"action_mode": "delta_joint_positions"},
+    "goals": {"goal_env": True, "start": {"sensor_noise": 0.1}, "info_state": True},
+}
+
+
+def made(kind: str | None, part: Any, mode: AutoresetMode, n: int = 3, **options: Any) -> Any:
+    """Make environments whose episodes are short."""
+    options = {"max_episode_length": 4, **options}
+    return make_vec(PUSHING, n, part, vectorization_mode=kind, autoreset_mode=mode, **options)
+
+
+def same(mine: Any, other: Any, where: str = "") -> None:
+    """Assert that two things are equal, bit for bit, all the way down."""
+    if isinstance(other, dict):
+        assert mine.keys() == other.keys(), where
+        for name in other:
+            same(mine[name], other[name], f"{where}.{name}")
+    elif isinstance(other, tuple | list):
+        assert len(mine) == len(other), where
+        for place, (one, two) in enumerate(zip(mine, other, strict=True)):
+            same(one, two, f"{where}[{place}]")
+    elif isinstance(other, np.ndarray) and other.dtype == object:
+        same(list(mine), list(other), where)
+    else:
+        assert type(mine) is type(other), where
+        np.testing.assert_array_equal(mine, other, where, strict=True)
+
+
+def roll(envs: Any, others: Any, steps: int, mode: AutoresetMode) -> None:
+    """Assert that two vectors say the same from here on."""
+    rng = np.random.default_rng(7)
+    for t in range(steps):
+        actions = rng.uniform(-1, 1, (envs.num_envs, 9)).astype(np.float32)
+        mine, other = envs.step(actions), others.step(actions)
+        same(mine, other, f"step {t}")
+        ended = other[2] | other[3]
+        if mode is AutoresetMode.DISABLED and (ended.any() or t == 1):
+            which = ended if ended.any() else np.arange(envs.num_envs) == 1
+            again = {"reset_mask": which}
+            same(envs.reset(options=dict(again)), others.reset(options=dict(again)), f"reset {t}")
+    assert envs.memory == others.memory
+    assert envs.state() == others.state()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize("name", CURRICULA)
+def test_native_is_sync_value_by_value(name: str, mode: AutoresetMode) -> None:
+    """Observations, rewards, flags, infos, numbers, stages and states."""
+    pair = [made(kind, CURRICULA[name], mode) for kind in ("native", "sync")]
+    same(*(envs.reset(seed=3) for envs in pair))
+    roll(*pair, steps=11, mode=mode)
+    for envs in pair:
+        envs.close()
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_whatever_is_observed(options: str) -> None:
+    """Relative actions, goals, noise of the sensors, and what is said in words."""
+    mode = AutoresetMode.SAME_STEP
+    part = CURRICULA["within episodes"]
+    pair = [made(kind, part, mode, **OPTIONS[options]) for kind in ("native", "sync")]
+    same(*(envs.reset(seed=[5, 1, 2], options={"do": {FRICTION: 0.3}}) for envs in pair))
+    roll(*pair, steps=6, mode=mode)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_state_goes_on_in_the_other_kind(mode: AutoresetMode) -> None:
+    """What sync gave native resumes, and the other way round; draws and numbers are the same."""
+    part = CURRICULA["within episodes"]
+    native, sync = (made(kind, part, mode) for kind in ("native", "sync"))
+    for envs in (native, sync):
+        envs.reset(seed=0)
+        for _ in range(3):
+            envs.step(np.zeros((3, 9), np.float32))
+    state = sync.state()
+    assert native.state() == state
+    later = [made(kind, part, mode) for kind in ("native", "sync")]
+    for envs in later:
+        envs.resume(state)
+    same(*(envs.reset() for envs in later))
+    roll(*later, steps=6, mode=mode)
+
+
+def test_it_is_what_is_made_where_the_engine_has_it() -> None:
+    """MuJoCo steps many in one call; other engines, and a wrapper's limit, need single ones."""
+    part = goals("A")
+    assert isinstance(make_vec(PUSHING, 2, part, backend="fake").env, SyncVectorEnv)
+    assert isinstance(make_vec(PUSHING, 2, part, max_episode_steps=3).env, SyncVectorEnv)
+    native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
+    assert not isinstance(native.env, SyncVectorEnv)
+    assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
+    assert native.env.get_attr("where") == (None, None)
+    with pytest.raises(UnknownOption, match="max_episode_length"):
+        make_vec(PUSHING, 2, part, vectorization_mode="native", max_episode_steps=3)
+
+
+def test_what_is_refused_happens_in_none_of_them() -> None:
+    """A curriculum refused in one: all are as they were, and the next reset has their numbers."""
+    inside = during(range(4, 5), at_step(0, {TOOL: [0.2, 0.2, 0.0325]}))
+    part = together(interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100), inside)
+    envs = made("native", part, AutoresetMode.DISABLED)
+    envs.reset(seed=0)
+    before = envs.env.present()
+    with pytest.raises(InterventionError, match="environment 1"):
+        envs.reset()
+    same(envs.env.present(), before)
+    with pytest.raises(InterventionError, match=r"nowhere"):
+        made("native", {"nowhere": 1.0}, AutoresetMode.DISABLED)
+
+
+def test_a_snapshot_goes_back_to_what_is_due() -> None:
+    """After a snapshot what is due at a step is due again."""
+    envs = made("native", every(2, resample(MASS, "B")), AutoresetMode.DISABLED)
+    envs.reset(seed=0)
+    action = np.zeros((3, 9), np.float32)
+    envs.step(action)
+    snapshot = envs.env.snapshot()
+    first = [envs.step(action) for _ in range(2)]
+    envs.env.restore(snapshot)
+    same([envs.step(action) for _ in range(2)], first)
+
+
+def test_members_that_are_left_alone_are_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing is due within an episode, only resets ask an environment by itself."""
+    envs = made("native", goals("A"), AutoresetMode.NEXT_STEP)
+    crew = envs.env.crew._crew
+    envs.reset(seed=0)
+    asked: list[int] = []
+    alone = crew.alone
+    monkeypatch.setattr(crew, "alone", lambda index: asked.append(index) or alone(index))
+    for _ in range(4):
+        envs.step(np.zeros((3, 9), np.float32))
+    assert asked == []
+    envs.step(np.zeros((3, 9), np.float32))
+    assert asked == [0, 1, 2]

@@ -1,0 +1,287 @@
+"""Episodes that happen together are, bit for bit, those that happen alone."""
+
+from __future__ import annotations
+
+import importlib.util
+import multiprocessing
+import pickle
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.backends.mujoco.batch import MujocoBatch
+from scm_world.discovery.data import Design
+from scm_world.discovery.data.collect import source_of
+from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
+from scm_world.queries import At, Clamp, Contact, On, Outcome, Reaches, World, crews, rollouts
+from scm_world.queries.episodes import episode_of
+from scm_world.queries.lockstep import advanced, is_known
+from scm_world.queries.samples import Setting
+from scm_world.queries.stages import Stage, stage_of
+from scm_world.queries.traces import Trace
+from scm_world.queries.units import Unit
+from scm_world.variables import Mechanism, Null
+
+BULLET = pytest.mark.skipif(
+    importlib.util.find_spec("pybullet") is None, reason="Bullet is not installed"
+)
+NAMES = (
+    "reward",
+    "success",
+    "end_effector_positions",
+    "action",
+    "control_index",
+    "tool_block.mass",
+    "tool_block.cartesian_position",
+)
+FALLS = Reaches("tool_block.linear_velocity", below=-0.01, component=2)
+PLANS: tuple[Mapping[str, Any], ...] = (
+    {},
+    {"tool_block.mass": 0.05},
+    {"floor_friction": At(5, 0.3)},
+    {"tool_block.cartesian_position": Clamp([0, 0, 0.1], 3, 7)},
+    {"gravity": Clamp([0, 0, -5.0], 3, 9)},
+    {"tool_block.mass": On(Contact("robot", "tool_block"), 0.03)},
+    {"tool_block.cartesian_position": [0, 0, 0.1], "tool_block.mass": On(FALLS, 0.03)},
+    {"tool_block": At(8, Null())},
+    {"actuator_noise": 0.1},
+    {"control_index": 5},
+    {"preset": 1},
+    {"tool_block.size": [0.07, 0.07, 0.07]},
+    {"tool_block.mass": At(10, -1.0)},
+    {"tool_block.mass": -1.0},
+    {"nothing": 3},
+)
+
+
+def units_of(world: World, plans: Sequence[Mapping[str, Any]], **setting: Any) -> list[Unit]:
+    """Say what is to happen, one unit for each plan."""
+    names = setting.pop("names", NAMES)
+    made = Setting(**{"steps": 14, **setting})
+    return [made.unit(world, made.plan(world, plan), i, names) for i, plan in enumerate(plans)]
+
+
+def alone(stage: Stage, units: Sequence[Unit]) -> list[Trace | Exception]:
+    """Let units happen one after another."""
+    with stage.twin() as world:
+        return [unit.ended(world) for unit in units]
+
+
+def together(stage: Stage, units: Sequence[Unit], threads: int = 2) -> list[Trace | Exception]:
+    """Let units happen at the same time."""
+    with stage.together(len(units), units[0].names, threads) as batch:
+        return advanced(batch, units)
+
+
+def same_values(one: Any, other: Any) -> bool:
+    """Tell whether two values have the same type, shape and bits."""
+    a, b = np.asarray(one), np.asarray(other)
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def assert_same(one: Trace | Exception, other: Trace | Exception) -> None:
+    """Compare all that two units leave behind, but for snapshots."""
+    if not isinstance(one, Trace) or not isinstance(other, Trace):
+        assert (type(one), str(one)) == (type(other), str(other))
+        return
+    for a, b in ((one.vectors, other.vectors), (one.actions, other.actions)):
+        assert len(a) == len(b)
+        assert all(map(same_values, a, b))
+    assert [step for step, _ in one.statics] == [step for step, _ in other.statics]
+    for (_, mine), (_, its) in zip(one.statics, other.statics, strict=True):
+        assert mine.keys() == its.keys()
+        assert all(same_values(mine[name], its[name]) for name in mine)
+    plans = ([(at, found.plan) for at, found in trace.declarations] for trace in (one, other))
+    assert next(plans) == next(plans)
+    assert one.fired == other.fired
+    assert {at: str(a) for at, a in one.audits.items()} == {
+        at: str(a) for at, a in other.audits.items()
+    }
+    assert one.values.keys() == other.values.keys()
+    for name, values in one.values.items():
+        assert len(values) == len(other.values[name])
+        assert all(map(same_values, values, other.values[name])), name
+
+
+SETTINGS: tuple[dict[str, Any], ...] = (
+    {},
+    {"policy": "across"},
+    {"policy": None, "action_mode": "end_effector_positions"},
+    {"action_mode": "joint_torques", "preset": "precise"},
+    {"policy": np.full((3, 9), 0.1), "action_mode": "joint_torques"},
+    {"policy": "sweep", "action_mode": "joint_torques"},
+)
+ENGINES = ["mujoco", "fake", pytest.param("bullet", marks=BULLET)]
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=str)
+@pytest.mark.parametrize("backend", ENGINES)
+def test_lives_together_are_those_alone(backend: str, setting: dict[str, Any]) -> None:
+    """Whatever is done, when it is done, and whether it is refused."""
+    options = {key: setting[key] for key in ("action_mode", "preset") if key in setting}
+    how = {"policy": setting["policy"]} if "policy" in setting else {}
+    world = World("pushing", backend=backend, **options)
+    plans = PLANS if backend != "bullet" else PLANS[1:8]  # making a world of Bullet takes long
+    units, stage = units_of(world, plans, **how), stage_of(world)
+    for one, other in zip(alone(stage, units), together(stage, units), strict=True):
+        assert_same(one, other)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_lives_do_not_depend_on_threads_or_company(threads: int) -> None:
+    """One, two or four threads; five worlds at once, or seven."""
+    world = World("stacking2")
+    stage = stage_of(world)
+    units = units_of(world, [{}, {"gravity": [0, 0, -3.0]}] * 4, names=("reward",), steps=5)
+    expected = alone(stage, units)
+    for n in (5, 7, 8):
+        for one, other in zip(expected, together(stage, units[:n], threads), strict=False):
+            assert_same(one, other)
+
+
+@pytest.mark.parametrize("at", [0, 1, 10, 23])
+def test_branches_together_are_those_alone(at: int) -> None:
+    """From any instant, with events before and after it, of an episode that had no snapshots."""
+    world = World("pushing")
+    stage = stage_of(world)
+    event = {
+        "floor_friction": On(Contact("robot", "tool_block"), 0.3),
+        "gravity": At(12, [0, 0, -5]),
+    }
+    (unit,) = units_of(world, [event], steps=24, policy="across")
+    (ending,) = together(stage, [unit])
+    assert isinstance(ending, Trace)
+    episode = episode_of(stage, unit, ending)
+    lived = world.rollout("across", seed=0, do=event, steps=24)
+    assert episode == lived
+    assert not episode.trace.snapshots
+    dos = [{"tool_block.mass": 0.02 + 0.001 * i} for i in range(24)]
+    branches = episode.worlds(dos, at=at, record=["reward"], workers=2)
+    assert len(branches) == 24
+    for do, branch in zip(dos[::6], branches[::6], strict=True):
+        single = lived.counterfactual(do, at=at, record=["reward"])
+        assert_same(single.trace, branch.trace)
+        assert episode.counterfactual(do, at=at) == single
+    again = branches[3].counterfactual({"floor_friction": 0.5}, at=at)
+    first = lived.counterfactual(dos[3], at=at).counterfactual({"floor_friction": 0.5}, at=at)
+    assert again == first
+
+
+def sampled(world: World, n: int = 48, **setting: Any) -> Any:
+    """Ask a question that is worth a batch."""
+    told: list[tuple[int, int]] = []
+    outcomes = ("reward", Outcome("reward", "sum"), "tool_block.mass", lambda e: e.final("action"))
+    found = world.sample(
+        {"floor_friction": 0.4},
+        n,
+        outcomes=outcomes,
+        nature={"tool_block.mass": "A"},
+        progress=lambda *at: told.append(at),
+        **{"steps": 12, **setting},
+    )
+    assert told == [(i, n) for i in range(1, n + 1)]
+    return found
+
+
+def test_samples_are_the_same_together_and_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numbers, order and progress; and a batch was used for one of them only."""
+    world = World("pushing")
+    found = [sampled(world, workers=workers) for workers in (None, 1, 2)]
+    assert stage_of(world).at_hand >= rollouts.LEAST
+    other = World("pushing")
+    monkeypatch.setattr(rollouts, "LEAST", 10**9)
+    found.append(sampled(other))
+    assert stage_of(other).at_hand == 0
+    for samples in found[1:]:
+        assert all(same_values(samples[name], found[0][name]) for name in found[0])
+
+
+def test_a_policy_that_looks_at_the_world_is_not_known() -> None:
+    """Its actions cannot be told beforehand; nor can all variables be written down together."""
+    world = World("pushing", backend="fake")
+    policies = ["random", None, "across", np.zeros(9), "grasp", lambda _: np.zeros(9)]
+    known = [is_known(units_of(world, [{}], policy=policy)[0]) for policy in policies]
+    assert known == [True, True, True, True, False, False]
+    assert not is_known(units_of(world, [{}], names=("*",))[0])
+
+
+def test_one_refusal_among_many_is_the_one_that_is_told() -> None:
+    """Of several, the first; afterwards the stage has its worlds again, and they are sound."""
+    world = World("pushing")
+    episode = world.rollout("random", steps=30)
+    dos: list[dict[str, Any]] = [{"tool_block.mass": 0.03}] * 22
+    dos[3], dos[7] = {"tool_block.mass": At(20, -1.0)}, {"nothing": 1}
+    with pytest.raises(OutOfBounds, match=r"tool_block\.mass"):
+        episode.worlds(dos)
+    with pytest.raises(UnknownVariable, match="nothing"):
+        episode.worlds(dos[4:])
+    assert stage_of(world).at_hand >= rollouts.LEAST
+    assert episode.worlds([{}] * 22)[21] == episode
+
+
+def test_an_interruption_loses_no_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while worlds are stepped, or while an outcome is read, leaves a stage that works."""
+    world = World("pushing")
+    expected = sampled(world)
+    step, calls = MujocoBatch.step, []
+
+    def interrupted(self: MujocoBatch, *given: Any) -> None:
+        calls.append(given)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        step(self, *given)
+
+    monkeypatch.setattr(MujocoBatch, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sampled(world)
+    again = sampled(world)
+    assert all(same_values(again[name], expected[name]) for name in expected)
+
+
+def test_a_failure_of_the_engine_ends_one_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others are found alone."""
+    world = World("pushing")
+    expected = sampled(world)
+    step, calls = MujocoBatch.step, []
+
+    def failing(self: MujocoBatch, *given: Any) -> None:
+        calls.append(given)
+        if len(calls) == 5:
+            raise EngineFailure("one state is lost", "mujoco")
+        step(self, *given)
+
+    monkeypatch.setattr(MujocoBatch, "step", failing)
+    again = sampled(world)
+    assert all(same_values(again[name], expected[name]) for name in expected)
+
+
+@BULLET
+def test_processes_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On an engine that steps one world at a time: branches, refusals, and structures."""
+    monkeypatch.setattr(crews, "PAYS", 1)
+    monkeypatch.setattr(crews, "GOES_ON", 1)
+    world = World("pushing", backend="bullet")
+    episode = world.rollout("random", steps=12)
+    dos: list[dict[str, Any]] = [{"tool_block": At(8, Null())}, {"tool_block.mass": 0.04}, {}]
+    for at in (0, 5):
+        one, two = (episode.worlds(dos, at=at, record=["reward"], workers=w) for w in (1, 2))
+        assert len(multiprocessing.active_children()) == 2
+        for first, second in zip(one, two, strict=True):
+            assert_same(first.trace, second.trace)
+        assert two[1].counterfactual({"floor_friction": 0.3}, at=9) == one[1].counterfactual(
+            {"floor_friction": 0.3}, at=9
+        )
+    with pytest.raises(OutOfBounds, match=r"tool_block\.mass"):
+        episode.worlds([*dos, {"tool_block.mass": -1.0}, {"nothing": 1}], workers=2)
+    halved = {"floor_friction": Mechanism(lambda mass: 5 * mass, ("tool_block.mass",))}
+    assert len(episode.worlds([halved, {}], workers=2)) == 2  # it cannot be sent
+
+
+def test_a_source_elsewhere_has_one_thread() -> None:
+    """Workers share the cores; here a source has all of them."""
+    world = World("pushing", backend="fake")
+    source: Any = source_of(world, Design("single", ("tool_block.mass",)), 4, seed=0)
+    assert source._setting.workers is None
+    assert pickle.loads(pickle.dumps(source))._setting.workers == 1  # noqa: S301 # our own
