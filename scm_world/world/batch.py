@@ -70,7 +70,8 @@ class Batch:
         self._away = np.zeros(len(self._worlds), dtype=np.bool_)  # it went on in its row only
         self._loaded = np.zeros(len(self._worlds), dtype=np.bool_)  # its row is as it is
         self._all = np.arange(len(self._worlds))
-        self._led: set[int] = set()
+        self._held: set[int] = set()
+        self._noisy: set[int] = set()
         self._by_tips = self._worlds[0].action_mode == "end_effector_positions"
         self._told = np.empty((len(self._worlds), 9))
 
@@ -129,36 +130,37 @@ class Batch:
         """
         rows = self._all if which is None else np.flatnonzero(which)
         self.fill(rows)
-        led = {row: self._lead(row, commands[row]) for row in self._led.intersection(rows.tolist())}
+        held = self._held.intersection(rows.tolist())
+        if held:
+            commands = commands.copy()
+            for row in held:
+                commands[row] = self.world(row).decided(commands[row])
         for table, members in self.tables(rows):
-            self._step(table, members, commands, led)
+            self._step(table, members, commands)
             if evaluate:
                 table.evaluate(members)
 
-    def _step(
-        self, table: Table, rows: Integers, commands: Floats, led: dict[int, tuple[Floats, Floats]]
-    ) -> None:
+    def _step(self, table: Table, rows: Integers, commands: Floats) -> None:
+        self._tell(table, rows, commands)
         table.remember(rows)
         table.advance(rows, commands)
-        told = self._told
-        self._tell(table, rows, commands)
-        for row in led.keys() & set(rows.tolist()):
-            decided, told[row] = led[row]
-            table.act(row, decided)
         for (mode, substeps), members in self._paces(rows):
-            self._engine.step(members, mode, told, substeps, table.matrix)
+            self._engine.step(members, mode, self._told, substeps, table.matrix)
         self._away[rows] = self._loaded[rows] = True
 
     def _tell(self, table: Table, rows: Integers, commands: Floats) -> None:
-        """Write what the engine is told, where the action alone decides it."""
+        """Write what the engine is told: actions, with noise, as joint positions if they are not."""
+        told = self._told
+        told[rows] = commands[rows]
+        for row in self._noisy.intersection(rows.tolist()):
+            told[row] = self._worlds[row].disturbed(commands[row], table.clock(row))
         if not self._by_tips:
-            self._told[rows] = commands[rows]
             return
         heights, reached = table.column("robot_height"), np.empty(3, dtype=np.bool_)
         joints = table.matrix[:, :9]
         for row in rows.tolist():
             height = float(heights[row, 0])
-            inverse_kernel(commands[row], height, joints[row], self._told[row], reached)
+            inverse_kernel(told[row].copy(), height, joints[row], told[row], reached)
 
     def _paces(self, rows: Integers) -> list[tuple[Any, Integers]]:
         """Tell worlds with different presets apart."""
@@ -175,16 +177,11 @@ class Batch:
         table = self._homes[row] = self._table(world)
         table.load(row, world)
         self._loaded[row] = True
-        if world.is_led:
-            self._led.add(row)
-        else:
-            self._led.discard(row)
-
-    def _lead(self, row: int, command: Floats) -> tuple[Floats, Floats]:
-        """Decide on the action of a world, and on what its engine is told."""
-        world = self.world(row)
-        decided = world.decided(command)
-        return decided, world.told(decided).copy()
+        for rows, belongs in ((self._held, world.holds_action), (self._noisy, world.is_noisy)):
+            if belongs:
+                rows.add(row)
+            else:
+                rows.discard(row)
 
     def _table(self, world: World) -> Table:
         declaration = world.declaration

@@ -116,8 +116,7 @@ class Table:
             for name, place in self.earlier.items()
         }
         vector = numbers[: ROBOT_SIZE + BLOCK_SIZE * self.declaration.n_blocks]
-        index = int(numbers[self.where[CONTROL_INDEX]][0])
-        world.arrive(vector, index, numbers[self.where[ACTION]].copy(), earlier)
+        world.arrive(vector, self.clock(row), numbers[self.where[ACTION]].copy(), earlier)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -129,6 +128,10 @@ class Table:
         """Write the actions of some rows, shape (n, 9), and let their clocks go on."""
         self.matrix[rows, self.where[ACTION]] = actions[rows]
         self.matrix[rows, self.where[CONTROL_INDEX].start] += 1.0
+
+    def clock(self, row: int) -> int:
+        """Give the control step of a row."""
+        return int(self.matrix[row, self.where[CONTROL_INDEX].start])
 
     def evaluate(self, rows: Integers) -> None:
         """Compute everything for some rows, after a step."""

@@ -82,9 +82,14 @@ class Stepped(Declared):
         return self._mode, self._substeps
 
     @property
-    def is_led(self) -> bool:
-        """Whether more than the action decides what the engine is told in a step."""
-        return self._action_is_held or self._noisy
+    def holds_action(self) -> bool:
+        """Whether the action has a mechanism."""
+        return self._action_is_held
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether the actuators have noise."""
+        return self._noisy
 
     def decided(self, command: Floats) -> Floats:
         """Give the action that is taken: the command, unless the action has a mechanism."""
@@ -98,15 +103,18 @@ class Stepped(Declared):
     def told(self, command: Floats) -> Floats:
         """Give what the engine is told in a step; it holds until the next call."""
         if self._noisy:
-            bounds = self.declaration.action_bounds
-            noise = float(self._now[ACTUATOR_NOISE])
-            command = disturbed(command, *bounds, noise, self.moment(self._index))
+            command = self.disturbed(command, self._index)
         if self._by_tips:
             height = float(self._now["robot_height"])
             joints = self._state.joint_positions
             inverse_kernel(command, height, joints, self._command, self._reached)
             command = self._command
         return command
+
+    def disturbed(self, command: Floats, index: int) -> Floats:
+        """Add the noise that the actuators have in a control step of this episode."""
+        noise = float(self._now[ACTUATOR_NOISE])
+        return disturbed(command, *self.declaration.action_bounds, noise, self.moment(index))
 
     def _goes_on(self, index: int) -> None:
         """Be at another control step; where everything is has been written already."""
