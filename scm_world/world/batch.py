@@ -149,7 +149,7 @@ class Batch:
         self._away[rows] = self._loaded[rows] = True
 
     def _tell(self, table: Table, rows: Integers, commands: Floats) -> None:
-        """Write what the engine is told: actions, with noise, as joint positions if they are not."""
+        """Write what the engine is told: actions, with noise, fingertips as joint positions."""
         told = self._told
         told[rows] = commands[rows]
         for row in self._noisy.intersection(rows.tolist()):

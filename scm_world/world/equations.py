@@ -164,7 +164,12 @@ class Called:
 
 
 def _typed(value: Value, kind: Any, lag: int) -> Any:
-    """Give a value the type that it has in a single world."""
+    """Give a value the type that it had when its row began, if it still fits.
+
+    A function of Python may give a whole number in one step and a fraction in the next.
+    """
+    if np.dtype(kind).kind in "biu" and not (value == np.rint(value)).all():
+        kind = float
     if isinstance(kind, np.dtype):
         return value.astype(kind)
     if lag:

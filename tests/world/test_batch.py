@@ -13,7 +13,7 @@ from worlds import BACKENDS, NEEDS_BULLET
 from scm_world.errors import NotReset, UnknownOption
 from scm_world.tasks import TASKS, Pushing
 from scm_world.tasks.rewards import term
-from scm_world.variables import Mechanism
+from scm_world.variables import Function, Measured, Mechanism
 from scm_world.world import World
 from scm_world.world.batch import Batch
 
@@ -152,6 +152,31 @@ def test_functions_of_ones_own() -> None:
     own = term("reward.own", _own, ("tool_block.type", "control_index", NAMES[3]), "Of mine.")
     task = {"terms": [own], "weights": {"reward.own": 2.0}}
     compare(worlds(Pushing(**task)), worlds(Pushing(**task)))
+
+
+def test_whole_numbers_that_become_fractions() -> None:
+    """A function that gives a whole number first and a fraction later is not cut short."""
+    half = Measured(name="half", parents=("control_index",), mechanism=Function(_half))
+    own = term("reward.own", _plus, ("half", "control_index"), "Of mine.")
+
+    class Halved(Pushing):  # type: ignore[misc] # it is final; a test may
+        """Pushing, with one more readout."""
+
+        def dense(self) -> Any:
+            """Declare it beside the others."""
+            yield half
+            yield from super().dense()
+
+    task = {"terms": [own], "weights": {"reward.own": 2.0}}
+    compare(worlds(Halved(**task)), worlds(Halved(**task)))
+
+
+def _half(index: Any) -> Any:
+    return int(index) // 2 if int(index) % 2 == 0 else int(index) / 2
+
+
+def _plus(half: Any, index: Any) -> float:
+    return float(half * 10.0 + index)
 
 
 def _own(kind: Any, index: Any, tips: Any) -> float:
