@@ -141,12 +141,13 @@ def discover(
 
     Without --learner the one-step graph of a task is recovered by paired experiments. With it, and
     for models, learners are run over budgets and seeds, and a table, a picture and a report are
-    written. After an interruption the same command goes on. Ctrl-C gives the result so far (exit
-    code 130).
+    written, on any --engine. After an interruption the same command goes on. Ctrl-C gives the
+    result so far (exit code 130).
     """
     if learner is None and not is_model(task):
         from scm_world.cli.discovery import Options, run
 
+        Work(engine, workers, address).refuse_others("discover without --learner")
         options = Options(task, backend, preset, probes, seed, tuple(option or ()))
         raise typer.Exit(run(options, out=out, strict=strict))
     from scm_world.cli import exam

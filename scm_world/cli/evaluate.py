@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from scm_world.cli.options import Arguments, Out, read_location
-from scm_world.cli.working import Address, Engine, Work, Workers
+from scm_world.cli.working import Address, Engine, ManyWorkers, Work
 
 ENV = Annotated[
     list[str] | None,
@@ -50,7 +50,7 @@ def evaluate(
     metric: Annotated[
         str, typer.Option(help="Score that is shown and drawn; all are written.")
     ] = METRIC,
-    workers: Workers = 0,
+    workers: ManyWorkers = 0,
     engine: Engine = None,
     address: Address = None,
     format_: Annotated[str, typer.Option("--format", help="parquet or csv.")] = "parquet",

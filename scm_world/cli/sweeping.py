@@ -15,7 +15,7 @@ from scm_world.cli.console import console, show, table, written
 from scm_world.cli.questions import Circumstances, shown_episodes
 from scm_world.cli.working import Work
 from scm_world.discovery.data import Levels, Swept, sweep
-from scm_world.discovery.data.levels import points_of
+from scm_world.discovery.data.levels import check_points, points_of
 from scm_world.discovery.data.swept import ENDS, SUMMARY, TABLE
 from scm_world.output.locations import Location
 from scm_world.variables.kinds import SPACES
@@ -138,6 +138,7 @@ def _values(text: str) -> Any:
 def _count(text: str) -> int:
     if not text.isdecimal() or not int(text):
         raise typer.BadParameter(f"{text!r} is no number of values", param_hint=HINT)
+    check_points(int(text))
     return int(text)
 
 

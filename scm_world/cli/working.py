@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, final
+from typing import TYPE_CHECKING, Annotated, Any, final
 
 import typer
 
 from scm_world.cli.console import console
+from scm_world.errors import UnknownOption
 
 if TYPE_CHECKING:
     from scm_world.work.executors import Executor
@@ -21,14 +22,15 @@ Engine = Annotated[
         show_default="process, with one worker serial",
     ),
 ]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        min=0,
-        help="How much is done at the same time; 0 for as many as there are cores.",
-        show_default="1; with --engine as many as there are cores",
-    ),
-]
+
+
+def _workers(usual: str) -> Any:
+    told = "How much is done at the same time; 0 for as many as there are cores."
+    return typer.Option(min=0, help=told, show_default=usual)
+
+
+Workers = Annotated[int | None, _workers("1; with --engine as many as there are cores")]
+ManyWorkers = Annotated[int | None, _workers("as many as there are cores")]
 Address = Annotated[
     str | None,
     typer.Option(
@@ -53,6 +55,25 @@ class Work:
     workers: int | None = None
     address: str | None = None
 
+    def refuse_others(self, what: str) -> None:
+        """Refuse to work elsewhere than in this process.
+
+        Args:
+            what: Said in the error.
+
+        Raises:
+            UnknownOption: Another engine, several workers, or an address were typed.
+        """
+        typed: tuple[tuple[str, object, object], ...] = (
+            ("--engine", self.engine, "serial"),
+            ("--workers", self.workers, 1),
+            ("--address", self.address, None),
+        )
+        for name, value, alone in typed:
+            if value not in (None, alone):
+                allowed = "left out" if alone is None else f"{alone}, or left out"
+                raise UnknownOption(name, value, (f"{allowed}: {what} works in this process",))
+
     @contextmanager
     def begun(self, *, usual: str | None = None) -> Iterator[Executor]:
         """Open what does the work, and say in a line where that is.
@@ -63,7 +84,8 @@ class Work:
         Raises:
             UnknownOption: There is no such engine, or it cannot have so many workers.
         """
-        from scm_world.work.executors import cores, engine_of
+        from scm_world.work.executors import engine_of
+        from scm_world.work.threads import cores
 
         workers = self.workers or None
         if self.engine is None:

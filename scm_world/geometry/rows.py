@@ -11,13 +11,14 @@ from functools import cache
 from typing import Any, final
 
 import numpy as np
-from llvmlite import ir
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic, overload
 
 from scm_world._types import Floats, Integers
 
 _types: Any = types  # numba is untyped
+_cgutils: Any = cgutils
 VECTOR = types.float64[::1]
 _MATRIX, _WHERE = types.float64[:, ::1], types.int64[:, ::1]
 
@@ -74,9 +75,13 @@ def _called(typing: Any, address: Any, arguments: Any, like: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         values = [builder.extract_value(given[1], i) for i in range(len(kinds))]
-        types_ = [context.get_value_type(kind) for kind in kinds]
-        made = ir.FunctionType(context.get_value_type(like), types_)
-        return builder.call(builder.inttoptr(given[0], made.as_pointer()), values)
+        calls = context.call_conv
+        kind = calls.get_function_type(like, kinds).as_pointer()
+        function = builder.inttoptr(given[0], kind)
+        status, found = calls.call_function(builder, function, like, kinds, values)
+        with _cgutils.if_unlikely(builder, status.is_error):
+            calls.return_status_propagate(builder, status)  # an error is one of the loop
+        return found
 
     return like(address, arguments, like), generate
 
@@ -119,7 +124,7 @@ class Each:
     """A compiled function that is called for rows of a table.
 
     Args:
-        function: A dispatcher of numba that raises nothing.
+        function: A dispatcher of numba; what it raises, the loop raises.
         signature: With which it has been compiled: vectors (``VECTOR``) and numbers to a vector
             or a number.
         where: Columns of each argument.
@@ -129,7 +134,7 @@ class Each:
     def __init__(self, function: Any, signature: Any, where: Iterable[slice], place: slice) -> None:
         self._function = function  # the address is that of its code
         compiled = function.get_compile_result(signature)
-        name = compiled.fndesc.llvm_cfunc_wrapper_name
+        name = compiled.fndesc.llvm_func_name
         self._address = compiled.library.get_pointer_to_function(name)
         self._loop = _loop(signature)
         self._where = np.array([(column.start, column.stop) for column in where], dtype=np.int64)

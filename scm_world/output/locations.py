@@ -40,6 +40,8 @@ def located(given: Location | str) -> Location:
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)
+    if not protocol:
+        raise UnknownOption("URL", given, ("protocol://place, such as s3://bucket/run",))
     if protocol not in ("file", "local"):
         return Remote(given)
     path = rest.removeprefix("localhost")

@@ -11,7 +11,6 @@ Whoever has a bag of jobs runs it on an ``Executor``. All of them keep the same 
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.work.jobs import Bag
 from scm_world.work.pool import Pool
 from scm_world.work.processes import PROCESS, pickled
+from scm_world.work.threads import cores as cores
 from scm_world.work.threads import single_threaded
 
 Job = TypeVar("Job")
@@ -263,13 +263,6 @@ def opened(
         return
     with engine_of(engine, workers=workers, address=address) as made:
         yield made
-
-
-def cores() -> int:
-    """Count the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _counted(workers: int) -> int:

@@ -56,8 +56,8 @@ class Pool(Generic[Job, Result]):
 
         Raises:
             UnknownOption: A job cannot be pickled; none was begun.
-            EngineFailure: While reading: the pool was closed, or results of other jobs are not all
-                read yet. At the end: three processes ended over one job.
+            EngineFailure: While reading: the pool was closed, results of other jobs are not all
+                read yet, or processes cannot begin. At the end: three of them ended over one job.
             Exception: While reading: what ``make`` raised. At the end, when all other jobs are
                 done: what a job raised.
         """
@@ -92,7 +92,7 @@ class Pool(Generic[Job, Result]):
         try:
             return ((number, worker.answer()),)
         except Ended as ended:
-            bag.put_back(number, ended)
+            _put_back(bag, number, ended)
         except Exception as error:
             if not worker.is_made:
                 raise  # it is the fault of no job: there is nothing that could do one
@@ -109,7 +109,7 @@ class Pool(Generic[Job, Result]):
                 pipe = worker.begin("__call__", bag.jobs[number])
             except Ended as ended:
                 self._idle.append(worker)
-                bag.put_back(number, ended)
+                _put_back(bag, number, ended)
             else:
                 self._busy[pipe] = (worker, number)
 
@@ -136,3 +136,10 @@ class Pool(Generic[Job, Result]):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _put_back(bag: Bag[Any], number: int, ended: Ended) -> None:
+    """Let a job wait once more, unless no process could do it."""
+    if ended.cannot_begin:
+        raise EngineFailure(str(ended), PROCESS)
+    bag.put_back(number, ended)

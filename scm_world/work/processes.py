@@ -21,6 +21,10 @@ from scm_world.work.threads import children_single_threaded
 PROCESS = "process"  # the engine of an EngineFailure
 DONE, FAILED, UNMADE = "done", "failed", "unmade"
 """How an answer begins: a result, an error of what was asked, or one of what makes the thing."""
+GUARD = (
+    "it reads the file that was started, too: what that file does has to stand under "
+    "'if __name__ == \"__main__\":'"
+)
 PICKLED = ("a function or class of a module, functools.partial of one, or plain data",)
 
 
@@ -31,11 +35,16 @@ class Ended(Exception):
     Attributes:
         code: Its exit code; that of a signal is negative. None if it never began.
         was_interrupted: Whether another thread ended it.
+        cannot_begin: Whether it ended by itself before it could be asked: another one would, too.
     """
 
-    def __init__(self, code: int | None, *, was_interrupted: bool = False) -> None:
-        self.code, self.was_interrupted = code, was_interrupted
+    def __init__(
+        self, code: int | None, *, was_interrupted: bool = False, cannot_begin: bool = False
+    ) -> None:
+        self.code, self.was_interrupted, self.cannot_begin = code, was_interrupted, cannot_begin
         ended = f"its process ended with exit code {code}"
+        if cannot_begin:
+            ended = f"a process cannot begin: it ended with exit code {code}; {GUARD}"
         super().__init__("interrupted" if was_interrupted else ended)
 
 
@@ -93,6 +102,7 @@ class Worker:
         self.is_made = False
         self._process: Any = None
         self._pipe: Any = None
+        self._signs: Any = None
         self._interrupted = False
 
     def ask(self, method: str, *given: Any, timeout: float | None = None) -> Any:
@@ -167,8 +177,16 @@ class Worker:
     def _ended(self) -> Ended:
         self._process.join(1.0)
         code = self._process.exitcode
+        cannot_begin = code is not None and code > 0 and not self._has_begun()
         self.stop()
-        return Ended(code, was_interrupted=self._interrupted)
+        return Ended(code, was_interrupted=self._interrupted, cannot_begin=cannot_begin)
+
+    def _has_begun(self) -> bool:
+        """Tell whether the process, which has ended, came so far as to be asked."""
+        try:
+            return bool(self._signs.recv_bytes())
+        except (EOFError, OSError):
+            return False
 
     @property
     def has_ended(self) -> bool:
@@ -178,11 +196,13 @@ class Worker:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
+        self._signs, sign = context.Pipe(duplex=False)
         with children_single_threaded(), _uninterrupted():
-            process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            process = context.Process(target=_serve, args=(theirs, sign), daemon=True)
             process.start()
         self._process = process
         theirs.close()
+        sign.close()
 
     def interrupt(self) -> None:
         """End the process from another thread, for good; who waits for an answer gets an error."""
@@ -196,9 +216,10 @@ class Worker:
         if self._process is not None:
             self._process.kill()
             self._process.join()
-        if self._pipe is not None:
-            self._pipe.close()  # one that has just begun ends by this
-        self._process = self._pipe = None
+        for pipe in (self._pipe, self._signs):
+            if pipe is not None:
+                pipe.close()  # one that has just begun ends by this
+        self._process = self._pipe = self._signs = None
 
     def __enter__(self) -> Worker:
         return self
@@ -228,12 +249,14 @@ def _uninterrupted() -> Iterator[None]:
 # --- in the process -------------------------------------------------------------------------------
 
 
-def _serve(pipe: Connection) -> None:
+def _serve(pipe: Connection, sign: Connection) -> None:
     """Answer until nobody asks any more, or until the process that asks has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks ends this one
     threading.Thread(target=_end_with_parent, daemon=True).start()
     things: list[object] = []
     try:
+        sign.send_bytes(b"begun")
+        sign.close()
         make = pipe.recv_bytes()
         while True:
             method, given = pipe.recv_bytes().decode(), pipe.recv_bytes()

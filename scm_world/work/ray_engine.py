@@ -10,7 +10,10 @@ import socket
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, TypeVar, final
 
 from scm_world.errors import EngineFailure, MissingExtra, UnknownOption
@@ -68,15 +71,28 @@ def connected(workers: int | None, address: str | None) -> RayEngine:
 
 def _check_answers(address: str | None) -> None:
     """Refuse an address at which nobody is; Ray would wait for somebody for long."""
-    if address in (None, "auto"):
+    if address is None:
         return
-    host, _, port = str(address).rpartition(":")
+    where = _remembered() if address == "auto" else str(address)
+    host, _, port = where.rpartition(":")
     if not host or "/" in host or not port.isdecimal():
+        if address == "auto":
+            return
         raise UnknownOption("address", address, ADDRESSES)
     try:
         socket.create_connection((host, int(port)), timeout=PATIENCE).close()
     except (OSError, OverflowError) as error:
-        raise EngineFailure(f"there is no Ray at {address}: {error}", RAY) from None
+        asked = "" if where == address else f", which is {address!r} here"
+        raise EngineFailure(f"there is no Ray at {where}{asked}: {error}", RAY) from None
+
+
+def _remembered() -> str:
+    """Say which cluster Ray means by ``"auto"``; it keeps this when the cluster is no more."""
+    said = os.environ.get("RAY_ADDRESS", "")
+    folder = Path(os.environ.get("RAY_TMPDIR") or gettempdir())
+    with suppress(OSError):
+        said = said or (folder / "ray" / "ray_current_cluster").read_text().strip()
+    return said
 
 
 def _check_same(ray: Any, address: str | None) -> None:

@@ -1,4 +1,7 @@
-"""One thread for each library: sums do not depend on the machine, and seconds are of one core."""
+"""How many cores there are, and one thread for each library.
+
+Sums then do not depend on the machine, and seconds are of one core.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,13 @@ from threadpoolctl import threadpool_limits
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 """What numerical libraries look at when they are loaded."""
+
+
+def cores() -> int:
+    """Count the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextmanager

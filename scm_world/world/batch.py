@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from typing import Any, final
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
 from scm_world.scene.kinematics import inverse_kernel
+from scm_world.work.threads import cores as cores
 from scm_world.world.columns import Table
 from scm_world.world.declaration import Declaration
 from scm_world.world.start import whole_number
@@ -19,11 +19,6 @@ from scm_world.world.world import World
 
 KEPT = 4
 """Tables of structures that are kept for when these come again."""
-
-
-def cores() -> int:
-    """Count the cores that this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 @final
@@ -135,18 +130,25 @@ class Batch:
             commands = commands.copy()
             for row in held:
                 commands[row] = self.world(row).decided(commands[row])
-        for table, members in self.tables(rows):
+        tables = self.tables(rows)
+        for table, members in tables:
             self._step(table, members, commands)
-            if evaluate:
-                table.evaluate(members)
+        for table, members in tables if evaluate else ():
+            table.evaluate(members)
 
     def _step(self, table: Table, rows: Integers, commands: Floats) -> None:
         self._tell(table, rows, commands)
         table.remember(rows)
         table.advance(rows, commands)
-        for (mode, substeps), members in self._paces(rows):
-            self._engine.step(members, mode, self._told, substeps, table.matrix)
         self._away[rows] = self._loaded[rows] = True
+        try:
+            for (mode, substeps), members in self._paces(rows):
+                self._engine.step(members, mode, self._told, substeps, table.matrix)
+        except BaseException:  # a state is lost, or somebody interrupts: the others were stepped
+            for row in rows.tolist():
+                world = self.world(row)
+                world.backend.read(world.current()[1])
+            raise
 
     def _tell(self, table: Table, rows: Integers, commands: Floats) -> None:
         """Write what the engine is told: actions, with noise, fingertips as joint positions."""

@@ -208,6 +208,15 @@ def positional(function: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
     return function.func, tuple(function.keywords[name] for name in names)
 
 
+def called(model: SCM, name: str) -> Callable[..., Any]:
+    """Give the function of the parents of a variable, as it is called in every step."""
+    rule = _Rule(model, name)
+    if not rule.keys:
+        return rule.call([], None)
+    _, function, _, constants = rule.step()
+    return (lambda *given: function(*given, *constants)) if constants else function
+
+
 def key(parent: Parent) -> str:
     """Name the value of a parent: a value of one step ago stands beside the present ones."""
     return parent.name if parent.lag == 0 else f"{parent.name}, one step ago"

@@ -7,7 +7,7 @@ world calls, so that the bits are the same.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -59,6 +59,10 @@ class Table:
             if name in self.where and name not in self.computed
         )
         self._remembered = self._memory()
+        needed = set(world.needed(()))  # for what is remembered
+        both = zip(self.computed, self._equations, strict=True)
+        self._for_memory = tuple(bound for name, bound in both if name in needed)
+        self._fresh = np.zeros(n, dtype=np.bool_)  # what is remembered has been computed
 
     def _place_all(self) -> None:
         """Give columns to everything that is needed and is no state."""
@@ -78,9 +82,9 @@ class Table:
 
     def _bound(self, more: Columns) -> tuple[Equation, ...]:
         """Bind the mechanisms of what is computed."""
-        model = self.declaration.model
+        model, said = self.declaration.model, dict[str, dict[int, Any]]()
         return tuple(
-            equation(model, name, self.where, self.earlier, more) for name in self.computed
+            equation(model, name, self.where, self.earlier, more, said) for name in self.computed
         )
 
     def _memory(self) -> tuple[Integers, Integers]:
@@ -103,6 +107,7 @@ class Table:
             numbers[self.where[name]] = np.ravel(now[name])
         for bound in self._equations:
             bound.begin(row, now)
+        self._fresh[row] = True
 
     def act(self, row: int, action: Value) -> None:
         """Write the action of a row."""
@@ -122,12 +127,16 @@ class Table:
 
     def remember(self, rows: Integers) -> None:
         """Let the present of some rows become what was one control step ago."""
+        stale = rows[~self._fresh[rows]]
+        if len(stale):
+            _compute(self._for_memory, self.matrix, stale)
         move_columns(self.matrix, rows, *self._remembered)
 
     def advance(self, rows: Integers, actions: Floats) -> None:
         """Write the actions of some rows, shape (n, 9), and let their clocks go on."""
         self.matrix[rows, self.where[ACTION]] = actions[rows]
         self.matrix[rows, self.where[CONTROL_INDEX].start] += 1.0
+        self._fresh[rows] = False
 
     def clock(self, row: int) -> int:
         """Give the control step of a row."""
@@ -135,9 +144,14 @@ class Table:
 
     def evaluate(self, rows: Integers) -> None:
         """Compute everything for some rows, after a step."""
-        for bound in self._equations:
-            bound.compute(self.matrix, rows)
+        _compute(self._equations, self.matrix, rows)
+        self._fresh[rows] = True
 
     def column(self, name: str) -> Floats:
         """Give the values of a variable in all rows, shape (n, k), as a view."""
         return self.matrix[:, self.where[name]]
+
+
+def _compute(equations: Iterable[Equation], matrix: Floats, rows: Integers) -> None:
+    for bound in equations:
+        bound.compute(matrix, rows)

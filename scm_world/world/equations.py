@@ -17,9 +17,14 @@ from scm_world.graph import SCM
 from scm_world.variables import Linear, Parent
 from scm_world.variables.kinds import Variable
 from scm_world.variables.mechanisms import Stacked
-from scm_world.world.bound import positional
+from scm_world.world.bound import called, key, positional
+
+_types: Any = types  # numba is untyped
 
 Places = Mapping[str, slice]
+
+Said = dict[str, dict[int, Any]]
+"""What functions of Python gave last, by variable and row."""
 
 
 @final
@@ -128,11 +133,14 @@ class Called:
     """A function of Python, called for one row after another.
 
     Args:
-        function: With its constants bound.
-        parents: Names and whether they are of one control step ago.
+        function: What is called.
+        parents: What it is given.
         where: Columns of the arguments.
         shapes: Of the arguments.
         place: Columns of the result.
+        said: What functions of Python gave, by variable and row: a table of numbers does not have
+            its type. The results of this one are added, under ``name``.
+        name: Of the variable.
     """
 
     def __init__(
@@ -142,39 +150,45 @@ class Called:
         where: list[slice],
         shapes: list[tuple[int, ...]],
         place: slice,
+        said: Said,
+        name: str,
     ) -> None:
         self._function, self._place = function, place
-        self._arguments = tuple(zip(parents, where, shapes, strict=True))
-        self._kinds: dict[tuple[int, str], Any] = {}
+        self._given = tuple(
+            (key(parent), columns, shape, said.get(parent.name) if parent.lag == 0 else None)
+            for parent, columns, shape in zip(parents, where, shapes, strict=True)
+        )
+        self._kinds: dict[tuple[int, str], tuple[type, Any]] = {}
+        self._found = said.setdefault(name, {})
 
     def begin(self, row: int, now: Values) -> None:
         """Keep the types of the arguments, which a table of numbers does not have."""
-        for parent, _, _ in self._arguments:
-            value: Any = now.get(parent.name)
-            self._kinds[row, parent.name] = getattr(value, "dtype", None) or type(value)
+        for name, _, _, _ in self._given:
+            value: Any = now[name]
+            self._kinds[row, name] = type(value), getattr(value, "dtype", None)
 
     def compute(self, matrix: Floats, rows: Integers) -> None:
         """Call it for each row."""
+        kinds, found = self._kinds, self._found
         for row in rows.tolist():
             given = [
-                _typed(matrix[row, place].reshape(shape), self._kinds[row, parent.name], parent.lag)
-                for parent, place, shape in self._arguments
+                _typed(matrix[row, columns].reshape(shape), *kinds[row, name])
+                if said is None
+                else said[row]
+                for name, columns, shape, said in self._given
             ]
-            matrix[row, self._place] = np.ravel(self._function(*given))
+            value = self._function(*given)
+            # Its own: a function may give one array again and again.
+            found[row] = value.copy() if isinstance(value, np.ndarray) else value
+            matrix[row, self._place] = np.ravel(value)
 
 
-def _typed(value: Value, kind: Any, lag: int) -> Any:
-    """Give a value the type that it had when its row began, if it still fits.
-
-    A function of Python may give a whole number in one step and a fraction in the next.
-    """
-    if np.dtype(kind).kind in "biu" and not (value == np.rint(value)).all():
-        kind = float
-    if isinstance(kind, np.dtype):
-        return value.astype(kind)
-    if lag:
-        return np.array(kind(value.item()))
-    return kind(value.item()) if value.ndim == 0 else value.copy()
+def _typed(value: Value, kind: type, dtype: Any) -> Any:
+    """Give a value the type that it has in a single world."""
+    if dtype is None:
+        return kind(value.item())
+    typed = value.astype(dtype)
+    return typed if issubclass(kind, np.ndarray) else typed[()]
 
 
 def equation(
@@ -183,6 +197,7 @@ def equation(
     where: Places,
     earlier: Places,
     more: Columns,
+    said: Said,
 ) -> Equation:
     """Bind the mechanism of a variable to columns.
 
@@ -192,32 +207,43 @@ def equation(
         where: Columns of present values.
         earlier: Columns of values of one control step ago.
         more: Columns for constants, and for vectors that are put together.
+        said: What functions of Python give; what follows from it is called like them.
     """
     variable: Any = model.declared(name)
     parents: tuple[Parent, ...] = tuple(variable.all_parents)
     columns = [where[p.name] if p.lag == 0 else earlier[p.name] for p in parents]
     shapes = [model.declared(p.name).shape for p in parents]
-    place = where[name]
+    if not any(p.lag == 0 and p.name in said for p in parents):
+        found = _compiled(variable, columns, shapes, where[name], more)
+        if found is not None:
+            return found
+    return Called(called(model, name), parents, columns, shapes, where[name], said, name)
+
+
+def _compiled(
+    variable: Any,
+    columns: list[slice],
+    shapes: list[tuple[int, ...]],
+    place: slice,
+    more: Columns,
+) -> Equation | None:
+    """Bind a mechanism that needs no Python for each row; None if it does."""
     if isinstance(variable.mechanism, Linear):
         return Weighted(variable.mechanism, columns, place)
-    bound = variable.mechanism.bind()
-    function, constants = positional(bound, len(parents))
+    function, constants = positional(variable.mechanism.bind(), len(columns))
     stacked = isinstance(function, Stacked)
     if stacked:
         function, shapes = function.kernel, [(sum(c.stop - c.start for c in columns),)]
+    if not shapes or any(len(shape) > 1 for shape in shapes):
+        return None
     kinds = [VECTOR if shape else types.float64 for shape in (*shapes, *map(np.shape, constants))]
-    signature = None
-    if parents and all(len(shape) < 2 for shape in shapes):
-        signature = _signature(function, kinds, variable)
+    signature = _signature(function, kinds, variable)
     if signature is None:
-        shapes = [model.declared(p.name).shape for p in parents]
-        return Called(bound, parents, columns, shapes, place)
-    sources = columns
-    if stacked:
-        columns = [more.take(np.zeros(shapes[0]))]
-    columns = [*columns, *map(more.take, constants)]
-    compiled = Compiled(Each(function, signature, columns, place))
-    return Together(compiled, sources, columns[0]) if stacked else compiled
+        return None
+    whole = [more.take(np.zeros(shapes[0]))] if stacked else columns
+    given = [*whole, *map(more.take, constants)]
+    compiled = Compiled(Each(function, signature, given, place))
+    return Together(compiled, columns, whole[0]) if stacked else compiled
 
 
 def _signature(function: Any, kinds: list[Any], variable: Variable) -> Any:
@@ -229,6 +255,7 @@ def _signature(function: Any, kinds: list[Any], variable: Variable) -> Any:
         made: Any = function.overloads[tuple(kinds)]
     except (NumbaError, KeyError, RuntimeError):
         return None
-    result = made.signature.return_type
-    one, several = isinstance(result, types.Number | types.Boolean), result == VECTOR
+    result = _types.unliteral(made.signature.return_type)
+    one = isinstance(result, types.Float | types.Integer | types.Boolean)
+    several = result == VECTOR
     return result(*kinds) if (several if variable.shape else one) else None

@@ -109,7 +109,8 @@ class Readouts:
 
     def _keep(self, name: str, value: Value) -> None:
         """Keep a value of one step ago, beside the present ones so that one look-up finds all."""
-        kept, found = self._before.get(name), np.asarray(value)
+        real = self._model.declared(name).dtype == "real"  # also where the first one is whole
+        kept, found = self._before.get(name), np.asarray(value, dtype=np.float64 if real else None)
         if kept is None or (kept.shape, kept.dtype) != (found.shape, found.dtype):
             self._before[name] = self._now[key(Parent(name, 1))] = found.copy()
             self._sure = None

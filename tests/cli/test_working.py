@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 from scm_world.cli import app
 from scm_world.cli.working import Work
 from scm_world.errors import UnknownOption
-from scm_world.work.executors import cores
+from scm_world.work.threads import cores
 
 COLLECT = ("collect", "pushing", "--backend", "fake", "--steps", "1", "-n", "6", "--shard", "2")
 EVALUATE = ("evaluate", "still", "--protocols", "P0", "-n", "2", "--backend", "fake")
@@ -55,6 +55,35 @@ def test_commands_refuse_what_does_not_fit(
     assert done.exit_code == 2, done.output
     assert said in " ".join(done.output.split())
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--engine", "ray"), "--engine cannot be 'ray'; it can be: serial, or left out"),
+        (("--workers", "2"), "--workers cannot be 2; it can be: 1, or left out"),
+        (("--address", "auto"), "--address cannot be 'auto'; it can be: left out"),
+    ],
+)
+def test_experiments_of_one_graph_stay_here(
+    wrong: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    """Without --learner nothing is done elsewhere, and nobody is told that it is."""
+    done = call("discover", "pushing", "--backend", "fake", *wrong, "--out", str(tmp_path / "out"))
+    assert done.exit_code == 2, done.output
+    assert f"{said}: discover without --learner works" in " ".join(done.output.split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "usual"),
+    [("evaluate", "as many as there are cores"), ("collect", "1; with --engine")],
+)
+def test_help_tells_how_many_workers_there_are(command: str, usual: str) -> None:
+    """An evaluation has all cores without being asked."""
+    done = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "400"})
+    line = next(text for text in done.output.splitlines() if "--workers" in text)
+    assert f"default: ({usual}" in line
 
 
 def test_two_processes_write_what_one_does(tmp_path: Path) -> None:

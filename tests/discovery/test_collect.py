@@ -309,6 +309,7 @@ class Stubborn:
 
     def __init__(self, every: int) -> None:
         self.every, self.at_once, self.edges = every, False, None
+        self.uneven = False
         self.columns = Dataset.of([[0.0]], ["x"]).columns
         self.about: dict[str, Any] = {}
 

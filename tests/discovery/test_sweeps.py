@@ -24,6 +24,7 @@ from scm_world.variables import Box, Categories, Exogenous, Integers
 MASS, FRICTION = "tool_block.mass", "floor_friction"
 OVER = {MASS: [0.02, 0.05, 0.08], FRICTION: Levels("A", 2)}
 HOW: dict[str, Any] = {"steps": 2, "seed": 5, "nature": {"gravity": "A"}, "shard": 4}
+FIRST, OTHER = (f"tool_block_{number}.cartesian_position" for number in (1, 2))
 SPEED = Outcome("tool_block.linear_velocity", "final", 2)
 FILES = {**HOW, "format": "csv"}
 
@@ -77,7 +78,10 @@ def test_a_grid_is_every_combination(world: World) -> None:
         ({MASS: 0.02}, "Levels"),
         ({MASS: "C"}, "A, B, A|B, values"),
         ({MASS: Levels("A", 0)}, "levels of tool_block.mass"),
-        ({"tool_block.cylindrical_position": "A"}, "without ends of its own"),
+        ({"tool_block.cylindrical_position": "A"}, "a space with ends of its own"),
+        ({"tool_block.type": "A"}, "cannot be 'A'; it can be: values, as it has"),
+        ({MASS: Levels("A", 10**12)}, "points of the grid cannot be 1000000000000"),
+        ({MASS: Levels("A", 400), FRICTION: Levels("A", 400)}, "160000; it can be: at most"),
     ],
 )
 def test_grids_without_values_are_refused(over: Any, said: str, world: World) -> None:
@@ -85,6 +89,18 @@ def test_grids_without_values_are_refused(over: Any, said: str, world: World) ->
     with pytest.raises(UnknownOption) as caught:
         sweep(world, over, n=1, steps=1)
     assert said in str(caught.value)
+
+
+def test_what_is_no_world_is_refused() -> None:
+    """Its name is none: an evaluation takes that, a sweep does not."""
+    with pytest.raises(UnknownOption, match="world cannot be 'pushing'"):
+        sweep("pushing", OVER, n=1)  # type: ignore[arg-type] # it is none
+
+
+def test_no_column_comes_twice(world: World) -> None:
+    """What is set is written down already; it is told before any episode."""
+    with pytest.raises(UnknownOption, match=rf"outcomes cannot be '{MASS}'"):
+        sweep(world, OVER, [MASS], n=10**9)
 
 
 def test_variables_of_a_grid_can_be_set(world: World) -> None:
@@ -143,6 +159,17 @@ def test_refused_units_are_left_out_of_pairs() -> None:
     one, other = found.rows()
     assert [(row["n"], row["refused"]) for row in (one, other)] == [(3, 0), (2, 1)]
     assert (one["y"], other["y"], other["y.change"]) == (18.0, 6.0, 4.0)
+
+
+def test_impossible_points_side_by_side_are_told_in_the_table() -> None:
+    """Some of a grid, all in its first shard: they are less than half, and the rest is measured."""
+    inside, beside = np.linspace(0.0, 0.03, 20), np.linspace(0.07, 0.09, 21)
+    places = [[x, 0.0, 0.0325] for x in (*inside, *beside)]
+    with World("stacking2", backend="fake").given({FIRST: places[0]}) as world:
+        found = sweep(world, {OTHER: places}, ["reward"], n=1, steps=1, shard=20)
+        assert [row["refused"] for row in found.rows()] == [1] * 20 + [0] * 21
+        with pytest.raises(InterventionError, match="20 of 20 episodes were refused"):
+            sweep(world, {OTHER: places[:20]}, ["reward"], n=1, steps=1, shard=10)
 
 
 def test_what_is_given_to_the_world_holds_everywhere(world: World) -> None:
@@ -244,6 +271,7 @@ def test_the_command_sweeps(tmp_path: Path) -> None:
         ["--over", "tool_block.mass"],
         ["--over", "tool_block.mass=1:2"],
         ["--over", "tool_block.mass=A:0"],
+        ["--over", "tool_block.mass=0:1:1000000000000"],
         ["--over", "tool_block.mass=shift:1"],
         ["--over", "tool_block.mass=1", "--over", "tool_block.mass=2"],
         ["--over", "tool_blok.mass=1"],

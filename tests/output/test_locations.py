@@ -127,6 +127,12 @@ def test_unknown_protocols_are_refused() -> None:
         located("s4://bucket/run")
 
 
+def test_a_url_has_a_protocol() -> None:
+    """Without one, fsspec would take it for a path."""
+    with pytest.raises(UnknownOption, match="protocol://place"):
+        located("://run")
+
+
 def test_a_missing_package_is_named() -> None:
     """That of the protocol, in the words of fsspec."""
     advice = "Install nowhere-fs to get there"

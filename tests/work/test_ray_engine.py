@@ -129,6 +129,20 @@ def test_a_cluster_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) ->
         engine_of("ray", address="127.0.0.1:9")
 
 
+def test_a_cluster_that_is_no_more_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Ray keeps the address of one that was killed, and would knock there for minutes."""
+    (tmp_path / "ray").mkdir()
+    (tmp_path / "ray" / "ray_current_cluster").write_text("127.0.0.1:9\n")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    with pytest.raises(EngineFailure, match=r"there is no Ray at 127.0.0.1:9, which is 'auto'"):
+        engine_of("ray", address="auto")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:7")
+    with pytest.raises(EngineFailure, match=r"there is no Ray at 127.0.0.1:7, which is 'auto'"):
+        engine_of("ray", address="auto")
+
+
 def test_a_connection_is_shared(ray: Executor) -> None:
     """Another executor uses it, and leaves it open when it ends."""
     with engine_of("ray", workers=1, address="auto") as other:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Any, Protocol, final
 
@@ -19,6 +20,9 @@ from scm_world.scene.trifinger import N_JOINTS
 
 KEPT = 4
 """Structures whose simulations are kept although no scene is in them at the moment."""
+
+_STRANDED: list[_Room] = []
+"""Simulations whose threads were left behind by a fork."""
 
 
 class Guest(Protocol):
@@ -114,6 +118,7 @@ class MujocoBatch(EngineBatch):
         self._threads = max(1, min(threads, len(self._guests)))
         self._rooms: dict[Structure, _Room] = {}
         self._seats: list[Seat | None] = [None] * len(self._guests)
+        self._process = os.getpid()
 
     def step(
         self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
@@ -121,8 +126,10 @@ class MujocoBatch(EngineBatch):
         """Hold commands for some physics steps.
 
         Raises:
-            EngineFailure: A position or velocity is not finite afterwards.
+            EngineFailure: A position or velocity is not finite afterwards; all were stepped.
         """
+        if self._process != os.getpid():
+            self._leave_threads()
         rooms: dict[int, tuple[_Room, list[int]]] = {}
         changed: set[int] = set()
         for index in which.tolist():
@@ -132,20 +139,14 @@ class MujocoBatch(EngineBatch):
             if self._guests[index].depart(seat, mode):
                 seat.room.models[index] = self._guests[index].model
                 changed.add(key)
+        problems = []
         for key, (room, members) in rooms.items():
             if key in changed:
                 room.batch.set_models(room.models)
-            self._step(room, np.array(members, dtype=np.int32), commands, substeps, into)
-
-    def _step(self, room: _Room, which: Any, commands: Floats, substeps: int, into: Floats) -> None:
-        try:
-            room.step(which, commands, substeps)
-        except SimulationError as error:
-            raise EngineFailure(f"MuJoCo: {error}", "mujoco") from error
-        wrong = read_states(room.positions, room.velocities, room.forces, which, into)
-        if wrong >= 0:
-            said = f"MuJoCo produced a state that is not finite in scene {wrong} of the batch"
-            raise EngineFailure(said, "mujoco")
+            problem = _step(room, np.array(members, dtype=np.int32), commands, substeps, into)
+            problems += [problem] if problem else []
+        if problems:
+            raise EngineFailure("; ".join(problems), "mujoco")
 
     def _seat(self, index: int) -> Seat:
         """Give the seat of a scene in the room of its structure."""
@@ -164,8 +165,32 @@ class MujocoBatch(EngineBatch):
             self._rooms[structure] = found
         return found
 
+    def _leave_threads(self) -> None:
+        """Make everything anew after a fork: threads stay in the process that started them.
+
+        What they worked for cannot be freed here: that would wait for them for ever.
+        """
+        self._process = os.getpid()
+        _STRANDED.extend(self._rooms.values())
+        _STRANDED.extend(seat.room for seat in self._seats if seat is not None)
+        self._rooms.clear()
+        self._seats = [None] * len(self._guests)
+
     def _leave_unused(self) -> None:
         used = {id(seat.room) for seat in self._seats if seat is not None}
         unused = [key for key, room in self._rooms.items() if id(room) not in used]
         for key in unused[: max(0, len(self._rooms) + 1 - KEPT)]:
             del self._rooms[key]
+
+
+def _step(room: _Room, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
+    """Step and read; say what went wrong, or nothing."""
+    said = ""
+    try:
+        room.step(which, commands, substeps)
+    except SimulationError as error:
+        said = f"MuJoCo: {error}"
+    wrong = read_states(room.positions, room.velocities, room.forces, which, into)
+    if wrong >= 0 and not said:
+        said = f"MuJoCo produced a state that is not finite in scene {wrong} of the batch"
+    return said

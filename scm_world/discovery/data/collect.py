@@ -212,7 +212,8 @@ def _gathered(
         parts[index] = part = replace(found, table=replace(found.table, about=head.about))
         refused += part.refused
         made += len(ranges[index])
-        _refuse_hopeless(refused, made)
+        if made == head.n or not source.uneven:
+            _refuse_hopeless(refused, made)
         if folder is not None:
             folder.write(index, ranges[index], part)
         if not serial:

@@ -182,7 +182,7 @@ class Folder:
             raise UnreadableFile(str(self.path), reason, "give another folder")
         if there["n"] > self.head.n:
             allowed = (f"{there['n']} or more: {self.path} has so many already",)
-            raise UnknownOption("n", self.head.n, allowed)
+            raise UnknownOption("number of episodes", self.head.n, allowed)
         if there["n"] < self.head.n:
             self.note({})
 

@@ -35,6 +35,7 @@ class Experiments:
     """
 
     at_once = False
+    uneven = False
     edges: tuple[Edge, ...] | None = None
 
     def __init__(self, laboratory: Laboratory, design: Design, n: int, *, seed: int) -> None:

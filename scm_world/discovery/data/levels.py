@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
@@ -16,6 +17,7 @@ from scm_world.variables.kinds import SPACES
 from scm_world.world.start import whole_number
 
 LEVELS = 5
+MOST = 100_000  # points: each has its own plan, and a row of the table
 
 Point = Mapping[str, Any]
 """What is done: values as plain numbers or lists, by variable."""
@@ -43,11 +45,15 @@ class Levels:
             UnknownOption: There is no such space, or it has no ends.
         """
         count = whole_number(f"levels of {variable.name}", self.count, least=1)
+        check_points(count)
         space = self.space
         if isinstance(space, str):
             if space not in SPACES:
                 raise UnknownOption(f"levels of {variable.name}", space, (*SPACES, "values"))
             space = variable.space(space)
+        if space is None:
+            allowed = ("values, as it has no such space",)
+            raise UnknownOption(f"levels of {variable.name}", self.space, allowed)
         return tuple(_plain(value) for value in _evenly(variable, space, count))
 
 
@@ -64,7 +70,7 @@ def _evenly(variable: Variable, space: Any, count: int) -> Sequence[Any]:
         case Box() if not space.parents():
             low, high = space.bounds(variable.shape, {})
             return [np.asarray(value) for value in np.linspace(low, high, count)]
-    allowed = ("values: it has no such space, or one without ends of its own",)
+    allowed = ("a space with ends of its own", "values")
     raise UnknownOption(f"levels of {variable.name}", space, allowed)
 
 
@@ -81,7 +87,8 @@ def points_of(over: Mapping[str, Any], model: SCM) -> tuple[Point, ...]:
 
     Raises:
         UnknownVariable: No variable has this name.
-        UnknownOption: A variable has no values, or what is given is none.
+        UnknownOption: A variable has no values, what is given is none, or there are too many
+            combinations.
 
     Example:
         >>> from scm_world.variables import Exogenous
@@ -92,7 +99,19 @@ def points_of(over: Mapping[str, Any], model: SCM) -> tuple[Point, ...]:
     if not over:
         raise UnknownOption("over", "nothing", ("one variable or more, with values",))
     columns = [_values(name, given, model) for name, given in over.items()]
+    check_points(math.prod(map(len, columns)))
     return tuple(dict(zip(over, chosen, strict=True)) for chosen in itertools.product(*columns))
+
+
+def check_points(count: int) -> None:
+    """Refuse a grid with more points than a table can have.
+
+    Raises:
+        UnknownOption: It has.
+    """
+    if count > MOST:
+        allowed = (f"at most {MOST}: give fewer values, or several sweeps",)
+        raise UnknownOption("points of the grid", count, allowed)
 
 
 def _values(name: str, given: Any, model: SCM) -> tuple[Any, ...]:

@@ -43,6 +43,7 @@ class Model:
     """
 
     at_once = True
+    uneven = False
 
     def __init__(self, model: SCM, design: Design, *, seed: int, steps: int | None) -> None:
         if steps is None and any(edge.lag for edge in model.edges):

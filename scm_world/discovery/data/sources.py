@@ -41,12 +41,15 @@ class Source(Protocol):
         about: Everything that decides the rows, as plain data.
         edges: The declared graph; None where it may not be known.
         at_once: Whether any number of episodes takes one piece of work.
+        uneven: Whether some episodes say little of the others: that most of them are refused is
+            known only when all are done.
     """
 
     columns: tuple[Column, ...]
     about: dict[str, Any]
     edges: tuple[Edge, ...] | None
     at_once: bool
+    uneven: bool
 
     def part(self, numbers: range, tell: Tell) -> Part:
         """Let some episodes happen."""

@@ -16,6 +16,7 @@ from scm_world.discovery.data.levels import Point, points_of
 from scm_world.discovery.data.sources import Part, Tell
 from scm_world.discovery.data.swept import Swept
 from scm_world.discovery.data.worlds import Episodes
+from scm_world.errors import UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.output.locations import Location, located
 from scm_world.queries.plans import Plan
@@ -83,6 +84,8 @@ def sweep(
         >>> [(row["tool_block.mass"], row["n"]) for row in found.rows()]
         [(0.02, 3), (0.08, 3)]
     """
+    if not isinstance(world, World):
+        raise UnknownOption("world", world, ("a World: World('pushing')",))
     count = whole_number("n", n, least=1)
     points = points_of(over, world.model)
     setting = Setting(policy, nature, whole_number("steps", steps, least=1), seed)
@@ -118,6 +121,7 @@ class Grid:
     """
 
     at_once = False
+    uneven = True  # points that are impossible may be neighbors
 
     def __init__(
         self,

@@ -52,10 +52,12 @@ class Episodes:
     Raises:
         InterventionError: A target, or what varies, cannot be set to its values.
         UnknownVariable: No variable has this name.
-        UnknownOption: An outcome is a function, or sums up an episode with ``every_step``.
+        UnknownOption: An outcome is a function, sums up an episode with ``every_step``, or is
+            written down as a cause already.
     """
 
     at_once = False
+    uneven = False
 
     def __init__(
         self,
@@ -81,6 +83,7 @@ class Episodes:
             else Ends(world, varied, measured)
         )
         self.columns: tuple[Column, ...] = self._rows.columns
+        _refuse_twice(self.columns)
         self._sensors = Sensors(world, self._rows.watched)
         self.edges: tuple[Edge, ...] | None = world.model.edges
         self.about: dict[str, Any] = self._about()
@@ -167,6 +170,15 @@ class Episodes:
             step=np.array(step, dtype=np.int64),
             about=self.about,
         )
+
+
+def _refuse_twice(columns: Sequence[Column]) -> None:
+    """Refuse two columns with one name, before episodes happen for them."""
+    names = [column.name for column in columns]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        allowed = ("what is no cause: those have a column already",)
+        raise UnknownOption("outcomes", ", ".join(twice), allowed)
 
 
 def _outcomes(given: Iterable[Any]) -> tuple[Outcome, ...]:

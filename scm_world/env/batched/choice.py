@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Callable
 
 from scm_world.env.batched.crew import Crew
 from scm_world.env.batched.loop import LoopCrew
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import UnknownOption
+from scm_world.work.threads import cores
 
 CREWS = ("native", "processes", "loop")
 
@@ -62,10 +62,3 @@ def fastest(backend: str, num_envs: int, *, workers: int | None) -> str:
         return "native"
     several = num_envs > 1 and cores() > 1 and not multiprocessing.current_process().daemon
     return "processes" if workers is not None or (backend == "bullet" and several) else "loop"
-
-
-def cores() -> int:
-    """Count the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,14 +57,16 @@ class NativeCrew:
         self._commands = Commands(lead, num_envs)
         names = (*Inside.of(lead).needed, FRACTION, *self._commands.names)
         self._batch = Batch([env.world for env in self._envs], threads=threads, names=names)
-        self._lenses: dict[int, tuple[Table, Lens]] = {}
+        self._lenses: WeakKeyDictionary[Table, Lens] = WeakKeyDictionary()
         self._sensed: set[int] = set()
+        self._alone: set[int] = set()  # they were used by themselves since they were stepped
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step."""
         rows = np.flatnonzero(which)
         if not len(rows):
             return
+        self._look()
         commands = self._commands.read(rows, actions, self._batch)
         self._batch.advance(commands, which)
         self._commands.passed(rows)
@@ -85,21 +88,15 @@ class NativeCrew:
         options: Sequence[Mapping[str, Any] | None],
     ) -> None:
         """Begin an episode in some of them."""
-        indices = self._bring(np.flatnonzero(which).tolist())
-        try:
-            self._members.reset(which, seeds, options)
-        finally:
-            self._look(indices)
+        self._bring(np.flatnonzero(which).tolist())
+        self._members.reset(which, seeds, options)
 
     def do(
         self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
     ) -> dict[int, Audit]:
         """Intervene in some of them."""
-        indices = self._bring(requests)
-        try:
-            return self._members.do(requests, space)
-        finally:
-            self._look(indices)
+        self._bring(requests)
+        return self._members.do(requests, space)
 
     def snapshot(self, indices: Sequence[int]) -> list[EnvSnapshot]:
         """Save some of them."""
@@ -108,25 +105,18 @@ class NativeCrew:
 
     def restore(self, snapshots: Mapping[int, EnvSnapshot]) -> None:
         """Take some of them to a snapshot."""
-        indices = self._bring(snapshots)
-        try:
-            self._members.restore(snapshots)
-        finally:
-            self._look(indices)
+        self._bring(snapshots)
+        self._members.restore(snapshots)
 
     def undo(self) -> None:
         """Take back what the last reset, intervention or restoration did."""
-        everything = self._bring(range(self.num_envs))
+        self._bring(range(self.num_envs))
         self._members.undo()
-        self._look(everything)
 
     def call(self, indices: Sequence[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Call a method of some of them; what cannot be called is given as it is."""
         self._bring(indices)
-        try:
-            return self._members.call(indices, name, *args, **kwargs)
-        finally:
-            self._look(indices)
+        return self._members.call(indices, name, *args, **kwargs)
 
     def attribute(self, indices: Sequence[int], name: str) -> list[Any]:
         """Look an attribute of some of them up."""
@@ -150,10 +140,7 @@ class NativeCrew:
         env = self._envs[index]
         seen = env.observation_space
         self._bring([index])
-        try:
-            yield env
-        finally:
-            self._look([index])
+        yield env
         shown = env.present()
         if env.observation_space is not seen:
             self.form.check(env, "what was done")
@@ -170,18 +157,18 @@ class NativeCrew:
 
     def close(self) -> None:
         """Free their engines."""
+        self._bring(range(self.num_envs))  # no row counts any more
         self._members.close()
 
-    def _bring(self, indices: Iterable[int]) -> list[int]:
+    def _bring(self, indices: Iterable[int]) -> None:
         """Let environments be as they are now, so that each can be used by itself."""
-        found = list(indices)
-        for index in found:
-            self._batch.world(index)
-        return found
-
-    def _look(self, indices: Iterable[int]) -> None:
-        """Note what was changed in environments that were used by themselves."""
         for index in indices:
+            self._batch.world(index)
+            self._alone.add(index)
+
+    def _look(self) -> None:
+        """Note what was changed in environments that were used by themselves."""
+        for index in self._alone:
             env = self._envs[index]
             if not env.world.has_begun:
                 continue
@@ -190,12 +177,13 @@ class NativeCrew:
                 self._sensed.add(index)
             else:
                 self._sensed.discard(index)
+        self._alone.clear()
 
     def _lens(self, table: Table, row: int) -> Lens:
-        found = self._lenses.get(id(table))
-        if found is None or found[0] is not table:
-            found = self._lenses[id(table)] = table, Lens(self._envs[row], table)
-        return found[1]
+        found = self._lenses.get(table)
+        if found is None:
+            found = self._lenses[table] = Lens(self._envs[row], table)
+        return found
 
     def _explain(self, row: int) -> None:
         """Raise the error that the environment would raise alone.

@@ -70,14 +70,16 @@ class Form:
         Raises:
             InterventionError: There are other bodies in it than in the others.
         """
-        mine = (self.observation_space, self.goals)
-        if (env.observation_space, _goal_sizes(env)) == mine:
+        seen, goals = env.observation_space, _goal_sizes(env)
+        if (seen, goals) == (self.observation_space, self.goals):
             return
+        before, after = _shape(self.observation_space), _shape(seen)
+        if before == after:
+            before, after = f"goals of {self.goals} numbers", f"goals of {goals}"
         raise InterventionError(
             f"{variable} changes which bodies exist, and with them what is observed, from "
-            f"{_shape(self.observation_space)} to {_shape(env.observation_space)}; environments "
-            "in a batch are all observed alike: set it for all of them with start={…} when they "
-            "are made, or use single environments",
+            f"{before} to {after}; environments in a batch are all observed alike: set it for all "
+            "of them with start={…} when they are made, or use single environments",
             variable=variable,
         )
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from crews import LENGTH, actions, check_alike, check_same, kept, make
 
-from scm_world.env.batched.choice import cores, fastest
+from scm_world.env.batched.choice import fastest
 from scm_world.env.batched.memory import IN_MEMORY, Bell, meeting_place, share
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption, UnwritableFolder
 from scm_world.work.processes import Worker
+from scm_world.work.threads import cores
 
 
 def left_behind() -> list[str]:

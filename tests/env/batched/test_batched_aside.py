@@ -1,0 +1,62 @@
+"""What happens to environments beside steps: closing, and worlds that are used by themselves."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from typing import Any
+
+import numpy as np
+import pytest
+from crews import actions, check_same, make
+
+from scm_world.errors import InterventionError, NotReset
+
+
+@pytest.mark.parametrize("crew", ["loop", "native"])
+def test_a_closed_one_takes_no_step(crew: str) -> None:
+    """After closing there is no episode; a reset begins one."""
+    envs = make(crew, 2)
+    envs.reset(seed=0)
+    envs.step(actions(1, 2)[0])
+    envs.close()
+    envs.close()
+    with pytest.raises(NotReset):
+        envs.step(actions(1, 2)[0])
+    envs.reset(seed=0)
+    assert envs.step(actions(1, 2)[0])[1].shape == (2,)
+
+
+def test_what_is_done_to_a_world_itself_is_seen() -> None:
+    """Noise of the sensors that begins in a world that was asked for is there in the next step."""
+    pair = [make(crew, 2, backend="mujoco") for crew in ("loop", "native")]
+    for envs in pair:
+        envs.reset(seed=0)
+        envs.step(actions(1, 2)[0])
+        envs.get_attr("world")[1].do({"sensor_noise": 0.05})
+    one, other = (envs.step(actions(2, 2)[1]) for envs in pair)
+    check_same(one, other)
+
+
+def test_what_belongs_to_a_structure_that_is_gone_is_freed() -> None:
+    """Tables that a batch does not keep are kept by nobody else."""
+    envs: Any = make("native", 1)
+    envs.reset(seed=0)
+    envs.step(actions(1, 1)[0])
+    crew = envs.unwrapped.crew
+    table = weakref.ref(crew._batch.table(0))
+    crew._bring([0])
+    crew._batch._tables.clear()
+    crew._batch._homes[0] = None
+    gc.collect()
+    assert table() is None
+    assert np.isfinite(envs.step(actions(2, 1)[1])[1]).all()
+
+
+def test_goals_that_are_unlike_the_others_are_named() -> None:
+    """Where only goals differ, the refusal says so."""
+    options = {"observation_mode": "custom", "observe": ["joint_positions"]}
+    envs = make("loop", 2, "scm_world/General-v0", **options)
+    envs.reset(seed=0)
+    with pytest.raises(InterventionError, match="goals"):
+        envs.do({1: {"nums_objects": 2}})

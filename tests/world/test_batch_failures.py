@@ -1,0 +1,121 @@
+"""Batches in which something went wrong, or was left out."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world.backends.mujoco.backend import MujocoBackend
+from scm_world.errors import EngineFailure
+from scm_world.world import World
+from scm_world.world.batch import Batch
+
+COUNT = 3
+
+
+def _worlds() -> list[World]:
+    first = World("pushing")
+    found = [first, *(World(first.family) for _ in range(COUNT - 1))]
+    for seed, world in enumerate(found):
+        world.reset(seed=seed)
+    return found
+
+
+def _commands(world: World, steps: int) -> Any:
+    generator = np.random.default_rng(0)
+    return generator.uniform(world.action_low, world.action_high, (steps, COUNT, 9))
+
+
+def test_worlds_go_on_where_another_one_is_lost() -> None:
+    """A state that is lost is lost in one world; clocks and states of the others agree."""
+    alone, many = _worlds(), _worlds()
+    many[1].do({"floor_friction": 0.4})
+    batch = Batch(many, names=("reward",))
+    asked = _commands(alone[0], 3)
+    backend: Any = batch.world(1).backend
+    assert isinstance(backend, MujocoBackend)
+    backend._velocities[:] = 1e200
+    with pytest.raises(EngineFailure, match="scene 1"):
+        batch.advance(asked[0])
+    assert [batch.world(index).index for index in (0, 2)] == [1, 1]
+    batch.world(1).reset(seed=1)
+    alone[1].reset(seed=1)
+    for index in (0, 2):
+        alone[index].advance(asked[0, index].copy())
+    for step in (1, 2):
+        batch.advance(asked[step])
+        for index, world in enumerate(alone):
+            world.advance(asked[step, index].copy())
+    for index, world in enumerate(alone):
+        assert batch.world(index).index == world.index
+        for name, value in world.values().items():
+            np.testing.assert_array_equal(batch.world(index)[name], value, err_msg=name)
+
+
+class _Interrupted:
+    """An engine during whose step somebody presses Ctrl-C."""
+
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
+
+    def step(self, which: Any, mode: Any, commands: Any, substeps: int, into: Any) -> None:
+        """Step, and do not come to reading."""
+        self._engine.step(which, mode, commands, substeps, into.copy())
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_batch_is_where_its_engine_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After Ctrl-C every world goes on like one that is taken to its snapshot."""
+    batch, other = Batch(_worlds(), names=("reward",)), _worlds()[0]
+    first, second, third = _commands(other, 3)
+    batch.advance(first)
+    with monkeypatch.context() as patched:
+        patched.setattr(batch, "_engine", _Interrupted(batch._engine))
+        with pytest.raises(KeyboardInterrupt):
+            batch.advance(second)
+    for index in range(COUNT):
+        other.restore(batch.world(index).snapshot())
+        batch.advance(third, np.arange(COUNT) == index)
+        other.advance(third[index].copy())
+        assert other.index == batch.world(index).index == 3
+        assert other["reward"] == batch.table(index).column("reward")[index, 0]
+
+
+def test_what_was_not_computed_is_remembered_all_the_same() -> None:
+    """What a step leaves out is computed as soon as a later step needs it."""
+    alone, many = _worlds(), _worlds()
+    batch = Batch(many, names=("reward",))
+    for step, asked in enumerate(_commands(alone[0], 6)):
+        batch.advance(asked, evaluate=step % 3 == 2)
+        for index, world in enumerate(alone):
+            world.advance(asked[index].copy())
+            if step % 3 == 2:
+                now = world.evaluate(("reward",))
+                assert batch.table(index).column("reward")[index, 0] == now["reward"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_batch_goes_on_in_a_forked_process() -> None:
+    """The threads of the engine stay behind in the old process; the new one starts its own."""
+    alone, many = _worlds(), _worlds()
+    batch = Batch(many, threads=2, names=("reward",))
+    first, second = _commands(alone[0], 2)
+    batch.advance(first)
+    for index, world in enumerate(alone):
+        world.advance(first[index].copy())
+        world.advance(second[index].copy())
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # else nobody would notice that it waits for ever
+        same = False
+        try:
+            batch.advance(second)
+            same = all(batch.world(i)["reward"] == w["reward"] for i, w in enumerate(alone))
+        finally:
+            os._exit(0 if same else 1)
+    assert os.waitpid(child, 0)[1] == 0
