@@ -20,7 +20,7 @@ from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.work.executors import Executor, Serial, opened
-from scm_world.world.batch import cores
+from scm_world.work.threads import cores
 
 
 @final

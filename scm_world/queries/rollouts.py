@@ -17,7 +17,7 @@ from scm_world.queries.lockstep import advanced, is_known
 from scm_world.queries.stages import Stage, threaded
 from scm_world.queries.traces import Trace
 from scm_world.queries.units import Unit
-from scm_world.work.executors import cores
+from scm_world.work.threads import cores
 from scm_world.world.start import whole_number
 
 R = TypeVar("R")

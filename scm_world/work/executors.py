@@ -21,8 +21,7 @@ from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.work.jobs import Bag
 from scm_world.work.pool import Pool
 from scm_world.work.processes import PROCESS, pickled
-from scm_world.work.threads import cores as cores
-from scm_world.work.threads import single_threaded
+from scm_world.work.threads import cores, single_threaded
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
 from scm_world.scene.kinematics import inverse_kernel
-from scm_world.work.threads import cores as cores
+from scm_world.work.threads import cores
 from scm_world.world.columns import Table
 from scm_world.world.declaration import Declaration
 from scm_world.world.start import whole_number
