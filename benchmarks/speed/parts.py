@@ -93,7 +93,7 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
     places: list[tuple[str, Any, str]] = [
         (PHYSICS, crew._batch._engine, "step"),
         *(("mechanisms", table, "evaluate") for table in tables),
-        *(("observation", lens, "write") for _, lens in lenses),
+        *(("observation", lens, "write") for lens in lenses),
         ("observation", inner, "_observations"),
         ("info", inner, "_infos"),
         ("command", crew._commands, "read"),
