@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from benchmarks.speed.goals import Figures
@@ -86,7 +87,7 @@ def changing(axis: Any, results: Figures) -> None:
 def profile(axis: Any, results: Figures) -> None:
     """Stack the parts of a step, as shares of the whole."""
     bars = [
-        (f"{TITLES.get(engine, engine)}\n{scene}", row)
+        (fill(f"{TITLES.get(engine, engine)} {scene}", width=9), row)
         for engine, scenes in results.get("profile", {}).items()
         for scene, row in scenes.items()
     ]
