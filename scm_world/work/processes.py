@@ -120,18 +120,24 @@ class Worker:
                 it was interrupted.
             Exception: What the method, or ``make``, raised.
         """
-        self.begin(method, *given)
         try:
-            is_late = not self._pipe.poll(timeout)
-        except OSError:
-            is_late = False  # ``answer`` tells why there is none
-        except BaseException:
-            self.stop()  # nobody waits for the answer any more
+            self.begin(method, *given)
+            if self._is_late(timeout):
+                self.stop()
+                raise TookTooLong
+            return self.answer()
+        except Exception:
             raise
-        if is_late:
+        except BaseException:  # Ctrl-C, at whatever moment: nobody waits for the answer any more
             self.stop()
-            raise TookTooLong
-        return self.answer()
+            raise
+
+    def _is_late(self, timeout: float | None) -> bool:
+        """Wait for an answer; tell whether there is none in time."""
+        try:
+            return not self._pipe.poll(timeout)
+        except OSError:
+            return False  # ``answer`` tells why there is none
 
     def begin(self, method: str, *given: Any) -> Connection:
         """Begin to ask; ``answer`` ends it.
