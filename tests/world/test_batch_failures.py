@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,11 @@ def _commands(world: World, steps: int) -> Any:
     return generator.uniform(world.action_low, world.action_high, (steps, COUNT, 9))
 
 
-def test_worlds_go_on_where_another_one_is_lost() -> None:
+def test_worlds_go_on_where_another_one_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A state that is lost is lost in one world; clocks and states of the others agree."""
+    monkeypatch.chdir(tmp_path)  # engines may write a log
     alone, many = _worlds(), _worlds()
     many[1].do({"floor_friction": 0.4})
     batch = Batch(many, names=("reward",))
