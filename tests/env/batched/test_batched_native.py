@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from crews import check_same
 
 from scm_world.env import ScmWorldEnv
 from scm_world.env.batched.loop import LoopCrew
@@ -52,21 +53,6 @@ def crews(threads: int = 2, count: int = COUNT, **options: Any) -> tuple[LoopCre
     return loop, native
 
 
-def same(one: Any, other: Any, where: str) -> None:
-    """Compare what two crews say, with every bit and type."""
-    if isinstance(one, dict):
-        assert one.keys() == other.keys(), where
-        for name in one:
-            same(one[name], other[name], f"{where}, {name}")
-    elif isinstance(one, list | tuple):
-        assert len(one) == len(other), where
-        for mine, its in zip(one, other, strict=True):
-            same(mine, its, where)
-    else:
-        np.testing.assert_array_equal(one, other, err_msg=where)
-        assert getattr(one, "dtype", None) == getattr(other, "dtype", None), where
-
-
 def compare(loop: LoopCrew, native: NativeCrew, where: str) -> None:
     """Compare their sheets."""
     for field in (
@@ -77,7 +63,7 @@ def compare(loop: LoopCrew, native: NativeCrew, where: str) -> None:
         "infos",
         "extras",
     ):
-        same(getattr(loop.sheet, field), getattr(native.sheet, field), f"{where}: {field}")
+        check_same(getattr(loop.sheet, field), getattr(native.sheet, field), f"{where}: {field}")
 
 
 def actions(crew: Any, steps: int) -> Any:
@@ -120,7 +106,7 @@ def test_everything_that_can_be_done_to_one() -> None:
             crew.step(EVERYONE, asked)
             meddling.get(step, lambda _: None)(crew)
         compare(loop, native, f"step {step}")
-    same(
+    check_same(
         loop.call(range(COUNT), "interventions"),
         native.call(range(COUNT), "interventions"),
         "interventions",
