@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import final
+import math
+from typing import Any, final
 
 import gymnasium
 import numpy as np
@@ -11,10 +12,15 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.entities import ACTIONS
 from scm_world.env.vector import box
+from scm_world.errors import UnknownOption
 from scm_world.world import World
 
 PREFIX = "delta_"
-TIPS = "end_effector_positions"
+JOINTS, TIPS = "joint_positions", "end_effector_positions"
+COMMAND, MEASURED = "command", "measured"
+ORIGINS = (COMMAND, MEASURED)
+"""What relative joint positions are relative to."""
+
 MODES = (*ACTIONS, *(PREFIX + mode for mode in ACTIONS))
 """What an environment calls its actions."""
 
@@ -31,19 +37,38 @@ class Delta:
     Args:
         world: That takes the actions.
         middle: What an absolute action of 0 stands for, shape (9,).
-        half: What an action of 1 adds, shape (9,).
+        half: What an absolute action of 1 adds, shape (9,).
+        scale: Share of half of the range that the largest relative action stands for, in (0, 1].
+        origin: ``"command"``: joint positions are relative to their last target; ``"measured"``:
+            to where the joints are.
+
+    Attributes:
+        reads: The variable that actions are relative to; None if that is the last command.
+
+    Raises:
+        UnknownOption: The scale is not in (0, 1], there is no such origin, or torques should be
+            relative to what is measured.
     """
 
-    def __init__(self, world: World, middle: Floats, half: Floats) -> None:
+    def __init__(
+        self,
+        world: World,
+        middle: Floats,
+        half: Floats,
+        *,
+        scale: float = 1.0,
+        origin: str = COMMAND,
+    ) -> None:
         self._world, self._middle, self._half = world, middle, half
         low, high = world.action_low, world.action_high
         self._low, self._high = (low - middle) / half, (high - middle) / half
+        self._gain, self._reach = _steps(self._low, self._high, scale, middle, half)
+        self.reads = _read(world.action_mode, origin)
         self._version = self._fresh = -1
 
     def space(self) -> gymnasium.Space[NDArray[np.float32]]:
-        """Give the space of relative actions: half of the range to either side."""
-        reach = (self._high - self._low) / 2.0
-        return box(-reach, reach)
+        """Give the space of relative actions: by itself, half of the range to either side."""
+        return box(-self._reach, self._reach)
 
     def absolute(self, action: Floats) -> Floats:
         """Add what the action is relative to; what leaves the range of actions is clipped.
@@ -56,16 +81,17 @@ class Delta:
     def moved(self, action: Floats, offset: Floats) -> Floats:
         """Add what actions are relative to, shape (..., 9) [SI units]; clip to the range."""
         relative = (offset - self._middle) / self._half
-        found: Floats = np.clip(action + relative, self._low, self._high)
+        step = self._gain * np.clip(action, -self._reach, self._reach)
+        found: Floats = np.clip(step + relative, self._low, self._high)
         return found
 
     def _offset(self) -> Floats:
         world = self._world
-        if world.action_mode == TIPS:
-            tips: Floats = world.evaluate((TIPS,))[TIPS]
-            return tips
+        if self.reads is not None:
+            measured: Floats = world.evaluate((self.reads,))[self.reads]
+            return measured
         now, state = world.current()
-        if world.action_mode == "joint_positions" and self.is_set():
+        if world.action_mode == JOINTS and self.is_set():
             return state.joint_positions
         last: Floats = now["action"]
         return last
@@ -79,3 +105,65 @@ class Delta:
             set_now = instant and (instant.at_start or "joint_positions" in instant.requests)
             self._fresh = world.index if set_now else -1
         return self._fresh == world.index
+
+
+def delta_for(mode: str, world: World, *given: Floats, scale: float, origin: str) -> Delta | None:
+    """Make what turns the actions of a mode into absolute ones, if they are relative.
+
+    Args:
+        mode: One of ``MODES``.
+        world: That takes the actions.
+        given: What absolute actions of 0 and 1 stand for; see ``Delta``.
+        scale: See ``Delta``.
+        origin: Likewise.
+
+    Raises:
+        UnknownOption: See ``Delta``; or actions are absolute, and the options mean nothing.
+    """
+    if mode.startswith(PREFIX):
+        return Delta(world, *given, scale=scale, origin=origin)
+    options = {"delta_scale": (scale, 1.0), "delta_origin": (origin, COMMAND)}
+    for name, (value, usual) in options.items():
+        if value != usual:
+            allowed = f"{usual!r}, or an action_mode that begins with {PREFIX!r}"
+            raise UnknownOption(f"{name} of {mode}", value, (allowed,))
+    return None
+
+
+def _steps(
+    low: Floats, high: Floats, scale: float, middle: Floats, half: Floats
+) -> tuple[float, Floats]:
+    """Work out what an action of 1 adds to an absolute one, and how large actions can be.
+
+    Normalized actions fill [-1, 1] whatever the scale is; others keep their unit.
+    """
+    number = checked_share("delta_scale", scale)
+    normalized = bool(np.any(half != 1.0) or np.any(middle != 0.0))
+    reach = (high - low) / 2.0
+    return (number, reach) if normalized else (1.0, number * reach)
+
+
+def _read(mode: str, origin: str) -> str | None:
+    """Name the variable that actions of a mode are relative to."""
+    if origin not in ORIGINS:
+        raise UnknownOption("delta_origin", origin, ORIGINS)
+    if mode == TIPS:
+        return TIPS
+    if origin == COMMAND:
+        return None
+    if mode != JOINTS:
+        allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
+        raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, (allowed,))
+    return JOINTS
+
+
+def checked_share(name: str, share: Any) -> float:
+    """Check that an option is a share of something.
+
+    Raises:
+        UnknownOption: It is no number in (0, 1].
+    """
+    number = share if isinstance(share, int | float) else math.nan
+    if not 0.0 < number <= 1.0:
+        raise UnknownOption(name, share, ("a number in (0, 1]",))
+    return float(number)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.copies import Copied
-from scm_world.env.delta import MODES, PREFIX, Delta
+from scm_world.env.delta import COMMAND, MODES, PREFIX, Delta, delta_for
 from scm_world.env.given import doubles, made_task, names_of
 from scm_world.env.goals import GoalReward, Goals, reward_scale
 from scm_world.env.looks import Looks
@@ -35,10 +35,7 @@ from scm_world.world.requests import merged
 from scm_world.world.start import whole_number
 
 RENDER_MODES = ("rgb_array", "human")
-
-
 SINGLE = np.dtype(np.float32)
-
 _NOT_GIVEN = ("self", "__class__")
 _RESETS = ("do", "episode")
 
@@ -62,6 +59,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         frame_skip: Length of a control step in units of 4 ms.
         action_mode: ``"joint_positions"``, ``"joint_torques"`` or ``"end_effector_positions"``,
             or one of them after ``"delta_"``: see ``DeltaAction``.
+        delta_scale: Share of half of the range that the largest relative action stands for.
+        delta_origin: What relative joint positions are relative to: ``"command"``, the last
+            target, or ``"measured"``, where the joints are.
         normalize_actions: Take actions in [-1, 1] instead of SI units.
         observation_mode: ``"structured"``: the published layout; ``"full"``: that and every other
             variable; ``"custom"``: the variables in ``observe``; ``"pixel"``: pictures.
@@ -116,6 +116,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         preset: str = "fast",
         frame_skip: int = 10,
         action_mode: str = "joint_positions",
+        delta_scale: float = 1.0,
+        delta_origin: str = COMMAND,
         normalize_actions: bool = True,
         observation_mode: str = "structured",
         observe: Sequence[str] = (),
@@ -165,7 +167,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._rich = (info_contacts, info_state)
         self._begin_with(start, random_goal, attempts)
         self._open(render_mode)
-        self._act(normalize=normalize_actions, relative=action_mode.startswith(PREFIX))
+        self._act(normalize_actions, action_mode, {"scale": delta_scale, "origin": delta_origin})
         extra = int(self.world.conventions.extra_step)
         self._limit = self.world.max_episode_length + extra
         self._scale = reward_scale(self.world)
@@ -199,14 +201,14 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._start, self._random_goal = asked(start), random_goal
         self._attempts = whole_number("attempts", attempts, least=1)
 
-    def _act(self, *, normalize: bool, relative: bool) -> None:
+    def _act(self, normalize: bool, mode: str, steps: Mapping[str, Any]) -> None:
         """Choose what an action means."""
         low, high = self.world.action_low, self.world.action_high
         self._middle, self._half = (low + high) / 2.0, (high - low) / 2.0
         if not normalize:
             self._middle, self._half = np.zeros(9), np.ones(9)
         bounds = (-np.ones(9), np.ones(9)) if normalize else (low, high)
-        self._delta = self.relative() if relative else None
+        self._delta = delta_for(mode, self.world, self._middle, self._half, **steps)
         self._given = np.empty(9)
         self._range = (self._middle, self._half, low, high)
         self._scale_and_clip = direct(scaled_clip_kernel, self._given, *self._range, self._given)

@@ -153,3 +153,36 @@ def test_a_reset_forgets_earlier_actions() -> None:
     np.testing.assert_allclose(env.unwrapped.as_action(commands(env)), -0.2, atol=1e-6)
     with pytest.raises(UnknownOption, match="window"):
         MovingAverageAction(make(PUSHING), window=0)
+
+
+@pytest.mark.parametrize("origin", ["command", "measured"])
+def test_relative_actions_can_be_small_and_start_from_where_the_joints_are(origin: str) -> None:
+    """An action of 1 adds the share of half of the range to the origin that was asked for."""
+    options = {"action_mode": "delta_joint_positions", "backend": "mujoco"}
+    env = make(**options, delta_scale=0.1, delta_origin=origin)
+    env.reset(seed=0)
+    assert np.array_equal(env.action_space.high, np.ones(9, np.float32))
+    world = env.unwrapped.world
+    half = (world.action_high - world.action_low) / 2.0
+    env.step(np.full(9, 0.5, np.float32))
+    before = {"command": world["action"], "measured": world["joint_positions"]}[origin]
+    env.step(np.full(9, 7.0, np.float32))  # what lies outside is clipped
+    expected = np.clip(before + 0.1 * half, world.action_low, world.action_high)
+    assert np.allclose(world["action"], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"delta_scale": 0.1},
+        {"delta_origin": "measured"},
+        {"action_mode": "delta_joint_positions", "delta_scale": 0.0},
+        {"action_mode": "delta_joint_positions", "delta_scale": "much"},
+        {"action_mode": "delta_joint_positions", "delta_origin": "here"},
+        {"action_mode": "delta_joint_torques", "delta_origin": "measured"},
+    ],
+)
+def test_what_relative_actions_cannot_be_is_refused(wrong: dict[str, Any]) -> None:
+    """Scales, origins, and both where actions are absolute."""
+    with pytest.raises(UnknownOption, match="delta_"):
+        make(**wrong)

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.env.batched.crew import located
 from scm_world.env.batched.inside import Inside
-from scm_world.env.delta import TIPS
+from scm_world.env.delta import JOINTS
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import ActionError
 from scm_world.world.batch import Batch
 from scm_world.world.columns import ACTION, Table
-
-JOINTS = "joint_positions"
 
 
 @final
@@ -37,7 +35,8 @@ class Commands:
         self._low, self._high = env.world.action_low, env.world.action_high
         self._delta = inside.delta
         self._mode = env.world.action_mode
-        self.names = (TIPS,) if self._delta is not None and self._mode == TIPS else ()
+        self._reads = None if self._delta is None else self._delta.reads
+        self.names = () if self._reads is None else (self._reads,)
         # Where the joints were put since the last command: it is relative to them.
         self._are_set = np.zeros(num_envs, dtype=np.bool_)
         self._found = np.empty((num_envs, 9))
@@ -75,8 +74,8 @@ class Commands:
 
     def _offset(self, table: Table, rows: Integers) -> Floats:
         """Give what actions are relative to, shape (m, 9)."""
-        if self._mode == TIPS:
-            return table.column(TIPS)[rows]
+        if self._reads is not None:
+            return table.column(self._reads)[rows]
         last = table.column(ACTION)[rows]
         if self._mode != JOINTS:
             return last

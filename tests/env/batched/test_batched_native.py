@@ -24,6 +24,7 @@ OPTIONS: list[dict[str, Any]] = [
     {"action_mode": "joint_torques"},
     {"action_mode": "end_effector_positions"},
     {"action_mode": "delta_joint_positions"},
+    {"action_mode": "delta_joint_positions", "delta_scale": 0.1, "delta_origin": "measured"},
     {"action_mode": "delta_joint_torques"},
     {"action_mode": "delta_end_effector_positions"},
     {"goal_env": True},
