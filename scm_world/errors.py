@@ -69,6 +69,18 @@ class ScmWorldError(Exception):
         return _rebuild, (type(self), str(self), self.__dict__)
 
 
+def in_one_line(error: Exception) -> str:
+    """Write an error in one line; with its name, unless it is one of ours.
+
+    Example:
+        >>> in_one_line(KeyError("mass")), in_one_line(ScmWorldError("too heavy"))
+        ("KeyError: 'mass'", 'too heavy')
+    """
+    text = " ".join(str(error).split())
+    name = type(error).__name__
+    return text if text and isinstance(error, ScmWorldError) else f"{name}: {text}".rstrip(": ")
+
+
 class ModelError(ScmWorldError, ValueError):
     """A causal model that cannot be built.
 

@@ -3,18 +3,69 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+from typing import TypeVar
 
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
-from scm_world.errors import MissingEngine, UnknownOption
+from scm_world.backends.wrapper import BackendWrapper
+from scm_world.errors import MissingEngine, ModelError, UnknownOption
 
 BACKENDS = ("mujoco", "bullet", "fake")
-"""Names that ``make_backend`` knows."""
+"""Names of the engines of this package."""
 
 _CLASSES = {
     "mujoco": ("scm_world.backends.mujoco", "MujocoBackend", "mujoco>=3.17,<5"),
     "bullet": ("scm_world.backends.bullet", "BulletBackend", "pybullet==3.2.7"),
     "fake": ("scm_world.backends.fake", "FakeBackend", "scm-world"),
 }
+
+_REGISTERED: dict[str, type[Backend]] = {}
+
+Kind = TypeVar("Kind", bound=type[Backend])
+
+
+def register(kind: Kind) -> Kind:
+    """Make a backend of one's own known by its ``name``, wherever an engine is named by a text.
+
+    It can decorate the class. Processes that are started anew know it if the module that
+    registers it is imported there: put it at the top level of that module.
+
+    Args:
+        kind: A class that passes ``scm_world.testing.backend.BackendConformance``, or as much of
+            it as its use needs; made without arguments.
+
+    Returns:
+        The same class.
+
+    Raises:
+        ModelError: It is no class of backends, methods are missing, or it has no name.
+        UnknownOption: Another one has this name.
+    """
+    if not (inspect.isclass(kind) and issubclass(kind, Backend)):
+        raise ModelError([f"{kind!r} is no class derived from scm_world.backends.Backend"])
+    missing = sorted(getattr(kind, "__abstractmethods__", ()))
+    problems = [f"{kind.__name__} does not define {method!r}" for method in missing]
+    name = getattr(kind, "name", None)
+    if not isinstance(name, str) or not name:
+        problems.append(f"{kind.__name__} has no name; set name = 'mine' in the class")
+    if not isinstance(getattr(kind, "capabilities", None), Capabilities):
+        problems.append(f"{kind.__name__} has no capabilities; set capabilities = Capabilities()")
+    if problems:
+        raise ModelError(problems)
+    if kind.name in BACKENDS or not _same(_REGISTERED.get(kind.name, kind), kind):
+        raise UnknownOption("name of a backend", kind.name, ("a name that is not taken",))
+    _REGISTERED[kind.name] = kind
+    return kind
+
+
+def _same(one: type, other: type) -> bool:
+    """Say whether two classes are one, or one whose module was run again."""
+    return (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
+
+
+def backends() -> tuple[str, ...]:
+    """Name all backends that ``make_backend`` knows: of this package, then those registered."""
+    return (*BACKENDS, *_REGISTERED)
 
 
 def make_backend(name: str) -> Backend:
@@ -29,8 +80,10 @@ def make_backend(name: str) -> Backend:
         >>> make_backend("fake").name
         'fake'
     """
-    if name not in BACKENDS:
-        raise UnknownOption("backend", name, BACKENDS)
+    if name not in backends():
+        raise UnknownOption("backend", name, backends())
+    if name in _REGISTERED:
+        return _REGISTERED[name]()
     module, class_name, requirement = _CLASSES[name]
     try:
         backend: Backend = getattr(importlib.import_module(module), class_name)()
@@ -44,8 +97,11 @@ def make_backend(name: str) -> Backend:
 __all__ = [
     "BACKENDS",
     "Backend",
+    "BackendWrapper",
     "Capabilities",
     "Contact",
     "EngineSnapshot",
+    "backends",
     "make_backend",
+    "register",
 ]

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from scm_world.cli.clone import clone
 from scm_world.cli.evaluate import evaluate, explain
 from scm_world.cli.options import (
     Acts,
@@ -23,7 +24,10 @@ from scm_world.cli.options import (
     Steps,
     Task,
 )
+from scm_world.cli.planning import plan
+from scm_world.cli.reproduction import reproduce
 from scm_world.cli.sampling import collect, sweep
+from scm_world.cli.train import train
 from scm_world.cli.working import Address, Engine, Work, Workers
 from scm_world.errors import ScmWorldError
 
@@ -167,7 +171,7 @@ def discover(
     raise typer.Exit(exam.run(sitting, out=out))
 
 
-for _command in (evaluate, explain, collect, sweep):
+for _command in (evaluate, explain, collect, sweep, plan, reproduce, train, clone):
     app.command()(_command)
 
 
@@ -311,11 +315,15 @@ def variables(
 
 
 @app.command(name="list")
-def list_() -> None:
-    """List tasks, engines, presets, conventions and environments."""
-    from scm_world.cli.listing import run
+def list_(
+    zoo: Annotated[
+        bool, typer.Option("--zoo", help="List the trained policies of the package instead.")
+    ] = False,
+) -> None:
+    """List tasks, engines, presets, conventions, environments and trained policies."""
+    from scm_world.cli.listing import run, show_zoo
 
-    run()
+    show_zoo() if zoo else run()
 
 
 def main() -> None:

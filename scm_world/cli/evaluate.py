@@ -31,11 +31,18 @@ def evaluate(
     policy: Annotated[
         str | None,
         typer.Argument(
-            help="A file (.onnx, .zip, .npz, .parquet), random, still, sweep, grasp, or "
-            "module:function; several with commas; NAME=POLICY names one, and A+B are its runs."
+            help="A file (.safetensors, .onnx, .zip, .npz, .parquet), the folder of a training "
+            "run, zoo:NAME, random, still, sweep, grasp, or module:function; several with commas; "
+            "NAME=POLICY names one, and A+B are its runs."
         ),
     ] = None,
-    task: Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.")] = "pushing",
+    task: Annotated[
+        str | None,
+        typer.Argument(
+            help="Name of a task; see 'scm-world list'.",
+            show_default="what the policy was trained for, or pushing",
+        ),
+    ] = None,
     protocols: Annotated[
         str | None,
         typer.Option(help="Names with commas, such as P0,P5; P2@100 is within episodes; all else."),

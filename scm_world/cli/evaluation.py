@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, final
@@ -28,7 +28,9 @@ from scm_world.errors import UnknownOption
 from scm_world.evaluation import METRICS, Evaluation, evaluate
 from scm_world.evaluation.files import CODECS
 from scm_world.evaluation.parts import FOLDER
+from scm_world.evaluation.policies import NAMES
 from scm_world.evaluation.reporting import write_outputs
+from scm_world.evaluation.setups import task_of
 from scm_world.output.locations import Location
 
 INTERRUPTED = 130
@@ -42,7 +44,7 @@ class Options:
 
     Attributes:
         policies: With commas between them.
-        task: Name of the task.
+        task: Name of the task; None for the one that the policies were trained for.
         protocols: With commas between them; None for all.
         n: Episodes of each protocol, for each seed.
         seeds: With commas between them.
@@ -56,7 +58,7 @@ class Options:
     """
 
     policies: str
-    task: str
+    task: str | None
     protocols: str | None
     n: int
     seeds: str
@@ -72,15 +74,19 @@ class Options:
         """Name the folder of the results."""
         names = "-".join(policies_of(self.policies))
         about = suffix((*self.arguments, *self.env))
-        return RESULTS / f"evaluate-{names}-{self.task}{about}"
+        return RESULTS / f"evaluate-{names}-{self.the_task()}{about}"
 
     def environment(self) -> dict[str, Any]:
         """Read the options of the environment, and the arguments of the task."""
         given = parse_assignments(self.env, "'--env'")
         found = {k: _WORDS.get(v, v) if isinstance(v, str) else v for k, v in given.items()}
         if self.arguments:
-            found["task_options"] = dict(build(self.task, self.arguments).given)
+            found["task_options"] = dict(build(self.the_task(), self.arguments).given)
         return found
+
+    def the_task(self) -> str:
+        """Name the task, also if it was not typed."""
+        return self.task or task_of(policies_of(self.policies))
 
 
 def policies_of(text: str) -> dict[str, list[str]]:
@@ -93,9 +99,10 @@ def policies_of(text: str) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for word in (part.strip() for part in text.split(",")):
         name, equals, given = word.partition("=")
-        if Path(word).is_file():  # a path may have any letters
+        is_path = word not in NAMES and Path(word).exists()  # which may have any letters
+        if is_path:
             name, equals, given = "", "", word
-        runs = [word] if Path(word).is_file() else (given if equals else word).split("+")
+        runs = [word] if is_path else (given if equals else word).split("+")
         label = name.strip() if equals else _label(runs[0])
         if not word or not all(runs) or not label or label in found:
             allowed = ("names or files, each once; NAME=POLICY gives a name",)
@@ -105,14 +112,18 @@ def policies_of(text: str) -> dict[str, list[str]]:
 
 
 def _label(policy: str) -> str:
-    """Name an agent after a file, or after a function."""
-    return policy.replace(":", ".") if ":" in policy else Path(policy).stem
+    """Name an agent after a file, a folder, or a function."""
+    is_folder = Path(policy).is_dir()
+    if ":" in policy and not is_folder:
+        return policy.replace(":", ".")
+    return Path(policy).resolve().name if is_folder else Path(policy).stem
 
 
 def run(options: Options, *, out: Location | None) -> int:
     """Evaluate, print a table, write everything; return the exit code."""
     _check(options)
     sys.path.insert(0, str(Path.cwd()))  # for a policy of one's own, beside where this is called
+    options = replace(options, task=options.the_task())
     folder = out or options.folder()
     check_writable(folder, folder=True)
     terminal = console()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.text import Text
 
-from scm_world.backends import BACKENDS, make_backend
+from scm_world.backends import backends, make_backend
 from scm_world.cli.console import console, table
 from scm_world.discovery.exam.families import FAMILIES
 from scm_world.discovery.learners import Learner, learners
@@ -12,6 +12,9 @@ from scm_world.entities import ACTIONS
 from scm_world.env import IDS
 from scm_world.errors import EngineError
 from scm_world.evaluation import protocols_of
+from scm_world.evaluation.policies.cards import PolicyAbout
+from scm_world.evaluation.zoo import zoo
+from scm_world.evaluation.zoo.texts import COMMAND, best_known
 from scm_world.scene.presets import PRESETS
 from scm_world.tasks import CONVENTIONS, TASKS
 
@@ -46,18 +49,36 @@ def _protocols() -> dict[str, str | Text]:
     return {**common, **only}
 
 
+def _trained(about: PolicyAbout) -> str:
+    """Say for what a policy was trained, and how well it does."""
+    scores = best_known(about)
+    return f"{about.task}: {scores}" if scores else about.task
+
+
+def show_zoo() -> None:
+    """List the trained policies: how each was made, and how well it does."""
+    made = table("name", "task", "seed", "scores", "command", title="trained policies")
+    cards = zoo()
+    for name, about in cards.items():
+        seed, command = about.card.get("seed", ""), about.card.get(COMMAND, "")
+        cells = (name, about.task, str(seed), best_known(about), str(command))
+        made.add_row(*map(Text, cells))
+    console().print(made if cards else "there are no trained policies in this installation")
+
+
 def run() -> None:
     """List what can be chosen."""
     made = table("", "name", "")
     made.show_header = False
     sections: dict[str, dict[str, str | Text]] = {
         "tasks": {name: _first_line(task.__doc__) for name, task in TASKS.items()},
-        "backends": {name: _engine(name) for name in BACKENDS},
+        "backends": {name: _engine(name) for name in backends()},
         "presets": {p.name: f"physics steps of {1000 * p.timestep:g} ms" for p in PRESETS.values()},
         "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},
         "conventions": dict.fromkeys(CONVENTIONS, ""),
         "learners": {name: _learner(chosen) for name, chosen in learners().items()},
         "protocols": _protocols(),
+        "trained policies": {name: _trained(about) for name, about in zoo().items()},
         "families": {f"{family.name}:N": family.doc for family in FAMILIES.values()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }

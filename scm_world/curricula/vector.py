@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scm_world.curricula.choices import count
 from scm_world.curricula.crew import CurriculumCrew
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
+from scm_world.curricula.members import Member
 from scm_world.curricula.situations import Memory
 from scm_world.curricula.wrapper import CurriculumEnv, place
 from scm_world.env import IDS
@@ -22,8 +23,8 @@ from scm_world.env.batched.choice import fastest
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.world.start import whole_number
 
-NATIVE = "native"
-MODES = (NATIVE, "sync", "async")
+NATIVE, PROCESSES, LOOP = "native", "processes", "loop"
+MODES = (NATIVE, PROCESSES, LOOP, "sync", "async")
 
 _TIME_LIMIT = "max_episode_steps"
 _OF_MAKE = (_TIME_LIMIT, "disable_env_checker")
@@ -45,11 +46,13 @@ def make_vec(
         env_id: Such as ``"scm_world/Pushing-v0"``.
         num_envs: How many.
         curriculum: What is done in each of them; see ``CurriculumEnv``.
-        vectorization_mode: ``"native"``: many in one call of the engine; ``"sync"``: in this
-            process, one after another; ``"async"``: each in one of its own; None: native where
-            the engine has it, else sync. What comes out does not depend on it.
+        vectorization_mode: ``"native"``: many in one call of the engine; ``"processes"``:
+            several in each of some processes; ``"loop"``: in this process, one after another;
+            ``"sync"``, ``"async"``: Gymnasium's own, each in this process or in one of its own;
+            None: native where the engine has it, else sync. What comes out does not depend on it.
         autoreset_mode: When a member that is done begins anew, as in Gymnasium.
-        options: Of the environments; ``threads`` with ``"native"``.
+        options: Of the environments; ``threads`` with ``"native"``, ``workers`` with
+            ``"processes"``.
 
     Raises:
         UnknownOption: There is no such mode, the number is none, or ``max_episode_steps`` is
@@ -66,8 +69,8 @@ def make_vec(
         raise UnknownOption("vectorization_mode", mode, MODES)
     n = whole_number("num_envs", num_envs, least=1)
     made = as_curriculum(curriculum)
-    if mode == NATIVE:
-        return CurriculumVectorEnv(_native(env_id, n, made, autoreset_mode, options), made)
+    if mode in (NATIVE, PROCESSES, LOOP):
+        return CurriculumVectorEnv(_crewed(env_id, n, made, autoreset_mode, mode, options), made)
     one = partial(_one, env_id, made, options)
     kind: Any = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
     return CurriculumVectorEnv(kind([one] * n, autoreset_mode=autoreset_mode), made)
@@ -79,18 +82,26 @@ def _has_native(env_id: str, options: Mapping[str, Any]) -> bool:
     return kind == NATIVE and env_id in IDS and options.get(_TIME_LIMIT) is None
 
 
-def _native(
-    env_id: str, n: int, curriculum: Curriculum, mode: AutoresetMode, options: Mapping[str, Any]
+def _crewed(
+    env_id: str,
+    n: int,
+    curriculum: Curriculum,
+    mode: AutoresetMode,
+    crew: str,
+    options: Mapping[str, Any],
 ) -> Any:
     if options.get(_TIME_LIMIT) is not None:
         allowed = ("max_episode_length=…", "vectorization_mode='sync'")
-        raise UnknownOption(f"{_TIME_LIMIT} with {NATIVE!r}", options[_TIME_LIMIT], allowed)
+        raise UnknownOption(f"{_TIME_LIMIT} with {crew!r}", options[_TIME_LIMIT], allowed)
     own = {name: value for name, value in options.items() if name not in _OF_MAKE}
+    if crew != NATIVE:
+        own["member"] = partial(Member.of, curriculum)
     kind = VectorizeMode.VECTOR_ENTRY_POINT
     envs: Any = gymnasium.make_vec(
-        env_id, n, vectorization_mode=kind, autoreset_mode=mode, crew=NATIVE, **own
+        env_id, n, vectorization_mode=kind, autoreset_mode=mode, crew=crew, **own
     )
-    envs.crew = CurriculumCrew(envs.crew, curriculum)
+    if crew == NATIVE:
+        envs.crew = CurriculumCrew(envs.crew, curriculum)
     return envs
 
 
@@ -170,6 +181,61 @@ class CurriculumVectorEnv(VectorWrapper):
         self._members.set_attr("where", places)
         self.memory, self._again = memory, again
         self._forget()
+
+    def running(self) -> dict[str, Any]:
+        """Give what decides how the episodes that are under way began, as plain data.
+
+        With the actions since then, ``rerun`` takes all members to where they are.
+        """
+        memories, turns = self._members.get_attr("memory"), self._members.get_attr("turn")
+        told = [None if turn is None else [turn[0], turn[1].as_dict()] for turn in turns]
+        return {
+            **self.state(),
+            "present": [*self._present],
+            "waiting": [*self._waiting],
+            "left": [*self._again],
+            "memories": [memory.as_dict() for memory in memories],
+            "turns": told,
+            "stepped": self._stepped.tolist(),
+            "success": self._success.tolist(),
+        }
+
+    def rerun(self, running: Mapping[str, Any], actions: Any, lengths: Any) -> Any:
+        """Play episodes again up to where they were, bit for bit.
+
+        Args:
+            running: What ``running`` gave, of as many environments in a crew.
+            actions: Of each control step since their resets, shape (steps, n, 9).
+            lengths: How many of them each member took, shape (n,).
+
+        Returns:
+            The observations.
+
+        Raises:
+            UnreadableFile: ``running`` is something else.
+        """
+        try:
+            memories = [Memory.from_dict(memory) for memory in running["memories"]]
+            turns = [t and (int(t[0]), Memory.from_dict(t[1])) for t in running["turns"]]
+            left = [int(number) for number in running["left"]]
+            kept = {name: running[name] for name in ("present", "waiting", "stepped", "success")}
+            if any(len(one) != self.num_envs for one in (memories, turns, *kept.values())):
+                raise ValueError("it is of another number of environments")
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            advice = f"give what running() gave, of {self.num_envs} environments"
+            raise UnreadableFile("running episodes", repr(error), advice) from None
+        self.resume({name: running[name] for name in ("episode", "stages", "again", "noises")})
+        self._members.set_attr("turn", [(memory.episode, memory) for memory in memories])
+        self.env.reset()
+        crew: Any = self.unwrapped.crew  # type: ignore[attr-defined] # not of Gymnasium's kinds
+        for step, row in enumerate(np.asarray(actions, dtype=np.float64)):
+            if (which := np.asarray(lengths) > step).any():
+                crew.step(which, row)
+        self._members.set_attr("turn", turns)
+        self._present, self._waiting, self._again = kept["present"], kept["waiting"], left
+        self._stepped = np.array(kept["stepped"], bool)
+        self._success = np.array(kept["success"], bool)
+        return self._members.present()[0]
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

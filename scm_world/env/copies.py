@@ -35,6 +35,11 @@ class Copied(EzPickle):
     world: World
     _done: list[tuple[int, dict[str, Any]]]
 
+    @property
+    def made_with(self) -> dict[str, Any]:
+        """The options that it was made with, by name."""
+        return dict(self._ezpickle_kwargs)
+
     def snapshot(self) -> EnvSnapshot:
         """Save everything that decides how the episode goes on.
 

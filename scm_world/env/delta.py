@@ -85,6 +85,16 @@ class Delta:
         found: Floats = np.clip(step + relative, self._low, self._high)
         return found
 
+    def toward(self, command: Floats) -> Floats:
+        """Give the relative action that leads to a command, or as near to it as one can.
+
+        Args:
+            command: Shape (9,) [SI units].
+        """
+        step = (command - self._offset()) / self._half
+        found: Floats = np.clip(step / self._gain, -self._reach, self._reach)
+        return found
+
     def _offset(self) -> Floats:
         world = self._world
         if self.reads is not None:

@@ -169,7 +169,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._open(render_mode)
         self._act(normalize_actions, action_mode, {"scale": delta_scale, "origin": delta_origin})
         extra = int(self.world.conventions.extra_step)
-        self._limit = self.world.max_episode_length + extra
+        self.limit = self.world.max_episode_length + extra
         self._scale = reward_scale(self.world)
         self._terms = tuple(self.world.task.weights)
         self._version = -1
@@ -222,6 +222,15 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """Give the (absolute) action that stands for a command in SI units, shape (9,)."""
         found: NDArray[np.float64] = (np.asarray(command) - self._middle) / self._half
         return found
+
+    def toward(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Give the action, now, that leads to a command in SI units, shape (9,).
+
+        Relative actions that are too small for it go as near to it as they can.
+        """
+        if self._delta is None:
+            return self.as_action(command)
+        return self._delta.toward(np.asarray(command, dtype=np.float64))
 
     def _arrange(self, declaration: Declaration) -> None:
         """Observe the structure that there is."""
@@ -296,7 +305,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self.world.advance(self._command(action))
         now = self._look()
         reward = self._scale * one_number(now, "reward", self._terms)
-        truncated = self.world.index >= self._limit
+        truncated = self.world.index >= self.limit
         if self._window is not None:
             self._show()
         return self._observer.observe(now), reward, False, truncated, self._info(now)

@@ -119,7 +119,7 @@ def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Itera
             player = as_player(evaluation.policies[who])
         else:
             player = player_from(what, trusted=trusted)
-        yield Seat(*who, player, what)
+        yield Seat(*who, player, what, one.get("env"))
 
 
 def _acts(options: Any, trusted: Sequence[str]) -> Any:

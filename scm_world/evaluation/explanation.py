@@ -203,7 +203,7 @@ def _others(
     if not row.drawn:
         allowed = ("an episode in which a protocol varies something",)
         raise UnknownOption("episode", f"{row.protocol}, {row.episode}", allowed)
-    arena = bench.arena(shard.engine)
+    arena = bench.arena(shard)
     where: Any = {"seed": shard.seed, "episode": row.episode, "who": (row.agent, row.run)}
     usual = _natural(arena, shard, row)
     against: dict[str, Any] = {n: versus or _versus(arena, usual, n, row) for n in row.drawn}

@@ -165,7 +165,10 @@ def _clashes(listed: Sequence[Evaluation]) -> list[str]:
     for evaluation in listed:
         named = [(("protocol", p["name"]), p) for p in evaluation.about["protocols"]]
         named += [
-            ((f"agent {one['agent']}, run", one["run"]), what_it_is(one["policy"]))
+            (
+                (f"agent {one['agent']}, run", one["run"]),
+                [what_it_is(one["policy"]), one.get("env")],
+            )
             for one in evaluation.about["agents"]
         ]
         for key, content in named:

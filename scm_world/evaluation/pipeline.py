@@ -37,7 +37,7 @@ class Bench:
     setup: Setup
     trusted: Sequence[str] | None = None
     threads: int = 1
-    arenas: dict[str, Arena] = field(default_factory=dict)
+    arenas: dict[str, Arena] = field(default_factory=dict)  # by engine and form
     locksteps: dict[str, Lockstep] = field(default_factory=dict)
     players: dict[int, Player] = field(default_factory=dict)
 
@@ -46,13 +46,13 @@ class Bench:
         seat, numbers = self.setup.seats[shard.seat], range(shard.first, shard.stop)
         protocol = self.setup.protocols[shard.protocol]
         episodes = Episodes((seat.agent, seat.run), protocol, shard.seed, numbers)
-        rows = self.lockstep(shard.engine).play(self.player(shard.seat), episodes)
+        rows = self.lockstep(shard).play(self.player(shard.seat), episodes)
         return rows or [self.play(shard, episode) for episode in numbers]
 
     def play(self, shard: Shard, episode: int, watch: Any = None) -> Row:
         """Play one episode of it."""
         seat = self.setup.seats[shard.seat]
-        return self.arena(shard.engine).play(
+        return self.arena(shard).play(
             self.player(shard.seat),
             self.setup.protocols[shard.protocol],
             seed=shard.seed,
@@ -61,18 +61,20 @@ class Bench:
             watch=watch,
         )
 
-    def arena(self, engine: str) -> Arena:
-        """Give where episodes of an engine happen."""
-        if engine not in self.arenas:
-            self.arenas[engine] = Arena(self.setup.place.env(engine))
-        return self.arenas[engine]
+    def arena(self, shard: Shard) -> Arena:
+        """Give where the episodes of a shard happen: on its engine, in the form of its agent."""
+        key = self.setup.where(shard)
+        if key not in self.arenas:
+            self.arenas[key] = Arena(self.setup.env(shard))
+        return self.arenas[key]
 
-    def lockstep(self, engine: str) -> Lockstep:
-        """Give where episodes of an engine happen side by side."""
-        if engine not in self.locksteps:
-            env, most = self.arena(engine).env, min(SHARD, self.setup.n)
-            self.locksteps[engine] = Lockstep(env, most, self.threads)
-        return self.locksteps[engine]
+    def lockstep(self, shard: Shard) -> Lockstep:
+        """Give where the episodes of a shard happen side by side."""
+        key = self.setup.where(shard)
+        if key not in self.locksteps:
+            env, most = self.arena(shard).env, min(SHARD, self.setup.n)
+            self.locksteps[key] = Lockstep(env, most, self.threads)
+        return self.locksteps[key]
 
     def player(self, seat: int) -> Player:
         """Give who acts."""
@@ -94,7 +96,7 @@ def evaluate(
     policy: Any,
     protocols: Any = None,
     *,
-    task: Task | str = "pushing",
+    task: Task | str | None = None,
     n: int = 200,
     seeds: Any = 0,
     backend: Any = "mujoco",
@@ -116,11 +118,13 @@ def evaluate(
             the name of the agent. What a policy can be is said at ``as_player``.
         protocols: Names (``"P0,P5"``, ``"P2@100"`` for within the episodes), patterns,
             ``Protocol``, or several; all of the task if None.
-        task: Name, or a task.
+        task: Name, or a task; if None the one that the policies were trained for, else pushing.
         n: Episodes of each protocol, for each seed.
         seeds: Of the noise, one or several.
         backend: ``"mujoco"``, ``"bullet"``, or both.
-        env: Options of the environment, such as ``{"frame_skip": 3}``.
+        env: Options of the environment, such as ``{"frame_skip": 3}``. A trained policy brings
+            those that it was trained with. What is observed and what actions mean is each agent's
+            own; such options are for the agents that bring none.
         workers: How many shards of 25 episodes are played at the same time. None is one, in this
             process; with an engine it is as many as there are cores. Other processes play
             policies that can be pickled or are named by a text.
@@ -136,7 +140,8 @@ def evaluate(
         The table of all episodes, and what follows from it.
 
     Raises:
-        UnknownOption: Something is asked for that does not exist.
+        UnknownOption: Something is asked for that does not exist, or that contradicts what a
+            policy was trained with.
         EvaluationError: A policy gave no action, or an intervention was refused, with the place;
             all other shards are played and safe by then.
         EngineFailure: Three workers ended over one shard, or there is no cluster at the address.

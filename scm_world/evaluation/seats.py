@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption
+from scm_world.evaluation.forms import form_of
 from scm_world.evaluation.policies import Player, WorldPolicy, as_player
+from scm_world.evaluation.policies.cards import PolicyAbout
 from scm_world.evaluation.protocols import named
 
 _TRIES = 25  # observations on which a policy without a file is tried out
@@ -30,16 +32,66 @@ class Seat:
         run: Number of its training run.
         policy: What a user gave.
         about: What it is, as plain data.
+        form: Options of the environment that are its own; None if it takes those of all.
     """
 
     agent: str
     run: int
     policy: Any
     about: Mapping[str, Any]
+    form: Mapping[str, Any] | None = None
 
     def identity(self) -> list[Any]:
         """Say who it is, as plain data: the same wherever its file lies."""
-        return [self.agent, self.run, what_it_is(self.about)]
+        own = [] if self.form is None else [dict(self.form)]
+        return [self.agent, self.run, what_it_is(self.about), *own]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Say who it is and in which form of the environment it acts, as plain data."""
+        own = {} if self.form is None else {"env": dict(self.form)}
+        return {"agent": self.agent, "run": self.run, "policy": dict(self.about), **own}
+
+
+@final
+@dataclass(frozen=True)
+class Entry:
+    """A policy that was read, and not yet tried out.
+
+    Attributes:
+        agent: Name of the agent.
+        run: Number of its training run.
+        policy: What a user gave.
+        player: Who acts.
+    """
+
+    agent: str
+    run: int
+    policy: Any
+    player: Player
+
+    @property
+    def made_for(self) -> PolicyAbout | None:
+        """What it was trained for, if it says so."""
+        return getattr(self.player, "made_for", None)
+
+    def seated(self, env: ScmWorldEnv) -> Seat:
+        """Try it out.
+
+        Args:
+            env: Where.
+
+        Raises:
+            EvaluationError: It does not fit the environment; with its name.
+        """
+        try:
+            traits = _traits(self.policy, self.player, env)
+        except ScmWorldError as error:
+            raise EvaluationError({"agent": self.agent, "run": self.run}, str(error)) from error
+        except Exception as error:
+            error.add_note(f"agent {self.agent}, run {self.run}, before the first episode")
+            raise
+        about = {**self.player.about, **traits}
+        return Seat(self.agent, self.run, self.policy, about, form_of(self.made_for))
 
 
 def what_it_is(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -52,35 +104,26 @@ def what_it_is(about: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in about.items() if name not in _PLACE}
 
 
-def seats_of(policy: Any, env: ScmWorldEnv, trusted: Sequence[str] | None) -> tuple[Seat, ...]:
-    """Read who acts, and try the policies out.
+def entries_of(policy: Any, trusted: Sequence[str] | None) -> tuple[Entry, ...]:
+    """Read who acts.
 
     Args:
         policy: A policy; a list of them, one for each training run; or either by the name of the
             agent.
-        env: Where they are tried out.
         trusted: Packages whose functions may be policies, if named by a text.
 
     Raises:
         UnknownOption: There is none, or two have one name.
-        EvaluationError: One does not fit the environment; with its name.
     """
-    seats: list[Seat] = []
+    entries: list[Entry] = []
     for agent, run, one in listed(policy):
         player = as_player(one, trusted=trusted)
         name = _short(str(player.about["name"])) if agent is None else agent
-        name = seats[0].agent if agent is None and seats else name  # a list is one agent
-        try:
-            traits = _traits(one, player, env)
-        except ScmWorldError as error:
-            raise EvaluationError({"agent": name, "run": run}, str(error)) from error
-        except Exception as error:
-            error.add_note(f"agent {name}, run {run}, before the first episode")
-            raise
-        seats.append(Seat(named("name of an agent", name), run, one, {**player.about, **traits}))
-    if not seats:
+        name = entries[0].agent if agent is None and entries else name  # a list is one agent
+        entries.append(Entry(named("name of an agent", name), run, one, player))
+    if not entries:
         raise UnknownOption("policy", policy, ("one or several",))
-    return tuple(seats)
+    return tuple(entries)
 
 
 def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, final
 
 import numpy as np
 
-from scm_world.backends import BACKENDS
+from scm_world.backends import backends
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import ROLES, protocols_of
+from scm_world.evaluation.forms import form_of, in_form, shared_options, task_for
 from scm_world.evaluation.protocols import Protocol, chosen
-from scm_world.evaluation.seats import Seat, seats_of, source_of
+from scm_world.evaluation.seats import Entry, Seat, entries_of, source_of
 from scm_world.queries.experiments.versions import versions
 from scm_world.tasks import TASKS, Task
 from scm_world.world.start import whole_number
@@ -42,9 +43,14 @@ class Place:
     task: Task | str
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def env(self, engine: str) -> ScmWorldEnv:
-        """Make the environment on an engine."""
-        return ScmWorldEnv(self.task, backend=engine, **self.options)
+    def env(self, engine: str, form: Mapping[str, Any] | None = None) -> ScmWorldEnv:
+        """Make the environment on an engine.
+
+        Args:
+            engine: Its name.
+            form: Options of the agent that acts in it; see ``in_form``.
+        """
+        return ScmWorldEnv(self.task, backend=engine, **in_form(self.options, form))
 
     @property
     def name(self) -> str:
@@ -123,6 +129,14 @@ class Setup:
     n: int
     versions: Mapping[str, Mapping[str, str]]
 
+    def env(self, shard: Shard) -> ScmWorldEnv:
+        """Make the environment of a shard: on its engine, in the form of its agent."""
+        return self.place.env(shard.engine, self.seats[shard.seat].form)
+
+    def where(self, shard: Shard) -> str:
+        """Name this environment; it is the same one for agents of the same form."""
+        return json.dumps([shard.engine, self.seats[shard.seat].form], sort_keys=True)
+
     def shards(self) -> list[Shard]:
         """List everything that has to be played; what is compared with one another is near."""
         return [
@@ -171,10 +185,7 @@ class Setup:
         return {
             **self.place.about(),
             "engines": list(self.engines),
-            "agents": [
-                {"agent": seat.agent, "run": seat.run, "policy": dict(seat.about)}
-                for seat in self.seats
-            ],
+            "agents": [seat.as_dict() for seat in self.seats],
             "protocols": [protocol.as_dict() for protocol in self.protocols],
             "seeds": list(self.seeds),
             "n": self.n,
@@ -186,7 +197,7 @@ def prepare(
     policy: Any,
     protocols: Any,
     *,
-    task: Task | str,
+    task: Task | str | None,
     n: int,
     seeds: Any,
     backend: Any,
@@ -199,7 +210,7 @@ def prepare(
         policy: A policy; a list of policies, one for each training run; or either by the name of
             the agent.
         protocols: See ``chosen``.
-        task: Name, or a task.
+        task: Name, or a task; if None the one that the policies were trained for, else pushing.
         n: Episodes of each protocol, for each seed.
         seeds: One or several.
         backend: One engine or several.
@@ -209,11 +220,12 @@ def prepare(
     Raises:
         ScmWorldError: What is wrong, by name.
     """
-    place = _place(task, env)
+    entries = entries_of(policy, trusted)
+    place = _place(task, env, entries)
     engines = _several("backend", backend)
     for engine in engines:
-        if not isinstance(engine, str) or engine not in BACKENDS:
-            raise UnknownOption("backend", engine, BACKENDS)
+        if not isinstance(engine, str) or engine not in backends():
+            raise UnknownOption("backend", engine, backends())
     known = protocols_of(place.name) if place.name in ROLES or protocols is None else ()
     wanted = chosen(protocols, known)
     count = whole_number("n", n, least=1)
@@ -226,7 +238,7 @@ def prepare(
             for protocol in wanted:
                 arena.try_out(protocol, seed=noises[0])
             found[engine] = versions(arena.env.world.engine)
-            seats = seats or seats_of(policy, arena.env, trusted)
+            seats = seats or tuple(_seated(entries, place, arena.env))
         finally:
             arena.close()
     setup = Setup(place, seats, engines, wanted, noises, count, found)
@@ -234,7 +246,36 @@ def prepare(
     return setup
 
 
-def _place(task: Task | str, env: Any) -> Place:
+def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
+    """Name the task in which policies act if nobody says anything else.
+
+    Args:
+        policy: As in ``prepare``.
+        trusted: Packages whose functions may be policies, if named by a text.
+
+    Raises:
+        ScmWorldError: A policy cannot be read, or they were trained for several tasks.
+    """
+    agents = [(entry.agent, entry.made_for) for entry in entries_of(policy, trusted)]
+    return str(task_for(None, agents))
+
+
+def _seated(entries: Sequence[Entry], place: Place, shared: ScmWorldEnv) -> Iterator[Seat]:
+    """Try everybody out, each in an environment of its own form if it has one."""
+    engine = shared.world.backend.name
+    for entry in entries:
+        form = form_of(entry.made_for)
+        env = shared if form is None else place.env(engine, form)
+        try:
+            yield entry.seated(env)
+        finally:
+            if env is not shared:
+                env.close()
+
+
+def _place(task: Task | str | None, env: Any, entries: Sequence[Entry]) -> Place:
+    agents = [(entry.agent, entry.made_for) for entry in entries]
+    task = task_for(task, agents)
     if not isinstance(task, Task) and (not isinstance(task, str) or task not in TASKS):
         raise UnknownOption("task", task, TASKS)
     if not isinstance(env, Mapping | None):
@@ -243,7 +284,7 @@ def _place(task: Task | str, env: Any) -> Place:
     for name in env or {}:
         if name not in allowed:
             raise UnknownOption("option of the environment", name, allowed)
-    return Place(task, dict(env or {}))
+    return Place(task, shared_options(env, agents))
 
 
 def _seed(seed: Any) -> int:

@@ -52,7 +52,7 @@ def _write(target: Path, data: bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         draft.replace(target)
-        _sync(target.parent)
+        synced(target.parent)
     except OSError as error:
         reason = error.strerror or str(error)
         raise UnwritableFolder(str(target.parent), f"{target.name}: {reason}") from None
@@ -95,7 +95,7 @@ def made(folder: Location) -> Location:
     return folder
 
 
-def _sync(folder: Path) -> None:
+def synced(folder: Path) -> None:
     """Make a new name in a folder outlast a loss of power."""
     handle = os.open(folder, os.O_RDONLY)
     try:

@@ -13,6 +13,8 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.queries.grasping import Grasp
+from scm_world.queries.planning import CrossEntropy
+from scm_world.queries.stillness import still as still  # it is one of the policies here
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import forward, inverse
 from scm_world.world import World
@@ -151,20 +153,12 @@ class Sweep(Blind):
         return _kept(self._way if "effector" in world.action_mode else self._joints, first, count)
 
 
-def still(world: World) -> Floats:
-    """Keep the robot where it is told to be: joints, fingertips, or no torque."""
-    if world.action_mode == "joint_torques":
-        return np.zeros(9)
-    name = "end_effector_positions" if "effector" in world.action_mode else "joint_positions"
-    found: Floats = np.array(world[name])
-    return found
-
-
 NAMED: Mapping[str, Callable[[], Policy]] = {
     "random": Random,
     "sweep": cache(Sweep),
     "across": cache(partial(Sweep, across=True)),
     "grasp": Grasp,
+    "mpc": cache(CrossEntropy),
 }
 """Policies that have a name."""
 
@@ -174,8 +168,8 @@ def as_policy(given: Any) -> Policy:
 
     Args:
         given: A policy, actions, ``"random"``, ``"sweep"`` (to the middle), ``"across"``
-            (one finger), ``"grasp"`` (blocks, to their goals), or None: where the robot begins
-            it stays.
+            (one finger), ``"grasp"`` (blocks, to their goals), ``"mpc"`` (plans), or None: where
+            the robot begins it stays.
 
     Raises:
         ActionError: It is none of these.

@@ -14,11 +14,12 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.entities import Entity
 from scm_world.errors import UnknownOption
 from scm_world.scene import trifinger
+from scm_world.tasks import shaping
 from scm_world.tasks.arguments import numbers_of
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.observed import Observed
-from scm_world.tasks.rewards import Common, own_terms, resolve
-from scm_world.variables import Draw, Integers, Variable
+from scm_world.tasks.rewards import Common, further_terms, resolve
+from scm_world.variables import Draw, Integers, Measured, Variable
 from scm_world.variables.kinds import SpaceName
 
 
@@ -34,13 +35,14 @@ class Task(ABC):
         default_weights: Weight of every dense reward term, in order, and of
             ``fractional_success``.
         paper_weights: Where the published training runs differ.
+        ready_terms: Further reward terms, by name in the option ``terms``.
         decided_by: The shared variables that decide what stands in the world.
         goal_causes: The variables that a new goal is drawn for.
         plan: What stands in the world, as ``arrange`` has it; None where that is always the same.
         absent: Entities that an intervention took away.
         conventions: Ours or the predecessor's.
         weights: Weight of each reward term, by the name of its variable.
-        terms: Reward terms of the user's own.
+        terms: Reward terms that were asked for.
         start: Where the robot begins, shape (9,) [rad].
         given: What it was made with.
     """
@@ -51,6 +53,7 @@ class Task(ABC):
     name: ClassVar[str]
     default_weights: ClassVar[Mapping[str, float]]
     paper_weights: ClassVar[Mapping[str, float]] = {}
+    ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
     decided_by: ClassVar[tuple[str, ...]] = ()
     goal_causes: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = trifinger.REST
@@ -69,9 +72,8 @@ class Task(ABC):
         unknown = sorted(common.keys() - Common.__annotations__.keys())
         if unknown:
             raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
-        self.terms = own_terms(common.get("terms", ()), self.default_weights)
-        common["terms"] = self.terms  # it may have been an iterator, which is empty now
-        self.weights = resolve(self.default_weights, self.paper_weights, common)
+        self.terms = further_terms(common.get("terms", ()), self.default_weights, self.ready_terms)
+        self.weights = resolve(self.default_weights, self.paper_weights, common, self.terms)
         given = common.get("joint_positions")
         joints = numbers_of(self.rest if given is None else given)
         if joints is None or joints.shape != (trifinger.N_JOINTS,):

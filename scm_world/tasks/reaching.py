@@ -14,7 +14,7 @@ from scm_world.entities import Entity, GoalSphere
 from scm_world.geometry.scalars import fused, scalar
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
-from scm_world.tasks import kernels
+from scm_world.tasks import kernels, shaping
 from scm_world.tasks.arguments import checked
 from scm_world.tasks.base import Task
 from scm_world.tasks.observed import Observed, observe_obstacle, observe_position
@@ -93,6 +93,7 @@ class Reaching(Task):
         FRACTION: 1.0,
     }
     paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
+    ready_terms = shaping.REACHING
     decided_by = (COUNT,)
     goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)
 

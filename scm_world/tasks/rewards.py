@@ -35,8 +35,9 @@ class Common(TypedDict, total=False):
         fractional_reward_weight: Weight of the fractional success.
         dense_reward_weights: Weights of the dense terms, in their order.
         activate_sparse_reward: The same as ``weights="sparse"``.
-        terms: Reward terms of one's own: ``Measured`` variables with a mechanism, whose names
-            begin with ``reward.``; their weights stand in ``weights``.
+        terms: Further reward terms: names of ``ready_terms`` of the task, or terms of one's own,
+            ``Measured`` variables with a mechanism, whose names begin with ``reward.``; their
+            weights stand in ``weights``.
         joint_positions: Where the robot begins, shape (9,) [rad].
     """
 
@@ -44,12 +45,15 @@ class Common(TypedDict, total=False):
     fractional_reward_weight: float | None
     dense_reward_weights: Sequence[float] | None
     activate_sparse_reward: bool
-    terms: Iterable[Measured]
+    terms: Iterable[Measured | str]
     joint_positions: Sequence[float] | None
 
 
 def resolve(
-    default: Mapping[str, float], paper: Mapping[str, float], options: Common
+    default: Mapping[str, float],
+    paper: Mapping[str, float],
+    options: Common,
+    terms: Iterable[Measured] = (),
 ) -> dict[str, float]:
     """Work out the weight of every term.
 
@@ -57,13 +61,14 @@ def resolve(
         default: Of every dense term of the task in its order, and of the fractional success.
         paper: Where the published training runs differ.
         options: What the user asked for.
+        terms: Further ones; see ``further_terms``.
 
     Raises:
         UnknownOption: A preset or a term that does not exist, a wrong number of weights, or one
             that is no finite number.
     """
     asked = options.get("weights", "default")
-    own = {term.name: 0.0 for term in options.get("terms", ())}
+    own = {term.name: 0.0 for term in terms}
     weights = {**default, **own}
     if isinstance(asked, str):
         if asked not in PRESETS:
@@ -98,27 +103,35 @@ def _in_order(dense: Sequence[str], options: Common) -> dict[str, float]:
     return {name: checked_weight(name, weight) for name, weight in zip(dense, given, strict=True)}
 
 
-def own_terms(terms: Any, known: Iterable[str]) -> tuple[Measured, ...]:
-    """Check reward terms of the user's own.
+def further_terms(
+    asked: Any, known: Iterable[str], ready: Iterable[Measured]
+) -> tuple[Measured, ...]:
+    """Check reward terms that a task does not have by itself.
 
     Args:
-        terms: Any number of them.
+        asked: Any number of them; a name stands for one that is ready.
         known: Names of the terms that there are.
+        ready: What names may stand for.
 
     Raises:
-        UnknownOption: One is no measured number with a mechanism, or has the wrong name.
+        UnknownOption: A name stands for none, or a term is no measured number with a mechanism, or
+            has the wrong name.
     """
-    found = tuple(terms) if isinstance(terms, Iterable) else (terms,)
+    single = isinstance(asked, str) or not isinstance(asked, Iterable)
+    offered = {term.name: term for term in ready}
     names = [*known, SUCCESS]
-    for own in found:
+    found: list[Measured] = []
+    for one in (asked,) if single else tuple(asked):
+        own = offered.get(one) if isinstance(one, str) else one
         if not isinstance(own, Measured) or own.mechanism is None or own.shape:
             allowed = "a Measured variable of shape () with a mechanism"
-            raise UnknownOption("terms", own, (allowed,))
+            raise UnknownOption("terms", one, (*offered, allowed))
         if not own.name.startswith(PREFIX) or own.name in names:
             allowed = f"a new name that begins with {PREFIX!r}"
             raise UnknownOption("name of a reward term", own.name, (allowed,))
         names.append(own.name)
-    return found
+        found.append(own)
+    return tuple(found)
 
 
 def one_number(values: Values, name: str, terms: Iterable[str]) -> float:

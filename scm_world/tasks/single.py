@@ -14,7 +14,7 @@ from scm_world.entities.blocks import hull_size
 from scm_world.entities.goals import goal_orientation
 from scm_world.errors import ModelError
 from scm_world.geometry.hulls import Hull, extents
-from scm_world.tasks import kernels, shapes
+from scm_world.tasks import kernels, shapes, shaping
 from scm_world.tasks.arguments import checked
 from scm_world.tasks.building import Building
 from scm_world.tasks.reaching import minus_change
@@ -64,6 +64,8 @@ class OneBlock(Building):
         shape: Of block and goal; None for a box.
         place: x and y of the block at the start, and the height of its lowest point [m].
     """
+
+    ready_terms = shaping.ONE_BLOCK
 
     def __init__(
         self,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.backends import BACKENDS, Backend, make_backend
+from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.scene import PhysicalState
@@ -101,7 +101,7 @@ def the_backend(backend: Any) -> Backend:
         return backend
     if isinstance(backend, str):
         return make_backend(backend)
-    raise UnknownOption("backend", backend, (*BACKENDS, "a backend that is made"))
+    raise UnknownOption("backend", backend, (*backends(), "a backend that is made"))
 
 
 def check_held(region: AnyRegion | None, family: Family) -> None:

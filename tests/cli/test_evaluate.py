@@ -17,6 +17,7 @@ from scm_world.cli import app
 from scm_world.cli.evaluation import policies_of
 from scm_world.errors import UnknownOption
 from scm_world.evaluation import METRICS, Evaluation, protocols_of
+from scm_world.evaluation.policies import save_policy
 
 QUICK = ("--backend", "fake", "--env", "max_episode_length=3", "--workers", "1")
 
@@ -235,3 +236,27 @@ def test_scores_of_the_command_are_those_of_the_call() -> None:
     found = results()
     assert found == mine
     assert np.array_equal(found.scores(agent="still"), mine.scores(agent="still"))
+
+
+def test_the_file_of_a_policy_says_the_task_and_the_environment(tmp_path: Path) -> None:
+    """The task need not be typed; an option that contradicts the file is refused."""
+    layers = {
+        "layers.0.weight": np.full((9, 56), 0.01, np.float32),
+        "layers.0.bias": np.zeros(9, np.float32),
+    }
+    about = {"task": "picking", "env": {"action_mode": "delta_joint_positions"}}
+    run = tmp_path / "run=1"
+    run.mkdir()
+    save_policy(run / "policy.safetensors", layers, about)
+    done = call("evaluate", "run=1,still", "--protocols=P0", "-n2", *QUICK)
+    assert done.exit_code == 0, done.output
+    assert "in picking" in done.output
+    found = Evaluation.load(
+        Path("scm-world-results/evaluate-run=1-still-picking-max_episode_length=3")
+    )
+    assert found.agents == ("run=1", "still")
+    assert found.about["agents"][0]["env"] == about["env"]
+    wrong = call("evaluate", "run=1", "--env", "action_mode=joint_torques", *QUICK)
+    assert wrong.exit_code != 0
+    assert "action_mode for 'run=1' cannot be 'joint_torques'" in " ".join(wrong.output.split())
+    assert policies_of("zoo:pushing") == {"zoo.pushing": ["zoo:pushing"]}

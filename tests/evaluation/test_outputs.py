@@ -30,7 +30,7 @@ from scm_world.evaluation.outputs import (
 from scm_world.evaluation.outputs.bars import bars_figure
 from scm_world.evaluation.outputs.causes import SURE, causes_figure, causes_of
 from scm_world.evaluation.outputs.gap import gap_figure, gaps_of
-from scm_world.evaluation.outputs.looks import Looks, metric_words
+from scm_world.evaluation.outputs.looks import Looks, lines_of, metric_words
 from scm_world.evaluation.outputs.profiles import compare_agents, profile_figure
 from scm_world.evaluation.outputs.radar import radar_figure
 from scm_world.evaluation.outputs.sheets import text_size, wrapped
@@ -170,7 +170,7 @@ def test_an_unknown_metric_is_refused(draw: Any, tmp_path: Path) -> None:
 
 def test_all_lines_look_different() -> None:
     """Twenty agents on two engines have forty kinds of bars and of lines."""
-    looks = Looks(made([f"agent {k}" for k in range(20)], 1, engines=BOTH, n=1))
+    looks = Looks(lines_of(made([f"agent {k}" for k in range(20)], 1, engines=BOTH, n=1)))
     bars = {(bar["facecolor"], bar["hatch"]) for bar in map(looks.bar, looks.lines)}
     lines = {tuple(map(str, looks.line(line).values())) for line in looks.lines}
     assert len(bars) == len(lines) == len(looks.lines) == 40

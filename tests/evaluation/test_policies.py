@@ -207,10 +207,17 @@ def test_commands_become_actions() -> None:
     assert played(Random(share=0.5), env).shape == (STEPS, 9)
 
 
-def test_relative_actions_are_refused_by_commands() -> None:
-    """A command is absolute."""
-    with pytest.raises(UnknownOption, match="absolute commands"):
-        played("random", make(action_mode="delta_joint_positions"))
+@pytest.mark.parametrize("origin", ["command", "measured"])
+@pytest.mark.parametrize("normalized", [True, False])
+def test_relative_actions_lead_to_commands(origin: str, normalized: bool) -> None:
+    """What a policy of the world asks for is approached in steps, and then held."""
+    relative = {"delta_scale": 0.1, "delta_origin": origin, "normalize_actions": normalized}
+    env = make(action_mode="delta_joint_positions", **relative)
+    goal = np.array([0.3, 0.9, -0.9] * 3)
+    actions = played(WorldPolicy(lambda world: goal), env)
+    np.testing.assert_allclose(env.unwrapped.world["action"], goal, atol=1e-9)
+    assert np.all(np.abs(actions) <= env.action_space.high + 1e-6)
+    assert np.any(np.isclose(actions[0], env.action_space.high))  # the first one is cut short
 
 
 def test_functions_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

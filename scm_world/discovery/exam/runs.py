@@ -19,7 +19,7 @@ from scm_world.discovery.exam.subjects import Subject, TaskView, subject
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import Learner, learn, learner
 from scm_world.discovery.metrics import effect_rmse, evaluate
-from scm_world.errors import EngineFailure, MissingExtra, ScmWorldError, UnknownOption
+from scm_world.errors import EngineFailure, MissingExtra, UnknownOption, in_one_line
 from scm_world.output.locations import Location
 from scm_world.tasks import TASKS
 from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
@@ -145,7 +145,7 @@ class Bench:
             raise
         except Exception as error:  # of whatever kind: learners are not all ours
             seconds = time.perf_counter() - started
-            return job.cell(status="failed", message=_said(error), seconds=seconds)
+            return job.cell(status="failed", message=in_one_line(error), seconds=seconds)
 
     def _ran(self, job: Job, made: Subject, table: Dataset | None) -> Cell:
         chosen = learner(job.learner)
@@ -210,13 +210,6 @@ class Bench:
             self._test.append(made.test(seed))
         test = self._test[0]
         return None if test is None else effect_rmse(found, table, test).rmse
-
-
-def _said(error: Exception) -> str:
-    """Write an error in one line; with its name, unless it is one of ours."""
-    text = " ".join(str(error).split())
-    name = type(error).__name__
-    return text if text and isinstance(error, ScmWorldError) else f"{name}: {text}".rstrip(": ")
 
 
 # --- processes ----------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ class Inside:
             together and seen._goals is not None,
             env._terms,
             env._scale,
-            env._limit,
+            env.limit,
         )
 
 

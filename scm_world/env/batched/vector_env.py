@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, final
@@ -66,6 +66,8 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             ``"native"``: many in one call of the engine; None: the fastest that there is.
         threads: Of the native crew; as many as there are cores if None.
         workers: How many processes; as many as there are cores if None.
+        member: Makes one of them from the options: something that can do what a ``ScmWorldEnv``
+            can. Not with the native crew.
         options: Of ``ScmWorldEnv``.
 
     Raises:
@@ -90,12 +92,13 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         crew: str | None = None,
         threads: int | None = None,
         workers: int | None = None,
+        member: Callable[..., Any] = ScmWorldEnv,
         **options: Any,
     ) -> None:
         self.num_envs = whole_number("num_envs", num_envs, least=1)
         self.autoreset_mode = _mode(autoreset_mode)
         self.copy = copy
-        make = partial(ScmWorldEnv, **options)
+        make = partial(member, **options)
         backend = str(options.get("backend", "mujoco"))
         self.crew: Crew = made_crew(
             crew, make, self.num_envs, backend=backend, threads=threads, workers=workers

@@ -10,6 +10,7 @@ from scm_world.evaluation.outputs.looks import (
     Scores,
     counted,
     intervals,
+    lines_of,
     metric_words,
     protocol_words,
 )
@@ -50,7 +51,7 @@ def draw_bars(evaluation: Evaluation, path: Location | str, metric: str = SCORE)
 def bars_figure(evaluation: Evaluation, metric: str = SCORE) -> Figure:
     """Draw the same for a page."""
     said = metric_words(metric)
-    looks, scores = Looks(evaluation), intervals(evaluation, metric)
+    looks, scores = Looks(lines_of(evaluation)), intervals(evaluation, metric)
     count = len(looks.lines)
     strips = Strips(
         protocol_words(evaluation),

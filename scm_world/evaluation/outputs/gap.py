@@ -11,6 +11,7 @@ from scm_world.evaluation.outputs.looks import (
     Line,
     Looks,
     counted,
+    lines_of,
     metric_words,
     protocol_words,
 )
@@ -68,7 +69,7 @@ def draw_gap(evaluation: Evaluation, path: Location | str, metric: str = SCORE) 
 
 def gap_figure(evaluation: Evaluation, gaps: Gaps, metric: str = SCORE) -> Figure:
     """Draw gaps that are known already."""
-    said, looks = metric_words(metric), Looks(evaluation)
+    said, looks = metric_words(metric), Looks(lines_of(evaluation))
     agents, pairs = evaluation.agents, list(combinations(evaluation.engines, 2))
     strips = Strips(
         protocol_words(evaluation),

@@ -127,12 +127,14 @@ class Looks:
     Past the seventh agent colors come again with another hatch and another marker.
 
     Args:
-        evaluation: Of which the lines are.
+        lines: All that are drawn, such as ``lines_of`` an evaluation.
+        between: Stands between the names of agent and engine.
     """
 
-    def __init__(self, evaluation: Evaluation) -> None:
-        self.agents, self.engines = evaluation.agents, evaluation.engines
-        self.lines = lines_of(evaluation)
+    def __init__(self, lines: Sequence[Line], between: str = " on ") -> None:
+        self.lines, self.between = list(lines), between
+        self.agents = tuple(dict.fromkeys(line.agent for line in lines))
+        self.engines = tuple(dict.fromkeys(line.engine for line in lines))
 
     def color(self, line: Line) -> str:
         """Give the color of the agent."""
@@ -163,7 +165,7 @@ class Looks:
     def label(self, line: Line) -> str:
         """Name a line; the engine only where there are several."""
         name = " ".join(line.agent.split())
-        return name if len(self.engines) == 1 else f"{name} on {line.engine}"
+        return name if len(self.engines) == 1 else f"{name}{self.between}{line.engine}"
 
     def bar_key(self) -> list[Patch]:
         """Make the entries of a legend of bars."""

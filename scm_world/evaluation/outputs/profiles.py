@@ -14,6 +14,7 @@ from scm_world.evaluation.outputs.looks import (
     Line,
     Looks,
     is_fraction,
+    lines_of,
     metric_words,
 )
 from scm_world.evaluation.outputs.sheets import GAP, MARGIN, PLAIN, Sheet, text_size, wrapped
@@ -117,7 +118,7 @@ def profile_figure(
     evaluation: Evaluation, found: dict[str, Comparison], metric: str = SCORE
 ) -> Figure:
     """Draw comparisons that are known already, by engine."""
-    said, looks = metric_words(metric), Looks(evaluation)
+    said, looks = metric_words(metric), Looks(lines_of(evaluation))
     blocks = [sum(_pair_heights(one)) for one in found.values()]
     several = any(one.better for one in found.values())
     named = _names_width(found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, final
@@ -18,6 +19,7 @@ from scm_world.evaluation.outputs.looks import (
     counted,
     intervals,
     is_fraction,
+    lines_of,
     metric_words,
     protocol_words,
 )
@@ -63,24 +65,54 @@ def radar_figure(evaluation: Evaluation, metric: str = SCORE) -> Figure:
     if len(words) < 3:
         allowed = ("three protocols or more; draw_bars draws fewer",)
         raise UnknownOption("protocols of a radar", ", ".join(words), allowed)
-    looks, scores = Looks(evaluation), intervals(evaluation, metric)
-    together = len(looks.lines) <= TOGETHER
+    looks, scores = Looks(lines_of(evaluation)), intervals(evaluation, metric)
     groups = {"": looks.lines}
     note = f"Means of {counted(evaluation)}; bands are 95 % intervals."
-    if not together:
+    if len(looks.lines) > TOGETHER:
         groups = {a: [line for line in looks.lines if line.agent == a] for a in looks.agents}
         note += " " + "; ".join(f"{name}: {doc}" for name, doc in words.items() if doc)
         words = dict.fromkeys(words, "")
-    rim = _rim(words, LARGE if together else SMALL)
+    return radars(
+        groups,
+        scores,
+        words,
+        looks=looks,
+        title=f"{evaluation.task}: {said}",
+        note=note,
+        limits=_limits(scores, metric),
+    )
+
+
+def radars(
+    groups: Mapping[str, Sequence[Line]],
+    scores: Scores,
+    words: Mapping[str, str],
+    *,
+    looks: Looks,
+    title: str,
+    note: str = "",
+    limits: tuple[float, float] = (0.0, 1.0),
+) -> Figure:
+    """Draw radars side by side.
+
+    Args:
+        groups: The lines of each radar, by its name.
+        scores: Of the lines, by line and protocol.
+        words: What stands below the name of each protocol.
+        looks: Of all lines.
+        title: Above all.
+        note: Small, below the title.
+        limits: Score at the centers and at the rims.
+    """
+    rim = _rim(words, LARGE if len(groups) == 1 else SMALL)
     titles = {name: wrapped(name, rim.width - 0.2, NAME, bold=True) for name in groups}
     head = max(text_size(t, NAME, bold=True)[1] + GAP if t else 0.0 for t in titles.values())
     across = max(1, min(math.ceil(math.sqrt(len(groups))), int(WIDEST / rim.width)))
     down = math.ceil(len(groups) / across)
     sheet = Sheet(
         across * rim.width + 2 * MARGIN, down * (rim.height + head),
-        title=f"{evaluation.task}: {said}", note=note, handles=looks.line_key(),
+        title=title, note=note, handles=looks.line_key(),
     )  # fmt: skip
-    limits = _limits(scores, metric)
     left = (sheet.width - across * rim.width) / 2
     for number, (name, lines) in enumerate(groups.items()):
         row, column = divmod(number, across)
@@ -147,7 +179,7 @@ class Rim:
         return 2 * self.reach[1]
 
 
-def _rim(words: dict[str, str], least: float) -> Rim:
+def _rim(words: Mapping[str, str], least: float) -> Rim:
     """Find the smallest radius at which no two names meet."""
     texts = {
         name: (balanced(name, WORDS, NAME, bold=True), balanced(doc, WORDS, DOC))
@@ -206,7 +238,7 @@ def _radar(
     sheet: Sheet,
     rim: Rim,
     corner: tuple[float, float],
-    lines: list[Line],
+    lines: Sequence[Line],
     looks: Looks,
     scores: Scores,
     limits: tuple[float, float],

@@ -8,7 +8,8 @@ from typing import Any, final
 import numpy as np
 
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import ActionError, UnreadableFile
+from scm_world.errors import ActionError, ModelError, UnreadableFile
+from scm_world.evaluation.policies.cards import KEY, PolicyAbout, refuse_other_form
 from scm_world.evaluation.policies.players import About, Actions, Player, Playing
 from scm_world.graph.exchange.libraries import load
 
@@ -25,7 +26,8 @@ class ByNetwork(Playing):
     """Asks a network that takes a batch of observations and gives a batch of actions.
 
     An observation that is an array goes to its only input; one that is arrays by name goes to
-    inputs of the same names. The first output is the action, shape (1, 9) or (9,).
+    inputs of the same names. The first output is the action, shape (1, 9) or (9,). What the network
+    was trained for stands in its metadata under ``"scm_world"``, if it is known.
 
     Args:
         path: Of the ONNX file.
@@ -33,7 +35,7 @@ class ByNetwork(Playing):
 
     Raises:
         MissingExtra: onnxruntime is not installed.
-        UnreadableFile: It is no network.
+        UnreadableFile: It is no network, or what it says of itself is no ``PolicyAbout``.
     """
 
     def __init__(self, path: Path, about: About) -> None:
@@ -56,10 +58,21 @@ class ByNetwork(Playing):
             raise UnreadableFile(str(path), f"it is no network ({error})", _ADVICE) from None
         self._inputs = {node.name: node for node in self._session.get_inputs()}
         self._output = self._session.get_outputs()[0].name
+        text = self._session.get_modelmeta().custom_metadata_map.get(KEY)
+        try:
+            self._made_for = None if text is None else PolicyAbout.of(text)
+        except ModelError as error:
+            reason = f"its metadata {KEY!r}: {'; '.join(error.problems)}"
+            raise UnreadableFile(str(path), reason, _ADVICE) from None
 
     def __reduce__(self) -> Any:
         """Let a copy read the file again."""
         return type(self), (self._path, self._about)
+
+    @property
+    def made_for(self) -> PolicyAbout | None:
+        """What the network was trained for, if it says so."""
+        return self._made_for
 
     @property
     def is_plain(self) -> bool:
@@ -75,7 +88,9 @@ class ByNetwork(Playing):
 
         Raises:
             UnreadableFile: It takes another shape or type, or other inputs.
+            UnknownOption: It was trained with other options of the environment.
         """
+        refuse_other_form(self._made_for, env, self._name)
         self._env = env
         feed = self._feed(env.observe())
         if feed.keys() != self._inputs.keys():

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.env import ScmWorldEnv
-from scm_world.env.delta import MODES, PREFIX
 from scm_world.errors import ActionError, UnknownOption
+from scm_world.evaluation.policies.cards import PolicyAbout
 from scm_world.evaluation.policies.mlp import MlpPolicy
 from scm_world.queries.policies import Policy
 
@@ -140,6 +140,11 @@ class Playing:
         """Whether its actions are known to follow from what it observed in the episode alone."""
         return False
 
+    @property
+    def made_for(self) -> PolicyAbout | None:
+        """What the policy was trained for, if it says so."""
+        return None
+
     def twin(self) -> Player | None:
         """Give a player of the same policy for another episode at the same time.
 
@@ -260,29 +265,16 @@ class ByWorld(Playing):
         self._make = make
 
     def begin(self, env: ScmWorldEnv) -> None:
-        """Make the policy of a new episode.
-
-        Raises:
-            UnknownOption: The actions are relative, which those of the policy are not.
-        """
-        refuse_relative(env)
+        """Make the policy of a new episode."""
         self._env, self._policy = env, self._make()
         forget(self._policy)
 
     def act(self, observation: Any) -> Actions:
-        """Choose an action, shape (9,), dtype float64; it is not rounded."""
+        """Choose an action, shape (9,), dtype float64; it is not rounded.
+
+        Where actions are relative it leads as near to what the policy asks for as one can.
+        """
         if self._env is None:
             raise ActionError(f"the policy {self._name!r} acts in no episode; call begin()", None)
         command = self._checked(self._policy(self._env.world))
-        return self._env.as_action(command)
-
-
-def refuse_relative(env: ScmWorldEnv) -> None:
-    """Refuse an environment with relative actions, for commands that are absolute.
-
-    Raises:
-        UnknownOption: It has them.
-    """
-    if env.action_mode.startswith(PREFIX):
-        allowed = [mode for mode in MODES if not mode.startswith(PREFIX)]
-        raise UnknownOption("action_mode for absolute commands", env.action_mode, allowed)
+        return self._env.toward(command)

@@ -23,6 +23,10 @@ from scm_world.evaluation.policies.players import (
     WorldPolicy,
 )
 from scm_world.evaluation.policies.sb2 import load_sb2
+from scm_world.evaluation.policies.trained import ByWeights, in_run
+from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
+from scm_world.evaluation.zoo.shelf import PREFIX as ZOO
+from scm_world.evaluation.zoo.shelf import path_of
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.policies import NAMED, Policy, Random, Sweep, still
@@ -47,7 +51,10 @@ FORMS = (
     "an object with the method predict",
     "an array of actions",
     "an episode",
-    "a file (.onnx, .zip of Stable-Baselines 2, .npz of an episode, .parquet of a recording)",
+    "a file (.safetensors, .onnx, .zip of Stable-Baselines 2, .npz of an episode, .parquet of a "
+    "recording)",
+    "the folder of a training run",
+    "'zoo:name'",
     "'module:function'",
 )
 _PICKLED = "_stable_baselines3_version"
@@ -76,9 +83,11 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
     Args:
         policy: A function of the observation; an object with ``predict`` as Stable-Baselines3 has
             it; the name of a policy of this package; a ``WorldPolicy``; actions, shape (9,) or
-            (steps, 9); an episode of ``World.rollout`` or of a recording; the path of an ONNX
-            network, an archive of Stable-Baselines 2, a saved episode or a recording
-            (``"runs.parquet#3"`` for its fourth episode); or ``"package.module:function"``.
+            (steps, 9); an episode of ``World.rollout`` or of a recording; the path of a policy
+            file, of an ONNX network, an archive of Stable-Baselines 2, a saved episode or a
+            recording (``"runs.parquet#3"`` for its fourth episode); the folder of a training run;
+            ``"zoo:pushing"``, one that comes with this package; or
+            ``"package.module:function"``.
         trusted: Packages whose functions may be named. None: any, as the caller named it.
 
     Raises:
@@ -124,6 +133,8 @@ def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Pla
     advice = "give the policy itself: policy=…"
     if kind == "named" and name in NAMES:
         return as_player(name)
+    if kind == "zoo":
+        return _as_it_was(path_of(name), about, name, advice)
     if kind == "function":
         found = _function(name, trusted)
         if about.get("sees") == "world" and not isinstance(found, WorldPolicy):
@@ -132,9 +143,15 @@ def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Pla
     if kind != "file":
         raise UnknownOption(f"policy to make again from {kind!r}", name, (advice,))
     path, _, _ = str(about["path"]).partition("#")
-    if _sha256(Path(path), advice) != about["sha256"]:
-        raise UnreadableFile(path, "it is another file than the one that acted", advice)
-    return as_player(str(about["path"]), trusted=trusted)
+    return _as_it_was(Path(path), about, str(about["path"]), advice, trusted)
+
+
+def _as_it_was(
+    path: Path, about: Mapping[str, Any], text: str, advice: str, trusted: Sequence[str] = ()
+) -> Player:
+    if _sha256(path, advice) != about["sha256"]:
+        raise UnreadableFile(str(path), "it is another file than the one that acted", advice)
+    return as_player(text, trusted=trusted)
 
 
 # --- things in memory -------------------------------------------------------------------------
@@ -149,6 +166,8 @@ def _of_callable(policy: Any, about: About) -> Player:
         return ByWorld(partial(itself, policy), {**about, "sees": "world"})
     if isinstance(policy, type):
         return _of_callable(policy(), about)
+    if isinstance(policy, NetworkPolicy):
+        return ByWeights(policy, {**about, "sha256": policy.sha256})
     if hasattr(policy, "predict"):
         return ByPrediction(policy, about)
     return ByObservation(policy, about)
@@ -215,17 +234,29 @@ def _of_text(text: str, trusted: Sequence[str] | None) -> Player:
     if text in NAMES:
         about = {"kind": "named", "name": text, **_library(PACKAGE)}
         return ByWorld(partial(_named, text), about)
+    if text.startswith(ZOO):
+        path_in_zoo = path_of(text)
+        about = {"kind": "zoo", "name": text, **_library(PACKAGE)}
+        about["sha256"] = _sha256(path_in_zoo, _ADVICE)
+        return ByWeights(load_policy(path_in_zoo), about)
+    if Path(text).is_dir():
+        found = in_run(Path(text))
+        about = {"kind": "file", "name": Path(text).resolve().name, "path": str(found)}
+        about["sha256"] = _sha256(found, _ADVICE)
+        return ByWeights(load_policy(found), about)
     path, _, number = text.partition("#")
     suffix = Path(path).suffix
     if suffix in _FILES:
-        advice = "give the path of a policy"
         about = {"kind": "file", "name": Path(text).name, "path": text}
-        about["sha256"] = _sha256(Path(path), advice)
+        about["sha256"] = _sha256(Path(path), _ADVICE)
         return _FILES[suffix](Path(path), number, about, trusted or ())
     if ":" in text:
         about = {"kind": "function", "name": text, **_library(text)}
         return _of_callable(_function(text, trusted), about)
     raise UnknownOption("policy", text, FORMS)
+
+
+_ADVICE = "give the path of a policy"
 
 
 def _named(name: str) -> Policy:
@@ -254,6 +285,10 @@ def _function(name: str, trusted: Sequence[str] | None) -> Any:
 
 def _network(path: Path, number: str, about: About, trusted: Sequence[str]) -> Player:
     return ByNetwork(path, about)
+
+
+def _weights(path: Path, number: str, about: About, trusted: Sequence[str]) -> Player:
+    return ByWeights(load_policy(path), about)
 
 
 def _archive(path: Path, number: str, about: About, trusted: Sequence[str]) -> Player:
@@ -285,6 +320,7 @@ def _recording(path: Path, number: str, about: About, trusted: Sequence[str]) ->
 
 
 _FILES: Mapping[str, Callable[[Path, str, About, Sequence[str]], Player]] = {
+    ".safetensors": _weights,
     ".onnx": _network,
     ".zip": _archive,
     ".npz": _saved,

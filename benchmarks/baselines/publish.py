@@ -1,0 +1,169 @@
+"""Put a trained policy into the zoo, with a card that says how well it does.
+
+::
+
+    python -m benchmarks.baselines.publish RUN NAME --results EVALUATION …
+
+``RUN`` is the folder of a training run, or a policy file; ``EVALUATION`` a folder that
+``scm-world evaluate`` wrote about this very file, on one engine or both. The policy without its
+value network becomes ``scm_world/evaluation/zoo/NAME.safetensors``, and ``docs/zoo.md`` is written
+anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation import Evaluation
+from scm_world.evaluation.policies.cards import PolicyAbout
+from scm_world.evaluation.policies.trained import in_run
+from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
+from scm_world.evaluation.zoo import page as zoo_page
+from scm_world.evaluation.zoo import shelf
+from scm_world.evaluation.zoo.texts import COMMAND, LIMITS, RESULTS, SCORES
+from scm_world.output.durable import write_whole
+
+LARGEST = 1_000_000  # [bytes] of a file in the package
+PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
+
+
+def scores_of(path: Path, results: Iterable[Path]) -> list[dict[str, Any]]:
+    """List the scores of a policy file in evaluations: a row for each engine and protocol.
+
+    Args:
+        path: Of the file.
+        results: Folders of evaluations.
+
+    Raises:
+        UnreadableFile: An evaluation is damaged, or not of this file.
+        ModelError: Two evaluations have the same protocol on the same engine.
+    """
+    content = sha256(path.read_bytes()).hexdigest()
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for folder in results:
+        for row in _rows(folder, content):
+            if found.setdefault((row["engine"], row["protocol"]), row) is not row:
+                raise ModelError([f"{folder}: {row['protocol']} on {row['engine']} is there twice"])
+    return list(found.values())
+
+
+def _rows(folder: Path, content: str) -> Iterable[dict[str, Any]]:
+    evaluation = Evaluation.load(folder)
+    agents = [one for one in evaluation.about["agents"] if one["policy"].get("sha256") == content]
+    if not agents:
+        advice = "evaluate this very file: scm-world evaluate FILE --out FOLDER"
+        raise UnreadableFile(str(folder), "it is no evaluation of this policy", advice)
+    agent, run = agents[0]["agent"], agents[0]["run"]
+    mine = evaluation.only(agent=agent, run=run)
+    varied = {one["name"]: one.get("doc", "") for one in evaluation.about["protocols"]}
+    for engine in mine.engines:
+        for protocol in mine.only(engine=engine).protocols:
+            scores = {
+                metric: mine.score(protocol, metric, agent=agent, engine=engine).as_dict()
+                for metric in SCORES
+            }
+            n = len(mine.only(engine=engine, protocol=protocol))
+            where = {"engine": engine, "protocol": protocol, "varied": varied[protocol], "n": n}
+            yield {**where, **scores}
+
+
+def command_of(card: Mapping[str, Any]) -> str:
+    """Give the command that trains such a policy, from its card.
+
+    Raises:
+        UnknownOption: The card does not say which recipe it was.
+    """
+    recipe = card.get("recipe")
+    if not isinstance(recipe, Mapping) or "task" not in recipe or "algo" not in recipe:
+        raise UnknownOption("command", None, ("the one that trained it: --command '…'",))
+    words = ["scm-world", "train", recipe["task"], "--algo", recipe["algo"]]
+    words += ["--preset", recipe["name"]] if recipe.get("name") not in (None, "own") else []
+    words += ["--backend", card.get("backend", "mujoco"), "--seed", card.get("seed", 0)]
+    words += ["--steps", recipe["steps"]] if "steps" in recipe else []
+    return shlex.join(map(str, words))
+
+
+def published(
+    source: Path,
+    results: Sequence[Path],
+    *,
+    command: str | None = None,
+    limits: Sequence[str] = (),
+) -> NetworkPolicy:
+    """Give what goes into the zoo: a policy without its value network, with its scores.
+
+    Args:
+        source: The policy file.
+        results: Folders of evaluations.
+        command: That trained it; from its card if None.
+        limits: What has to be known, in sentences.
+
+    Raises:
+        UnreadableFile: A file is damaged, or an evaluation is not of this policy.
+        UnknownOption: Nobody says with which command it was trained.
+    """
+    policy = load_policy(source)
+    about: PolicyAbout = policy.about.with_card(
+        **{
+            COMMAND: command or policy.about.card.get(COMMAND) or command_of(policy.about.card),
+            RESULTS: scores_of(source, results),
+            LIMITS: [*limits],
+        }
+    )
+    return NetworkPolicy(policy.layers, about, policy.log_std)
+
+
+def publish(
+    source: Path, name: str, results: Sequence[Path], *, page: Path = PAGE, **more: Any
+) -> Path:
+    """Put a policy into the zoo, and write the page anew.
+
+    Args:
+        source: Folder of a training run, or a policy file.
+        name: In the zoo.
+        results: Folders of evaluations.
+        page: Where the cards are written.
+        more: See ``published``.
+
+    Returns:
+        The file in the zoo.
+
+    Raises:
+        UnknownOption: The name cannot be that of a file, or the file would be too large.
+    """
+    if not re.fullmatch(r"[a-z0-9_]+", name):
+        raise UnknownOption("name in the zoo", name, ("small letters, digits and _",))
+    policy = published(in_run(source) if source.is_dir() else source, results, **more)
+    size = sum(array.nbytes for array in policy.tensors().values()) + len(policy.about.text())
+    if size >= LARGEST:
+        raise UnknownOption("size of a policy", f"{size:,} bytes", (f"below {LARGEST:,}",))
+    path = shelf.FOLDER / f"{name}{shelf.SUFFIX}"
+    save_policy(path, policy)
+    write_whole(zoo_page(), page)
+    return path
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Read the command line, and publish."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("source", type=Path, help="folder of a training run, or a policy file")
+    parser.add_argument("name", help="in the zoo")
+    parser.add_argument("--results", type=Path, nargs="+", required=True, help="of evaluations")
+    parser.add_argument("--command", help="that trained it; from its recipe by default")
+    parser.add_argument("--limit", action="append", default=[], help="sentence; one for each")
+    asked = parser.parse_args(words)
+    path = publish(
+        asked.source, asked.name, asked.results, command=asked.command, limits=asked.limit
+    )
+    print(f"written: {path}, {PAGE}")
+
+
+if __name__ == "__main__":
+    main()

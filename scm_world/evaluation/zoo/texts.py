@@ -1,0 +1,132 @@
+"""Cards of trained policies, as pages in Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from scm_world.evaluation.policies.cards import PolicyAbout
+from scm_world.evaluation.statistics import Interval
+
+SCORES = {"last_fractional_success": "last fractional success", "success": "success"}
+"""Columns of the table, and what they are called."""
+
+COMMAND, RESULTS, LIMITS = "command", "scores", "limits"
+"""Entries of a card that are written when a policy is published."""
+
+_FACTS = ("seed", "backend", "steps", "cpu_s", "wall_s", "device", "threads")
+_APART = (COMMAND, RESULTS, LIMITS, "versions", *_FACTS)
+_LONG = 80  # letters of JSON from which on an entry is folded away
+
+INTRODUCTION = """# Zoo
+
+Trained policies that come with the package. Each is named `zoo:NAME` wherever a policy is named,
+and brings the options of the environment that it was trained with:
+
+```console
+scm-world evaluate zoo:pushing --protocols P0,P5
+```
+
+Scores are means over episodes with 95 % intervals; [Evaluation](evaluation.md) says what the
+protocols are and how scores are estimated. `scm-world list --zoo` lists them. This page is written
+by `python -m benchmarks.baselines.publish`.
+"""
+
+
+def page_text(cards: Mapping[str, PolicyAbout]) -> str:
+    """Write cards as one page.
+
+    Args:
+        cards: By the name of the policy.
+    """
+    parts = [card_text(about, name, level=2) for name, about in cards.items()]
+    return "\n".join([INTRODUCTION, *parts] if parts else [INTRODUCTION, "The zoo is empty.\n"])
+
+
+def card_text(about: PolicyAbout, name: str | None = None, *, level: int = 1) -> str:
+    """Write the card of a policy in Markdown.
+
+    Args:
+        about: What it says of itself.
+        name: Of the policy; that of its task if None.
+        level: Of the heading.
+    """
+    card: Mapping[str, Any] = about.card
+    mark = "#" * level
+    lines = [f"{mark} {name or about.task}", "", *_facts(about)]
+    if COMMAND in card:
+        lines += ["", "```console", str(card[COMMAND]), "```"]
+    if card.get(RESULTS):
+        lines += ["", *_table(card[RESULTS])]
+    if card.get(LIMITS):
+        lines += ["", f"{mark}# Limits", "", *(f"- {limit}" for limit in card[LIMITS])]
+    for entry, value in card.items():
+        if entry not in _APART and _is_long(value):
+            lines += ["", f"<details><summary>{entry}</summary>", "", "```json"]
+            lines += [json.dumps(value, indent=1), "```", "", "</details>"]
+    return "\n".join(lines) + "\n"
+
+
+def best_known(about: PolicyAbout) -> str:
+    """Write the scores of a policy in a line, those of the first engine that it was scored on."""
+    rows: Any = about.card.get(RESULTS) or []
+    metric = next(iter(SCORES))
+    mine = [row for row in rows if row["engine"] == rows[0]["engine"]]
+    return ", ".join(f"{row['protocol']} {row[metric]['value']:.2f}" for row in mine)
+
+
+def _facts(about: PolicyAbout) -> Iterable[str]:
+    """List in a table what a policy is and how it was made."""
+    card: Mapping[str, Any] = about.card
+    versions = card.get("versions")
+    rows: dict[str, Any] = {
+        "task": about.task,
+        "environment": ", ".join(f"`{name}={value!r}`" for name, value in about.env.items())
+        or "as usual",
+        **{name: card[name] for name in _FACTS if card.get(name) is not None},
+        "versions": ", ".join(f"{n} {v}" for n, v in versions.items()) if versions else None,
+        **{n: value for n, value in card.items() if n not in _APART and not _is_long(value)},
+    }
+    yield from ("| | |", "|---|---|")
+    for name, value in rows.items():
+        if value is not None:
+            yield f"| {name} | {_cell(value)} |"
+
+
+def _is_long(value: Any) -> bool:
+    return isinstance(value, dict | list) and len(json.dumps(value)) > _LONG
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    text = value if isinstance(value, str) else f"`{json.dumps(value)}`"
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _table(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
+    """Write scores: a line for each protocol, a column for each engine and score."""
+    listed = list(rows)
+    engines = list(dict.fromkeys(row["engine"] for row in listed))
+    found = {(row["protocol"], row["engine"]): row for row in listed}
+    varied = {row["protocol"]: row.get("varied", "") for row in listed}
+    heads = [f"{word}, {engine}" for engine in engines for word in SCORES.values()]
+    yield f"| {' | '.join(('protocol', 'varied', *heads, 'episodes'))} |"
+    yield "|---|---|" + "---:|" * (len(heads) + 1)
+    for protocol, what in varied.items():
+        cells = [
+            str(_interval(found[protocol, engine][metric])) if (protocol, engine) in found else "–"
+            for engine in engines
+            for metric in SCORES
+        ]
+        counts = {row["n"] for row in listed if row["protocol"] == protocol}
+        episodes = ", ".join(map(str, sorted(counts)))
+        yield f"| {' | '.join((protocol, what.replace('|', chr(92) + '|'), *cells, episodes))} |"
+
+
+def _interval(row: Mapping[str, Any]) -> Interval:
+    ends = {end: float("nan") if row[end] is None else row[end] for end in ("low", "high")}
+    return Interval(row["value"], ends["low"], ends["high"], row["level"], row["n"])

@@ -1,0 +1,160 @@
+"""What a plan is worth: variables, weighted sums of them, or functions of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.geometry.rotations import rotation_matrix
+from scm_world.tasks import Task
+from scm_world.tasks.building import Building
+
+TIPS = "end_effector_positions"
+
+NEAR = 0.1
+"""What a meter between fingertips and block counts beside one between block and goal."""
+
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""Of a cube with edges of length one, shape (8, 3)."""
+
+
+@final
+@dataclass(frozen=True)
+class Score:
+    """A function of the values of some variables, for many rollouts at once.
+
+    Attributes:
+        names: Of the variables.
+        function: Told the values in this order, each of shape (..., *shape) of its variable; gives
+            numbers of shape (...), the higher the better. It can be pickled if it has a name.
+
+    Example:
+        >>> import numpy as np
+        >>> heavy = Score(("tool_block.mass",), np.negative)
+        >>> heavy.of({"tool_block.mass": np.array([[0.02, 0.08]])})
+        array([[-0.02, -0.08]])
+    """
+
+    names: tuple[str, ...]
+    function: Callable[..., Any]
+
+    def of(self, values: Mapping[str, Floats], shape: tuple[int, ...] | None = None) -> Floats:
+        """Compute it.
+
+        Args:
+            values: By name, shape (..., *shape).
+            shape: That what comes out must have; it is not checked if None.
+
+        Returns:
+            Shape (...).
+
+        Raises:
+            ModelError: The function gave something else, or numbers that are not finite.
+        """
+        try:
+            found = np.asarray(self.function(*(values[n] for n in self.names)), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ModelError([f"the score of a plan cannot be computed: {error}"]) from error
+        if not np.isfinite(found).all():
+            names = ", ".join(self.names)
+            raise ModelError([f"the score of a plan is not finite; it is a function of {names}"])
+        if shape is not None and found.shape != shape:
+            problem = f"the score of a plan has shape {found.shape}, not {shape}: one number each"
+            raise ModelError([f"{problem}; values have shape (rollouts, steps, ...)"])
+        return found
+
+
+def as_score(given: Any) -> Score:
+    """Read a score.
+
+    Args:
+        given: The name of a variable, weights by name, or a ``Score``. Of a variable with several
+            numbers their sum counts.
+
+    Raises:
+        UnknownOption: It is none of these.
+
+    Example:
+        >>> import numpy as np
+        >>> score = as_score({"reward": 1.0, "joint_velocities": -0.1})
+        >>> score.of({"reward": np.ones(2), "joint_velocities": np.ones((2, 9))}).round(3)
+        array([0.1, 0.1])
+    """
+    allowed = ("the name of a variable", "weights by name", "a Score")
+    if isinstance(given, Score):
+        return given
+    if isinstance(given, str):
+        return Score((given,), partial(_weighted, (1.0,)))
+    if not isinstance(given, Mapping) or not given:
+        raise UnknownOption("objective", given, allowed)
+    for name, weight in given.items():
+        is_number = isinstance(weight, int | float | np.number) and np.isfinite(weight)
+        if not isinstance(name, str) or not is_number:
+            raise UnknownOption(f"weight of {name}", weight, ("a finite number",))
+    return Score(tuple(given), partial(_weighted, tuple(map(float, given.values()))))
+
+
+def _weighted(weights: tuple[float, ...], *values: Floats) -> Floats:
+    """Add values up; those with more axes than the first one's leading ones are summed."""
+    axes = min(value.ndim for value in values)
+    sums = (value.reshape(*value.shape[:axes], -1).sum(axis=-1) for value in values)
+    total: Floats = sum(weight * value for weight, value in zip(weights, sums, strict=True))
+    return total
+
+
+def nearness(task: Task) -> Score:
+    """Give the score that counts how near everything is to its goal, in minus meters.
+
+    Of blocks that is the mean distance of the eight corners of each block from those of its goal,
+    so that turning counts, and a tenth of the mean distance of the fingertips from the block; of
+    a task without blocks the distance of what is achieved from what is desired.
+
+    Args:
+        task: Of the world.
+    """
+    have, want = task.goal_names()
+    if not isinstance(task, Building):
+        return Score((*have, *want), partial(_apart, len(have)))
+    return Score((TIPS, *have, *want), _boxes_apart)
+
+
+def _apart(count: int, *values: Floats) -> Floats:
+    have, want = (np.concatenate(part, axis=-1) for part in (values[:count], values[count:]))
+    return -np.asarray(np.linalg.norm(have - want, axis=-1))
+
+
+def _boxes_apart(tips: Floats, *values: Floats) -> Floats:
+    """Compute minus the distances of boxes, given as size, position and quaternion each."""
+    half = len(values) // 2
+    total = np.zeros(tips.shape[:-1])
+    fingers = tips.reshape(*tips.shape[:-1], 3, 3)
+    for first in range(0, half, 3):
+        box, goal = (values[at : at + 3] for at in (first, half + first))
+        gaps = np.linalg.norm(corners(*box) - corners(*goal), axis=-1)
+        reach = np.linalg.norm(fingers - box[1][..., None, :], axis=-1)
+        total += gaps.mean(axis=-1) + NEAR * reach.mean(axis=-1)
+    return -total / (half // 3)
+
+
+def corners(size: Floats, position: Floats, orientation: Floats) -> Floats:
+    """Give the corners of boxes.
+
+    Args:
+        size: Edges, shape (..., 3) [m].
+        position: Of the centers, shape (..., 3) [m].
+        orientation: Quaternions, shape (..., 4).
+
+    Returns:
+        Shape (..., 8, 3) [m].
+    """
+    body = CORNERS * size[..., None, :]
+    found: Floats = position[..., None, :] + body @ np.swapaxes(
+        rotation_matrix(orientation), -1, -2
+    )
+    return found

@@ -1,0 +1,347 @@
+"""A recipe says how an agent is trained: a value, with JSON without loss."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, final
+
+from pydantic import (
+    Field,
+    SerializeAsAny,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from scm_world.curricula import Curriculum, as_curriculum, everything, goals
+from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.protocols import chosen
+from scm_world.tasks import TASKS
+from scm_world.training.paper import paper
+from scm_world.training.settings import (
+    ALGORITHMS,
+    Count,
+    Hindsight,
+    Network,
+    Ppo,
+    Rate,
+    Settings,
+    Trials,
+    refused,
+)
+from scm_world.training.tuned import tuned
+from scm_world.variables.spaces import Frozen
+
+FORMAT = "scm_world/recipe/1"
+PRESETS = {"tuned": tuned, "paper": paper}
+"""Recipes that are there for the asking: each gives the fields for a task and an algorithm."""
+
+PUBLISHED: dict[int, Curriculum] = {
+    0: Curriculum(),
+    1: Curriculum(goals("A")),
+    2: Curriculum(everything("A")),
+}
+"""The published curricula: nothing varies, goals, everything."""
+
+CURRICULA = ("0", "1", "2", "the path of a JSON file", "a Curriculum")
+
+RESERVED = ("task", "backend", "render_mode", "normalize_actions")
+"""Options of the environment that a recipe does not set."""
+
+SPARSE = {"weights": "sparse"}
+
+
+@final
+class Recipe(Frozen):
+    """How an agent is trained.
+
+    Attributes:
+        task: Name of the task.
+        algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
+        name: Of the preset that it comes from.
+        env: Options of the environment.
+        curriculum: What is done in it; plain data of a ``Curriculum``.
+        worlds: How many are simulated at once.
+        steps: Control steps of training, in all worlds together.
+        settings: Of the algorithm.
+        rate: Of learning.
+        network: Of the policy, and likewise of the values.
+        scale_rewards: Divide rewards by the running standard deviation of the return (PPO).
+        episode_length: Control steps of an episode while it is trained; as the environment has it
+            if None. Short ones show more beginnings; evaluations are as long as ever.
+        staggered: Cut the first episodes short, each at another step, so that the worlds are
+            not all at the same place of their episodes forever after.
+        critic_warmup: Control steps in which PPO learns the value only.
+        hindsight: Hindsight experience replay, with sparse rewards, if given (SAC and TD3).
+        observations: ``"plain"``, or ``"privileged"``: with every causal parameter.
+        trials: Evaluations while it is trained.
+    """
+
+    task: str
+    algo: Literal["ppo", "sac", "td3"] = "ppo"
+    name: str = "own"
+    env: dict[str, Any] = Field(default_factory=dict)
+    curriculum: dict[str, Any] = Field(default_factory=PUBLISHED[0].as_dict)
+    worlds: Count = 64
+    steps: Count = 1_000_000
+    settings: SerializeAsAny[Settings] = Field(default_factory=Ppo)
+    rate: Rate = Field(default_factory=Rate)
+    network: Network = Field(default_factory=Network)
+    scale_rewards: bool = False
+    episode_length: Count | None = None
+    staggered: bool = True
+    critic_warmup: Annotated[int, Field(ge=0)] = 0
+    hindsight: Hindsight | None = None
+    observations: Literal["plain", "privileged"] = "plain"
+    trials: Trials = Field(default_factory=Trials)
+
+    @field_validator("task")
+    @classmethod
+    def _known(cls, task: str) -> str:
+        if task not in TASKS:
+            raise UnknownOption("task", task, TASKS)
+        return task
+
+    @field_validator("env")
+    @classmethod
+    def _plain(cls, env: dict[str, Any]) -> dict[str, Any]:
+        for name in RESERVED:
+            if name in env:
+                allowed = ("options of what is observed and how the robot is commanded",)
+                raise UnknownOption("option of the environment in a recipe", name, allowed)
+        try:
+            return dict(json.loads(json.dumps(env, allow_nan=False)))
+        except (TypeError, ValueError) as error:
+            raise UnknownOption("env of a recipe", env, (f"plain data: {error}",)) from None
+
+    @field_validator("curriculum", mode="before")
+    @classmethod
+    def _read(cls, given: Any) -> dict[str, Any]:
+        return curriculum_of(given).as_dict()
+
+    @field_validator("settings", mode="before")
+    @classmethod
+    def _of_algorithm(cls, given: Any, info: ValidationInfo) -> Any:
+        kind = ALGORITHMS.get(info.data.get("algo", ""))
+        if kind is None or isinstance(given, kind):
+            return given
+        return kind.model_validate(given)
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        """Refuse what does not go together."""
+        if self.algo == "ppo" and self.hindsight is not None:
+            raise UnknownOption("hindsight with PPO", True, ("none: it needs SAC or TD3",))
+        if self.algo != "ppo":
+            for name in ("scale_rewards", "critic_warmup"):
+                if getattr(self, name):
+                    raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
+            if self.rate.schedule == "adaptive":
+                allowed = ("constant", "linear", "adaptive with PPO")
+                raise UnknownOption(f"schedule of {self.algo}", "adaptive", allowed)
+        kept: Any = self.settings
+        if self.hindsight is not None and kept.n_steps > 1:
+            raise UnknownOption("n_steps with hindsight", kept.n_steps, ("1",))
+        if self.steps < self.round:
+            least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
+            raise UnknownOption("steps", self.steps, (least,))
+        protocols = protocols_of(self.task)
+        if self.trials.protocols:
+            chosen(self.trials.protocols, protocols)
+        return self
+
+    def but(self, **changes: Any) -> Recipe:
+        """Give the same recipe with some changes, as ``recipe`` takes them; None changes nothing.
+
+        Raises:
+            UnknownOption: There is no such field, or a value is impossible.
+        """
+        wanted = {name: value for name, value in changes.items() if value is not None}
+        fields = changed(self.model_dump(mode="json"), wanted)
+        return _made(_with_hindsight(fields, wanted))
+
+    @property
+    def round(self) -> int:
+        """Control steps in all worlds from one update to the next."""
+        kept: Any = self.settings
+        return self.worlds * int(kept.n_steps if self.algo == "ppo" else kept.train_freq)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the environment, with all that follows from the other fields."""
+        found = dict(self.env)
+        if self.observations == "privileged":
+            found["context"] = "observation"
+        if self.hindsight is not None:
+            found |= {"goal_env": True, "task_options": SPARSE}
+        return found
+
+    @property
+    def trained_in(self) -> dict[str, Any]:
+        """Options of the environment while the agent is trained."""
+        if self.episode_length is None:
+            return self.options
+        return {**self.options, "max_episode_length": self.episode_length}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Write it as plain data."""
+        return {"format": FORMAT, **self.model_dump(mode="json")}
+
+    def to_json(self) -> str:
+        """Write it as JSON."""
+        return json.dumps(self.as_dict(), indent=2, allow_nan=False)
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Recipe:
+        """Read what ``as_dict`` wrote.
+
+        Raises:
+            UnknownOption: It is no recipe; it says where.
+        """
+        if not isinstance(data, Mapping) or data.get("format") != FORMAT:
+            raise UnknownOption("format of a recipe", data, (FORMAT,))
+        return _made({name: value for name, value in data.items() if name != "format"})
+
+    @classmethod
+    def load(cls, path: Path | str) -> Recipe:
+        """Read a file with the JSON of a recipe.
+
+        Raises:
+            UnreadableFile: There is none, or it is something else.
+        """
+        try:
+            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            advice = "give a file with the text of Recipe.to_json()"
+            raise UnreadableFile(str(path), str(error), advice) from None
+
+
+def curriculum_of(given: Any) -> Curriculum:
+    """Read a curriculum.
+
+    Args:
+        given: 0, 1 or 2 for the published ones; the path of a JSON file; a ``Curriculum``, a part
+            of one, or plain data. None is 0.
+
+    Raises:
+        UnknownOption: It is none of these.
+        UnreadableFile: It is a path, and there is no curriculum.
+        ModelError: It calls a function of one's own.
+
+    Example:
+        >>> curriculum_of("1").part.kind
+        'goal'
+    """
+    match given:
+        case None:
+            return PUBLISHED[0]
+        case bool() | float():
+            raise UnknownOption("curriculum", given, CURRICULA)
+        case int():
+            if given not in PUBLISHED:
+                raise UnknownOption("curriculum", given, CURRICULA)
+            return PUBLISHED[given]
+        case str() if given.isdecimal():
+            return curriculum_of(int(given))
+        case str() if not given.endswith(".json"):
+            raise UnknownOption("curriculum", given, CURRICULA)
+        case str() | Path():
+            return Curriculum.load(given)
+    return as_curriculum(given)
+
+
+def recipe(
+    task: str,
+    algo: str = "ppo",
+    *,
+    preset: str = "tuned",
+    curriculum: Any = None,
+    **changes: Any,
+) -> Recipe:
+    """Make a recipe from a preset.
+
+    Args:
+        task: Name of the task.
+        algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
+        preset: ``"tuned"``: what we found to work best; ``"paper"``: the published settings.
+        curriculum: See ``curriculum_of``; that of the preset if None.
+        changes: Fields of the ``Recipe`` or settings of the algorithm. What is a dictionary
+            (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names.
+            ``hindsight=True`` stands for its usual settings.
+
+    Raises:
+        UnknownOption: There is no such task, algorithm, preset, curriculum, field or setting, or
+            a value is impossible.
+
+    Example:
+        >>> made = recipe("pushing", curriculum=1, n_steps=32, env={"frame_skip": 5})
+        >>> made.settings.n_steps, made.env["frame_skip"]
+        (32, 5)
+        >>> Recipe.from_dict(made.as_dict()) == made
+        True
+    """
+    for what, given, known in (
+        ("task", task, TASKS),
+        ("algorithm", algo, ALGORITHMS),
+        ("preset", preset, PRESETS),
+    ):
+        if given not in known:
+            raise UnknownOption(what, given, known)
+    fields: dict[str, Any] = {"task": task, "algo": algo, "name": preset}
+    fields |= PRESETS[preset](task, algo)
+    if curriculum is not None:
+        fields["curriculum"] = curriculum
+    return _made(_with_hindsight(changed(fields, changes), changes))
+
+
+def changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Change fields of a recipe.
+
+    Args:
+        fields: As they are; there is ``algo``.
+        changes: Fields, or settings of the algorithm, by name. Those that are ``a.b`` change a
+            part of one.
+
+    Raises:
+        UnknownOption: There is no such field.
+    """
+    found = copy.deepcopy(dict(fields))
+    settings = ALGORITHMS[fields["algo"]].model_fields
+    for name, value in changes.items():
+        first, *rest = name.split(".")
+        if first not in Recipe.model_fields and first in settings:
+            first, rest = "settings", [first, *rest]
+        if first not in Recipe.model_fields:
+            raise UnknownOption("field of a recipe", name, (*Recipe.model_fields, *settings))
+        for part in reversed(rest):
+            value = {part: value}  # noqa: PLW2901 # from the inside out
+        found[first] = _merged(first, found.get(first), value)
+    return found
+
+
+def _with_hindsight(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Sum rewards over one step where goals are made up, unless it was said otherwise."""
+    said = {name.rpartition(".")[2] for name in changes} | {*changes.get("settings", ())}
+    if fields.get("hindsight") is None or fields["algo"] == "ppo" or "n_steps" in said:
+        return dict(fields)
+    return changed(fields, {"n_steps": 1})
+
+
+def _merged(name: str, before: Any, value: Any) -> Any:
+    if name == "hindsight" and isinstance(value, bool):
+        return {} if value else None
+    if name == "curriculum" or not isinstance(value, Mapping) or not isinstance(before, Mapping):
+        return value
+    return {**before, **{k: _merged("", before.get(k), v) for k, v in value.items()}}
+
+
+def _made(fields: Mapping[str, Any]) -> Recipe:
+    try:
+        return Recipe.model_validate(dict(fields))
+    except ValidationError as error:
+        raise refused("a recipe", error) from None

@@ -1,0 +1,171 @@
+"""The folder of a training: what it holds, and whether it is the one that is asked for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, final
+
+from scm_world.errors import UnreadableFile
+from scm_world.output.durable import write_whole
+from scm_world.queries.experiments.versions import versions
+from scm_world.training.checkpoints import checkpoints
+from scm_world.training.recipe import Recipe
+
+FORMAT = "scm_world/run/1"
+LIBRARIES = ("torch", "stable-baselines3")
+
+
+@final
+@dataclass(frozen=True)
+class Run:
+    """A training, and the folder in which it is kept.
+
+    Attributes:
+        folder: Of its files.
+        recipe: How the agent is trained.
+        seed: Of everything that is drawn.
+        backend: Name of the engine.
+        threads: Of torch.
+        device: Where networks are computed.
+        start: Policy file that it begins with, if any.
+    """
+
+    folder: Path
+    recipe: Recipe
+    seed: int
+    backend: str
+    threads: int = 1
+    device: str = "cpu"
+    start: Path | None = None
+
+    @property
+    def about(self) -> Path:
+        """The file that says what it is."""
+        return self.folder / "run.json"
+
+    @property
+    def curve(self) -> Path:
+        """The learning curve."""
+        return self.folder / "progress.csv"
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of its checkpoints."""
+        return self.folder / "checkpoints"
+
+    @property
+    def replay(self) -> Path:
+        """The folder of the replay buffer."""
+        return self.folder / "replay"
+
+    @property
+    def trials(self) -> Path:
+        """The folder of the evaluations while it runs."""
+        return self.folder / "evaluations"
+
+    @property
+    def policy(self) -> Path:
+        """The policy at the end, or at the last checkpoint."""
+        return self.folder / "policy.safetensors"
+
+    @property
+    def best(self) -> Path:
+        """The policy that was best in the evaluations while it ran."""
+        return self.folder / "best.safetensors"
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What decides what is learned, as plain data."""
+        start = None
+        if self.start is not None:
+            try:
+                start = sha256(self.start.read_bytes()).hexdigest()
+            except OSError as error:
+                advice = "give a policy file to start from"
+                raise UnreadableFile(str(self.start), str(error), advice) from None
+        return {
+            "recipe": self.recipe.as_dict(),
+            "seed": self.seed,
+            "backend": self.backend,
+            "threads": self.threads,
+            "device": self.device,
+            "start": start,
+        }
+
+    def card(self, engine: str) -> dict[str, Any]:
+        """Say how its policy is made, as plain data."""
+        found = {**versions(engine), **{name: version(name) for name in LIBRARIES}}
+        return {**self.identity, "versions": found}
+
+    def open(self, engine: str) -> bool:
+        """Begin in the folder, or go on there.
+
+        Args:
+            engine: Name and version of the physics engine.
+
+        Returns:
+            Whether there is a part of this training.
+
+        Raises:
+            UnreadableFile: Another training is in the folder; it says what is different.
+            UnwritableFolder: There is no room, or no permission.
+        """
+        there = read_about(self.about) if self.about.exists() else None
+        if there is not None:
+            wrong = differences(there, self.identity)
+            if wrong:
+                reason = f"it holds another training: {'; '.join(wrong)}"
+                advice = "give another folder, or the same options as before"
+                raise UnreadableFile(str(self.folder), reason, advice)
+            return bool(checkpoints(self.checkpoints))
+        strangers = [one.name for one in self.folder.iterdir()] if self.folder.exists() else []
+        if strangers:
+            reason = f"there is no training in it, but {', '.join(sorted(strangers)[:5])}"
+            raise UnreadableFile(str(self.folder), reason, "give an empty folder, or a new one")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        data = {"format": FORMAT, **self.card(engine)}
+        write_whole(json.dumps(data, indent=2, allow_nan=False), self.about)
+        return False
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """Read what a folder says of its training.
+
+    Raises:
+        UnreadableFile: It is damaged, or of another kind.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise ValueError(f"it is not of the format {FORMAT!r}")
+    except (OSError, ValueError) as error:
+        advice = "give a folder that scm-world train has written, or a new one"
+        raise UnreadableFile(str(path), str(error), advice) from None
+    return data
+
+
+def differences(there: Any, here: Any, where: str = "") -> list[str]:
+    """Say in what plain data are different; what is there besides does not matter.
+
+    Example:
+        >>> differences({"seed": 1, "recipe": {"steps": 8}}, {"seed": 2, "recipe": {"steps": 8}})
+        ['seed is 1 there, and 2 was asked for']
+    """
+    if isinstance(there, Mapping) and isinstance(here, Mapping):
+        names = [*here, *(name for name in there if where and name not in here)]
+        return [
+            line
+            for name in names
+            for line in differences(
+                there.get(name), here.get(name), f"{where}.{name}" if where else name
+            )
+        ]
+    if there == here:
+        return []
+    return [f"{where.removeprefix('recipe.')} is {there!r} there, and {here!r} was asked for"]

@@ -1,0 +1,343 @@
+"""Facts about files of trained policies: what they compute, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import safetensors.numpy
+from policy_samples import RELATIVE, policy, tensors, trained
+
+import scm_world
+from scm_world.errors import (
+    ActionError,
+    ModelError,
+    UnknownOption,
+    UnreadableFile,
+    UnwritableFolder,
+)
+from scm_world.evaluation.policies import as_player, player_from, weights
+from scm_world.evaluation.policies.cards import KEY, OPTIONS, USUAL, PolicyAbout
+from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
+
+SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
+
+
+def by_formula(tensors: dict[str, Any], x: Any, activation: str, output: str) -> Any:
+    """Compute what a network gives, in 64-bit floats and without the module."""
+    last = max(int(name.split(".")[1]) for name in tensors)
+    for number in range(last + 1):
+        weight, bias = (tensors[f"layers.{number}.{part}"] for part in ("weight", "bias"))
+        x = np.asarray(x, np.float64) @ weight.T.astype(np.float64) + bias
+        if number < last:
+            x = np.tanh(x) if activation == "tanh" else np.maximum(x, 0.0)
+    return np.tanh(x) if output == "tanh" else np.clip(x, -1.0, 1.0)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("output", ["clip", "tanh"])
+def test_a_network_computes_what_its_formula_says(activation: str, output: str) -> None:
+    """For both activations and both ways to bound the actions."""
+    given = tensors(56, 32, 16, 9)
+    found = NetworkPolicy.of(
+        given, PolicyAbout(task="pushing", activation=activation, output=output)
+    )
+    expected = by_formula(given, SEEN, activation, output)
+    np.testing.assert_allclose(found(SEEN), expected, atol=1e-7)
+    assert found(SEEN).dtype == np.float32
+    assert found(SEEN).shape == (5, 4, 9)
+    assert expected.std() > 0.1
+
+
+def test_an_observation_among_others_gets_the_action_that_it_gets_alone() -> None:
+    """Bit for bit, whatever the batch."""
+    found = policy()
+    together = found(SEEN)
+    for place in np.ndindex(SEEN.shape[:2]):
+        np.testing.assert_array_equal(found(SEEN[place]), together[place])
+    np.testing.assert_array_equal(found.predict(SEEN[0])[0], together[0])
+
+
+def test_parts_of_an_observation_are_joined_in_their_order() -> None:
+    """The file says which ones and in which order, not the dictionary."""
+    found = policy(inputs=("context", "observation"))
+    parts = {"observation": SEEN[..., 6:], "context": SEEN[..., :6], "achieved_goal": SEEN}
+    np.testing.assert_array_equal(found(parts), policy()(SEEN))
+
+
+def test_observations_that_do_not_fit_are_refused() -> None:
+    """Other numbers of components, other parts, one array instead of parts."""
+    with pytest.raises(ActionError, match=r"observes 56 numbers, got the shape \(55,\)"):
+        policy()(np.zeros(55))
+    with pytest.raises(ActionError, match="observes one array, got the parts"):
+        policy()({"observation": np.zeros(56)})
+    two = policy(inputs=("observation", "context"))
+    with pytest.raises(ActionError, match=r"the parts \['observation', 'context'\], got"):
+        two({"observation": np.zeros(56)})
+    with pytest.raises(ActionError, match="by name"):
+        two(np.zeros(56))
+    with pytest.raises(UnknownOption, match="deterministic"):
+        policy().predict(np.zeros(56), deterministic=False)
+
+
+def test_a_file_has_everything(tmp_path: Path) -> None:
+    """Weights, deviations, value, and what is said come back bit for bit."""
+    given = {
+        **tensors(56, 16, 9),
+        **tensors(56, 8, 1, prefix="value.layers"),
+        "log_std": np.linspace(-1, 0, 9, dtype=np.float32),
+    }
+    about = PolicyAbout(
+        task="picking", env=RELATIVE, activation="relu", output="tanh", card={"seed": 3}
+    )
+    path = save_policy(tmp_path / "a.safetensors", given, about)
+    found = load_policy(tmp_path / "a.safetensors")
+    assert path == tmp_path / "a.safetensors"
+    assert found.about == about
+    assert found.tensors().keys() == given.keys()
+    for name, array in given.items():
+        np.testing.assert_array_equal(found.tensors()[name], array)
+    again = save_policy(tmp_path / "b.safetensors", found)
+    assert again.read_bytes() == path.read_bytes()
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(found))(SEEN), found(SEEN))  # noqa: S301
+
+
+def test_other_programs_can_read_it(tmp_path: Path) -> None:
+    """It is a safetensors file with plain names, and JSON in its metadata."""
+    path = trained(tmp_path / "a.safetensors")
+    found = safetensors.numpy.load_file(path)
+    assert found["layers.0.weight"].shape == (16, 56)
+    with safetensors.safe_open(path, framework="np") as file:
+        about = json.loads(file.metadata()[KEY])
+    assert about["format"] == "scm_world.policy"
+    assert about["env"] == RELATIVE
+
+
+def damaged(path: Path, how: str) -> None:
+    """Damage a file."""
+    content = path.read_bytes()
+    match how:
+        case "cut short":
+            path.write_bytes(content[:-100])
+        case "empty":
+            path.write_bytes(b"")
+        case "text":
+            path.write_text("no policy" * 100)
+        case "header":
+            path.write_bytes(content[:8] + b"x" * 40 + content[48:])
+        case "foreign":
+            path.write_bytes(safetensors.numpy.save(tensors(56, 9)))
+        case "format":
+            said = json.dumps({"format": "other", "version": 1, "task": "pushing"})
+            path.write_bytes(safetensors.numpy.save(tensors(56, 9), {KEY: said}))
+        case "version":
+            said = policy().about.text().replace('"version": 1', '"version": 2')
+            path.write_bytes(safetensors.numpy.save(tensors(56, 9), {KEY: said}))
+        case "gone":
+            path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("how", "match"),
+    [
+        ("cut short", "damaged"),
+        ("empty", "damaged"),
+        ("text", "damaged"),
+        ("header", "damaged"),
+        ("foreign", "has no 'scm_world'"),
+        ("format", "format: Input should be 'scm_world.policy'"),
+        ("version", "version: Input should be 1"),
+        ("gone", "No such file"),
+    ],
+)
+def test_damaged_and_foreign_files_are_refused(tmp_path: Path, how: str, match: str) -> None:
+    """The error names the file, what is wrong with it, and what to give."""
+    path = trained(tmp_path / "a.safetensors")
+    damaged(path, how)
+    with pytest.raises(UnreadableFile, match=match) as caught:
+        as_player(path)
+    assert "a.safetensors" in str(caught.value)
+    assert "give " in str(caught.value)
+
+
+def test_a_file_that_is_too_large_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its size is looked at first."""
+    path = trained(tmp_path / "a.safetensors")
+    monkeypatch.setattr(weights, "LARGEST", 1000)
+    with pytest.raises(UnreadableFile, match="more than 1000 bytes"):
+        load_policy(path)
+
+
+FULL = tensors(56, 16, 9)
+NAN = np.full(9, np.nan, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        ({}, "no tensor 'layers.0.weight'"),
+        (tensors(56, 16, 8), "has to give 9 numbers, not 8"),
+        ({**FULL, "layers.1.weight": FULL["layers.1.weight"][:, :-1]}, "gives 16 numbers and the"),
+        ({**FULL, "layers.1.bias": NAN}, r"layers\.1: .*finite"),
+        ({**FULL, "layers.1.bias": FULL["layers.1.bias"][:-1]}, r"got \(9, 16\) and \(8,\)"),
+        ({**FULL, "log_std": NAN}, "log_std: expected"),
+        ({**FULL, "other": NAN}, "'other' is no tensor of a policy"),
+        ({k: v for k, v in FULL.items() if k != "layers.0.bias"}, "no tensor 'layers.0.bias'"),
+        ({**FULL, "log_std": np.zeros(9)}, "log_std: expected an array of float32, got float64"),
+        ({**FULL, **tensors(55, 1, prefix="value.layers")}, "take 56 numbers, not 55"),
+        ({**FULL, **tensors(56, 2, prefix="value.layers")}, "give 1 numbers, not 2"),
+    ],
+)
+def test_tensors_that_do_not_fit_are_refused(given: dict[str, Any], match: str) -> None:
+    """Before anything is written, and after anything was read."""
+    with pytest.raises(ModelError, match=match):
+        save_policy("never.safetensors", given, {"task": "pushing"})
+
+
+@pytest.mark.parametrize(
+    ("about", "match"),
+    [
+        ({}, "task: Field required"),
+        ({"task": "pushing", "env": {"start": {}}}, "'start' is none of the options"),
+        ({"task": "pushing", "activation": "gelu"}, "activation: "),
+        ({"task": "pushing", "inputs": ("a", "a")}, "each once"),
+        ({"task": "pushing", "card": {"x": object()}}, "card"),
+        ({"task": "pushing", "colour": 1}, "colour: "),
+    ],
+)
+def test_what_is_said_of_a_policy_is_checked(about: dict[str, Any], match: str) -> None:
+    """Every field has to be what the format says."""
+    with pytest.raises(ModelError, match=match):
+        save_policy("never.safetensors", FULL, about)
+
+
+def test_files_are_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that is full leaves what was there, and says so; another ending is refused."""
+    path = trained(tmp_path / "a.safetensors")
+    before = path.read_bytes()
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("scm_world.output.durable.os.fsync", full)
+    with pytest.raises(UnwritableFolder, match="No space left"):
+        save_policy(path, policy(seed=5))
+    assert path.read_bytes() == before
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]
+    with pytest.raises(UnknownOption, match=r"\.safetensors"):
+        save_policy(tmp_path / "a.pt", policy())
+
+
+def test_options_of_the_environment_exist() -> None:
+    """The format knows the options of the environment by their names, and what is usual."""
+    assert set(OPTIONS) == USUAL.keys()
+    about = PolicyAbout(task="pushing", env={"include": ("joint_torques",), "frame_skip": 10})
+    assert about.option("include") == ["joint_torques"]
+    assert about.option("context") == "none"
+    assert about.unusual(OPTIONS) == {"include": ["joint_torques"]}
+    assert PolicyAbout.of(about.text()) == about
+    assert about.with_card(seed=1).card == {"seed": 1}
+
+
+# --- as players -------------------------------------------------------------------------------
+
+
+def make(task: str = "Pushing", **options: Any) -> Any:
+    """Make a short environment, as a policy was trained in."""
+    made = {"backend": "fake", "max_episode_length": 6, **RELATIVE, **options}
+    return gymnasium.make(f"scm_world/{task}-v0", disable_env_checker=True, **made)
+
+
+def first_action(player: Any, env: Any) -> Any:
+    """Let a player begin an episode."""
+    observation, _ = env.reset(seed=0)
+    player.begin(env.unwrapped)
+    return player.act(observation)
+
+
+def test_a_file_a_folder_and_a_policy_in_memory_act_alike(tmp_path: Path) -> None:
+    """The folder of a run stands for its best policy, or its last one if there is no other."""
+    env = make()
+    path = trained(tmp_path / "run" / "policy.safetensors")
+    found = first_action(as_player(path), env)
+    np.testing.assert_array_equal(first_action(as_player(tmp_path / "run"), env), found)
+    np.testing.assert_array_equal(first_action(as_player(load_policy(path)), env), found)
+    assert as_player(tmp_path / "run").about["name"] == "run"
+    trained(tmp_path / "run" / "best.safetensors", seed=7)
+    best = first_action(as_player(tmp_path / "run"), env)
+    assert not np.array_equal(best, found)
+    with pytest.raises(UnreadableFile, match=r"neither best\.safetensors nor policy"):
+        as_player(tmp_path)
+
+
+def test_a_policy_is_made_again_from_what_results_say(tmp_path: Path) -> None:
+    """Unless its file is another one by now."""
+    path = trained(tmp_path / "run" / "policy.safetensors")
+    for given in (path, path.parent):
+        about = as_player(given).about
+        assert player_from(about).about["sha256"] == about["sha256"]
+    trained(path, seed=1)
+    with pytest.raises(UnreadableFile, match="another file"):
+        player_from(about)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("delta_scale", 0.2), ("frame_skip", 3), ("include", ["joint_torques"])],
+)
+def test_other_environments_are_refused(option: str, value: Any) -> None:
+    """The error says which option is another one, and what it was in the training."""
+    with pytest.raises(UnknownOption, match=f"{option} .* as in its training"):
+        first_action(as_player(policy(env=RELATIVE)), make(**{option: value}))
+
+
+def test_other_tasks_are_refused_by_what_they_show() -> None:
+    """As many numbers as it observes there must be."""
+    with pytest.raises(ActionError, match="observes 56 numbers"):
+        first_action(as_player(policy(env=RELATIVE)), make("Stacking2"))
+
+
+def test_an_onnx_network_may_say_what_it_was_trained_for(tmp_path: Path) -> None:
+    """It is in its metadata, and checked like that of a policy file."""
+    onnx: Any = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    helper, numbers = onnx.helper, onnx.TensorProto.FLOAT
+    weight = np.ascontiguousarray(FULL["layers.0.weight"].T[:, :9])
+    graph = helper.make_graph(
+        [helper.make_node("MatMul", ["x", "w"], ["y"])],
+        "policy",
+        [helper.make_tensor_value_info("x", numbers, [1, 56])],
+        [helper.make_tensor_value_info("y", numbers, [1, 9])],
+        [onnx.numpy_helper.from_array(weight, "w")],
+    )
+    opset = [helper.make_opsetid("", 13)]
+    model = helper.make_model(graph, opset_imports=opset, ir_version=8)
+    about = PolicyAbout(task="pushing", env=RELATIVE)
+    helper.set_model_props(model, {KEY: about.text()})
+    onnx.save(model, tmp_path / "a.onnx")
+    player: Any = as_player(tmp_path / "a.onnx")
+    assert player.made_for == about
+    assert first_action(player, make()).shape == (9,)
+    with pytest.raises(UnknownOption, match=r"action_mode for 'a\.onnx'"):
+        first_action(
+            player, make(action_mode="delta_end_effector_positions", delta_origin="command")
+        )
+    helper.set_model_props(model, {KEY: "{}"})
+    onnx.save(model, tmp_path / "b.onnx")
+    with pytest.raises(UnreadableFile, match="task: Field required"):
+        as_player(tmp_path / "b.onnx")
+
+
+def test_the_names_are_public() -> None:
+    """What users write and read files with is where its documentation says."""
+    assert scm_world.evaluation.policies.load_policy is load_policy
+    assert scm_world.evaluation.policies.save_policy is save_policy

@@ -1,0 +1,187 @@
+"""Facts about trained policies in evaluations: each acts in the form in which it was trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluation_samples import SHORT
+from policy_samples import RELATIVE, policy, trained
+
+from scm_world.errors import EvaluationError, UnknownOption
+from scm_world.evaluation import Evaluation, WorldPolicy, check, evaluate, merge, why
+from scm_world.evaluation.forms import shared_options, task_for
+from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.policies import PolicyAbout
+from scm_world.evaluation.setups import prepare
+
+OTHER = {**RELATIVE, "context": "privileged", "max_episode_length": 16}
+INPUTS = ["context", "observation"]
+CONTEXT = 130  # numbers of the parameters of picking
+
+
+def small(policy: Any, protocols: Any = "P0,P6", **options: Any) -> Evaluation:
+    """Evaluate a few short episodes without physics."""
+    return evaluate(policy, protocols, **{"n": 3, "backend": "fake", "env": SHORT, **options})
+
+
+@pytest.fixture
+def agents(tmp_path: Path) -> dict[str, Any]:
+    """Two policies of two forms, and two that bring none."""
+    first = trained(tmp_path / "run" / "policy.safetensors", task="picking")
+    second = trained(
+        tmp_path / "b.safetensors", 56 + CONTEXT, task="picking", env=OTHER, inputs=INPUTS
+    )
+    return {"one": str(first.parent), "two": str(second), "grasp": "grasp", "still": "still"}
+
+
+def test_agents_of_several_forms_meet_the_same_draws(agents: dict[str, Any]) -> None:
+    """Task and options come from the files, and paired differences are those of one world."""
+    found = small(agents)
+    assert found.task == "picking"
+    drawn = [column for name, column in found.columns.items() if name.startswith("drawn ")]
+    assert drawn
+    for name in ("two", "grasp", "still"):
+        for protocol in ("P0", "P6"):
+            mine, its = (found.only(agent=a, protocol=protocol).columns for a in ("one", name))
+            for column in mine:
+                if column.startswith("drawn "):
+                    np.testing.assert_array_equal(mine[column], its[column])
+    assert found.difference("one", "grasp", "P6").n == 3
+    assert len(set(found.columns["hash"].tolist())) > 8
+
+
+def test_an_agent_does_among_others_what_it_does_alone(agents: dict[str, Any]) -> None:
+    """Bit for bit, in an environment that was made by hand, too."""
+    found = small(agents)
+    for name in ("one", "two", "still"):
+        env = {"one": RELATIVE, "two": OTHER, "still": {}}[name]
+        alone = small({name: agents[name]}, task="picking", env={**env, **SHORT})
+        np.testing.assert_array_equal(alone.columns["hash"], found.only(agent=name).columns["hash"])
+
+
+def test_results_say_how_each_agent_acted(agents: dict[str, Any], tmp_path: Path) -> None:
+    """They can be played again, also from a file and in part."""
+    found = small(agents)
+    said = {one["agent"]: one.get("env") for one in found.about["agents"]}
+    assert said == {
+        "one": RELATIVE,
+        "two": {**RELATIVE, "context": "privileged"},
+        "grasp": None,
+        "still": None,
+    }
+    assert found.about["env"] == SHORT
+    found.save(tmp_path / "results", kind="csv")
+    again = Evaluation.load(tmp_path / "results")
+    assert check(again, episodes=len(again)).wrong == ()
+    assert why(again, "P6", 1, agent="two").others or why(again, "P6", 1, agent="two").left_out
+
+
+def test_evaluations_of_policies_can_be_merged(agents: dict[str, Any]) -> None:
+    """What is an agent's own does not make two tables different."""
+    parts = [small({name: agents[name]}, task="picking") for name in ("one", "two", "still")]
+    both = merge(parts)
+    at_once = small({name: agents[name] for name in ("one", "two", "still")})
+    assert both.about["agents"] == at_once.about["agents"]
+    for name in ("one", "two", "still"):
+        assert both.only(agent=name) == at_once.only(agent=name)
+
+
+def test_finished_episodes_are_used_again(agents: dict[str, Any], tmp_path: Path) -> None:
+    """But not those of another policy in a file of the same name."""
+    first = small(agents, out=tmp_path / "out")
+    parts = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "parts").iterdir()}
+    assert small(agents, out=tmp_path / "out") == first
+    assert parts == {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "parts").iterdir()}
+    trained(Path(agents["one"]) / "policy.safetensors", seed=3, task="picking")
+    assert small(agents, out=tmp_path / "out") != first
+
+
+def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:
+    """On the engine that steps many worlds at once; the rows are the same bits."""
+    setup = prepare(
+        {"a": policy(env=RELATIVE)},
+        "P0,P7",
+        task=None,
+        n=3,
+        seeds=2,
+        backend="mujoco",
+        env={"max_episode_length": 5},
+        trusted=None,
+    )
+    rows, crews = [], []
+    for threads in (1, 3):
+        bench = Bench(setup, None, threads)
+        rows.append([row for shard in setup.shards() for row in bench(shard)])
+        crews.append([lockstep._crew is not None for lockstep in bench.locksteps.values()])
+        bench.close()
+    assert rows[0] == rows[1]
+    assert crews == [[False], [True]]
+
+
+# --- what counts ------------------------------------------------------------------------------
+
+
+def test_what_is_given_has_to_fit_the_policy() -> None:
+    """The error says who was trained with what; the length may be another one."""
+    mine = {"mine": policy(env={**RELATIVE, "frame_skip": 5})}
+    for wrong in ({"context": "privileged"}, {"delta_scale": 1.0}, {"frame_skip": 10}):
+        with pytest.raises(UnknownOption, match=f"{next(iter(wrong))} for 'mine' cannot be"):
+            small(mine, env=wrong)
+    found = small(mine, env={**SHORT, **RELATIVE, "preset": "precise"})
+    assert found.about["env"] == {**SHORT, "preset": "precise", "frame_skip": 5}
+    assert set(found.columns["steps"].tolist()) == {16}
+
+
+def test_options_are_for_agents_that_bring_none() -> None:
+    """A policy in memory may act by torques beside one that was trained with relative joints."""
+    seen = []
+
+    def world_policy(world: Any) -> Any:
+        seen.append(world.action_mode)
+        return np.zeros(9)
+
+    two = {"a": policy(env=RELATIVE), "b": WorldPolicy(world_policy)}
+    found = small(two, env={**SHORT, "action_mode": "joint_torques"})
+    assert set(seen) == {"joint_torques"}
+    assert found.about["env"]["action_mode"] == "joint_torques"
+    assert found.about["agents"][0]["env"] == RELATIVE
+    with pytest.raises(UnknownOption, match="frame_skip for 'a'"):
+        small(two, env={"frame_skip": 3})
+
+
+def said(**about: Any) -> PolicyAbout:
+    """Say what a policy was trained for."""
+    return PolicyAbout(**{"task": "pushing", **about})
+
+
+def test_what_is_shared_must_be_the_same() -> None:
+    """Two policies that cannot be in one evaluation are named, with what differs."""
+    two = [("a", said(env={"frame_skip": 3})), ("b", said())]
+    with pytest.raises(UnknownOption, match="a with 3; b with 10: evaluate them apart"):
+        shared_options(None, two)
+    two = [("a", said(env={"max_episode_length": 100})), ("b", said()), ("c", None)]
+    with pytest.raises(UnknownOption, match="give max_episode_length in env"):
+        shared_options(None, two)
+    assert shared_options({"max_episode_length": 50}, two) == {"max_episode_length": 50}
+    assert shared_options(None, two[::2]) == {"max_episode_length": 100}
+    assert shared_options(None, [("c", None)]) == {}
+
+
+def test_the_task_is_that_of_the_policies() -> None:
+    """Unless another one is given; several tasks have to be told apart."""
+    picking, reaching = ("a", said(task="picking")), ("b", said(task="reaching"))
+    assert task_for(None, [picking, ("c", None)]) == "picking"
+    assert task_for("general", [picking]) == "general"
+    assert task_for(None, [("c", None)]) == "pushing"
+    with pytest.raises(UnknownOption, match="'picking', 'reaching'"):
+        task_for(None, [picking, reaching])
+
+
+def test_another_task_needs_as_many_numbers() -> None:
+    """A policy can be tried in a task that it was not trained for, if it can see it."""
+    assert small({"a": policy(env=RELATIVE)}, task="picking").task == "picking"
+    with pytest.raises(EvaluationError, match=r"agent a, run 0: .*observes 56 numbers"):
+        small({"a": policy(env=RELATIVE)}, task="stacking2")

@@ -1,0 +1,175 @@
+"""Facts about the zoo: policies with cards, and how they get there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from policy_samples import RELATIVE, tensors, trained
+
+from benchmarks.baselines import publish as publishing
+from benchmarks.baselines.publish import command_of, publish
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation import check, evaluate
+from scm_world.evaluation.policies import as_player, load_policy, player_from, save_policy
+from scm_world.evaluation.zoo import card, card_text, page, shelf, zoo
+from scm_world.evaluation.zoo.texts import best_known
+
+PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
+CARD = {
+    "recipe": {
+        "task": "pushing",
+        "algo": "ppo",
+        "name": "tuned",
+        "steps": 1000,
+        "env": {"delta_scale": 0.1, "delta_origin": "measured"},
+    },
+    "seed": 4,
+    "backend": "mujoco",
+    "steps": 1024,
+    "cpu_s": 12.345678,
+    "versions": {"numpy": "2.0", "mujoco": "3.3"},
+    "trial": {"steps": 512, "scores": {"P0": 0.5}},
+}
+COMMAND = "scm-world train pushing --algo ppo --preset tuned --backend mujoco --seed 4 --steps 1000"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Have an empty zoo in a folder of its own."""
+    made = tmp_path / "zoo"
+    made.mkdir()
+    monkeypatch.setattr(shelf, "FOLDER", made)
+    return made
+
+
+def evaluated(path: Path, out: Path, protocols: str = "P0,P5", **options: Any) -> Path:
+    """Evaluate a policy in short episodes without physics, and give the folder."""
+    env = {"max_episode_length": 5}
+    made: Any = {"n": 2, "backend": "fake", "env": env, **options}
+    evaluate({"a": str(path), "still": "still"}, protocols, **made).save(out, kind="csv")
+    return out
+
+
+@pytest.fixture
+def published(folder: Path, tmp_path: Path) -> str:
+    """Publish a policy, and give its name."""
+    path = trained(tmp_path / "run" / "policy.safetensors", card=CARD)
+    results = evaluated(path, tmp_path / "results")
+    publish(path.parent, "small", [results], page=tmp_path / "zoo.md", limits=["It does nothing."])
+    return "zoo:small"
+
+
+def test_a_published_policy_acts_by_its_name(published: str) -> None:
+    """Wherever a policy is named; results name it, and it is made again from them."""
+    about = as_player(published).about
+    assert (about["kind"], about["name"]) == ("zoo", "zoo:small")
+    assert player_from(about).about == about
+    found = evaluate(published, "P0", n=2, backend="fake", env={"max_episode_length": 5})
+    assert found.agents == ("small",)
+    assert check(found, episodes=2).wrong == ()
+    shelf.path_of(published).write_bytes(
+        trained(shelf.FOLDER / "other.safetensors", seed=1).read_bytes()
+    )
+    with pytest.raises(UnreadableFile, match="another file"):
+        player_from(about)
+
+
+def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_path: Path) -> None:
+    """As data, as text, in one line, and on the page of all of them."""
+    about = card(published)
+    assert zoo() == {published: about}
+    assert card("small") == about
+    assert about.card["command"] == COMMAND
+    scores: Any = about.card["scores"]
+    assert [(row["engine"], row["protocol"], row["n"]) for row in scores] == [
+        ("fake", "P0", 2),
+        ("fake", "P5", 2),
+    ]
+    assert scores[0]["last_fractional_success"]["n"] == 2
+    text = card_text(about, published)
+    for part in (
+        "# zoo:small\n",
+        COMMAND,
+        "| seed | 4 |",
+        "| steps | 1,024 |",
+        "| cpu_s | 12.35 |",
+        "numpy 2.0, mujoco 3.3",
+        "| protocol | varied | last fractional success, fake | success, fake | episodes |",
+        "- It does nothing.",
+        "<summary>recipe</summary>",
+        '| trial | `{"steps": 512, "scores": {"P0": 0.5}}` |',
+        "`delta_scale=0.1`",
+    ):
+        assert part in text
+    assert best_known(about).startswith("P0 0.")
+    assert (tmp_path / "zoo.md").read_text() == page()
+    assert "## zoo:small" in page()
+
+
+def test_the_page_shows_the_zoo_of_the_package() -> None:
+    """It was written with the policies that are there."""
+    assert PAGE.read_text(encoding="utf-8") == page()
+
+
+def test_every_policy_of_the_package_is_small_and_has_a_card() -> None:
+    """With command, scores on both engines, and a task in whose environment it can act."""
+    for name, about in zoo().items():
+        assert shelf.path_of(name).stat().st_size < 1_000_000
+        assert about.card["command"]
+        rows: Any = about.card["scores"]
+        assert {"mujoco", "bullet"} >= {row["engine"] for row in rows} >= {"mujoco"}
+        assert evaluate(name, "P0", n=1, backend="fake", env={"max_episode_length": 2}).task
+
+
+def test_names_that_are_not_there_are_refused(published: str) -> None:
+    """The error lists those that are."""
+    with pytest.raises(UnknownOption, match="did you mean 'zoo:small'"):
+        as_player("zoo:smal")
+    with pytest.raises(UnknownOption, match="name in the zoo"):
+        publish(Path("any"), "../out", [])
+
+
+def test_results_of_another_policy_are_not_published(folder: Path, tmp_path: Path) -> None:
+    """Nor the same scores twice, nor a policy without its command; nothing is written."""
+    path = trained(tmp_path / "a.safetensors", card=CARD)
+    results = evaluated(path, tmp_path / "results")
+    page_path = tmp_path / "zoo.md"
+    with pytest.raises(ModelError, match="P0 on fake is there twice"):
+        publish(path, "small", [results, results], page=page_path)
+    with pytest.raises(UnreadableFile, match="no evaluation of this policy"):
+        publish(trained(path, seed=9, card=CARD), "small", [results], page=page_path)
+    with pytest.raises(UnknownOption, match="--command"):
+        command_of({})
+    assert not page_path.exists()
+    assert not list(folder.iterdir())
+
+
+def test_large_policies_are_not_published(folder: Path, tmp_path: Path) -> None:
+    """A value network is left out; what is then still too large is refused."""
+    given = {**tensors(56, 8, 9), **tensors(56, 500, 500, 1, prefix="value.layers")}
+    about = {"task": "pushing", "env": RELATIVE, "card": CARD}
+    path = save_policy(tmp_path / "a.safetensors", given, about)
+    page_path = tmp_path / "zoo.md"
+    results = [evaluated(Path(str(path)), tmp_path / "results", "P0")]
+    small = publish(Path(str(path)), "small", results, page=page_path)
+    assert small.stat().st_size < 20_000
+    assert load_policy(small).value == ()
+    publishing_limit = publishing.LARGEST
+    assert publishing_limit == 1_000_000
+    wide = save_policy(tmp_path / "b.safetensors", tensors(56, 4000, 9), about)
+    results = [evaluated(Path(str(wide)), tmp_path / "wide", "P0")]
+    with pytest.raises(UnknownOption, match="size of a policy"):
+        publish(Path(str(wide)), "wide", results, page=page_path)
+    assert [one.name for one in folder.iterdir()] == ["small.safetensors"]
+
+
+def test_the_command_line_lists_the_zoo(published: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Name, task, seed, scores and command."""
+    from scm_world.cli.listing import show_zoo
+
+    show_zoo()
+    shown = " ".join(capsys.readouterr().out.split())
+    for part in ("zoo:small", "pushing", " 4 ", "P0 0."):
+        assert part in shown

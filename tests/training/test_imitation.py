@@ -1,0 +1,272 @@
+"""Learning by imitation: what is shown, and what is made of it. Most of it needs no torch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import scm_world  # noqa: F401 # registers the environments
+from scm_world.env import ScmWorldEnv
+from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
+from scm_world.evaluation.recording import record
+from scm_world.training.imitation import clone, lesson
+from scm_world.training.imitation.cloning import given_demonstrations
+from scm_world.training.imitation.demonstrations import (
+    Demonstrations,
+    Hands,
+    School,
+    joined,
+)
+from scm_world.training.imitation.fitting import whitening
+
+SHORT = {"max_episode_length": 12}
+QUICK: dict[str, Any] = {
+    "env": SHORT,
+    "keep": 0.0,
+    "episodes": 2,
+    "more": 1,
+    "updates": 20,
+    "batch": 8,
+    "network": {"hidden": [8]},
+    "trials": {"protocols": []},
+}
+
+
+def shown(n: int = 2, learner: NetworkPolicy | None = None, **changes: Any) -> Demonstrations:
+    """Let a teacher show a few short episodes."""
+    school = School(lesson("picking", **{**QUICK, **changes}), backend="mujoco", seed=0)
+    try:
+        return school.shown(0, range(n), learner)
+    finally:
+        school.close()
+
+
+def constant(action: float) -> NetworkPolicy:
+    """Make a network that always gives one action."""
+    tensors = {
+        "layers.0.weight": np.zeros((9, 56), np.float32),
+        "layers.0.bias": np.full(9, action, np.float32),
+    }
+    return NetworkPolicy.of(tensors, {"task": "picking"})
+
+
+def test_demonstrations_follow_from_the_seed_and_the_number() -> None:
+    """An episode is the same, whichever ones are shown with it."""
+    both, school = shown(2), School(lesson("picking", **QUICK), backend="mujoco", seed=0)
+    alone = school.shown(0, range(1, 2))
+    school.close()
+    assert both.observations.shape == (24, 56)
+    assert both.actions.shape == (24, 9)
+    np.testing.assert_array_equal(both.actions[12:], alone.actions)
+    np.testing.assert_array_equal(both.observations[12:], alone.observations)
+
+
+def test_a_quiet_teacher_is_itself() -> None:
+    """Without noise, what is shown leads from each observation to the next one."""
+    first = shown(1, noise=0.0, protocols=["P0"])
+    env = ScmWorldEnv("picking", **lesson("picking", **QUICK).env)
+    observation: Any = env.reset(seed=123)[0]  # nothing varies
+    for seen, done in zip(first.observations, first.actions, strict=True):
+        np.testing.assert_allclose(observation, seen, atol=1e-6)
+        observation = env.step(done)[0]
+    env.close()
+
+
+def test_who_learns_acts_but_does_not_teach() -> None:
+    """The network's own actions change what is seen, and are no example of what to do."""
+    alone = shown(1, noise=0.0)
+    together = shown(1, constant(0.9), noise=0.0, share=0.5, stretch=1.0)
+    assert not np.array_equal(alone.observations, together.observations)
+    assert not (together.actions == np.float32(0.9)).all(axis=1).any()
+
+
+def test_hands_shake_as_much_as_was_asked() -> None:
+    """The noise has, over episodes, a standard deviation between nothing and the largest one."""
+    hands = [Hands(lesson("picking", noise=0.1), np.random.default_rng(i)) for i in range(40)]
+    for each in hands:
+        for _ in range(10):  # the noise comes to its size
+            each.action(np.zeros(9), None, None)
+    drawn = np.array([each.action(np.zeros(9), None, None) for each in hands])
+    assert 0.03 < drawn.std() < 0.09  # 0.1 / sqrt(3) is 0.058
+
+
+def test_what_ends_badly_is_left_out() -> None:
+    """Only episodes that end well are pairs; how the others ended is known."""
+    found = shown(2, keep=1.0)
+    assert len(found) == 0
+    assert found.scores.shape == (2,)
+    with pytest.raises(ModelError, match=r"none of 2 demonstrations ended well enough"):
+        joined([found])
+
+
+def test_demonstrations_come_back_from_a_file(tmp_path: Path) -> None:
+    """A file has all of it, and one that is cut short is refused by name."""
+    first, path = shown(1), tmp_path / "first.npz"
+    first.save(path)
+    again = Demonstrations.load(path)
+    for name, array in vars(first).items():
+        np.testing.assert_array_equal(getattr(again, name), array)
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(UnreadableFile, match=r"first\.npz.*damaged"):
+        Demonstrations.load(path)
+
+
+def test_whitening_makes_small_things_count() -> None:
+    """Features have a variance of one, also of a small difference; what is constant is left out."""
+    random = np.random.default_rng(0)
+    place = random.normal(size=(4000, 1))
+    points = np.c_[place, place + 0.01 * random.normal(size=(4000, 1)), np.ones(4000)]
+    turn, shift = whitening(points)
+    features = points @ turn.T + shift
+    np.testing.assert_allclose(np.cov(features.T), np.eye(2), atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"teacher": "nobody"}, "no teacher is called|teacher"),
+        ({"protocols": ["P77"]}, "P77"),
+        ({"episode": 3}, "field of a lesson"),
+        ({"episodes": 0}, "episodes of a lesson"),
+        ({"noise": -0.1}, "noise of a lesson"),
+        ({"env": {"goal_env": True}}, "goal_env of a lesson"),
+        ({"env": {"backend": "mujoco"}}, "option of the environment"),
+        ({"trials": {"protocols": ["P99"]}}, "P99"),
+    ],
+)
+def test_impossible_lessons_are_refused(changes: dict[str, Any], message: str) -> None:
+    """An error names what was asked for."""
+    with pytest.raises(UnknownOption, match=message):
+        lesson("picking", **changes)
+
+
+@pytest.mark.parametrize(
+    ("task", "env", "message"),
+    [("reaching", {}, "needs blocks"), ("picking", {"action_mode": "joint_torques"}, "torques")],
+)
+def test_a_teacher_that_cannot_teach_says_so_at_once(
+    task: str, env: dict[str, Any], message: str
+) -> None:
+    """Before any episode: it knows nothing of the task, or cannot act in such units."""
+    usual = {"delta_scale": 1.0, "delta_origin": "command", **env} if env else {}
+    with pytest.raises(ActionError, match=message):
+        School(lesson(task, env=usual), backend="mujoco", seed=0)
+
+
+def test_an_unknown_task_is_refused() -> None:
+    """There is no lesson for a task that does not exist."""
+    with pytest.raises(UnknownOption, match="lifting"):
+        lesson("lifting")
+
+
+def recorded(path: Path, n: int = 2) -> Path:
+    """Record somebody who stays where it is."""
+    env = gymnasium.make(
+        "scm_world/Picking-v0",
+        action_mode="delta_joint_positions",
+        delta_scale=0.1,
+        delta_origin="measured",
+        **SHORT,  # type: ignore[arg-type] # options
+    )
+    record(np.zeros(9), env, n, out=path)
+    env.close()
+    return path
+
+
+def test_recordings_are_demonstrations(tmp_path: Path) -> None:
+    """A recording says in which environment one learns, and what was done there."""
+    path = recorded(tmp_path / "still.parquet")
+    for source in (path, tmp_path):
+        given = given_demonstrations(source, lesson("picking", keep=0.0))
+        assert len(given.shown) == 24
+        assert given.lesson.rounds == 0
+        assert given.lesson.env["delta_scale"] == 0.1
+        np.testing.assert_array_equal(given.shown.actions, np.zeros((24, 9)))
+
+
+def test_recordings_of_something_else_are_refused(tmp_path: Path) -> None:
+    """Another task, nothing that ended well, and an empty folder have messages of their own."""
+    path = recorded(tmp_path / "still.parquet", 1)
+    with pytest.raises(UnknownOption, match="task of a recording"):
+        given_demonstrations(path, lesson("pushing", keep=0.0))
+    with pytest.raises(ModelError, match="ended well"):
+        given_demonstrations(path, lesson("picking", keep=0.9))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UnreadableFile, match="no Parquet file"):
+        given_demonstrations(tmp_path / "empty", lesson("picking"))
+
+
+def test_without_torch_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error comes before an episode is played, and leaves no folder."""
+    monkeypatch.setitem(__import__("sys").modules, "torch", None)
+    with pytest.raises(MissingExtra, match="torch"):
+        clone(None, lesson("picking"), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+# --- with torch -------------------------------------------------------------------------------
+
+
+def test_a_clone_learns_what_was_shown(tmp_path: Path) -> None:
+    """A network that sees enough gives the actions of a teacher who always does the same."""
+    pytest.importorskip("torch")
+    path = recorded(tmp_path / "still.parquet")
+    found = clone(path, lesson("picking", **QUICK), out=tmp_path / "run")
+    policy = load_policy(found.policy)
+    assert policy.about.env["delta_origin"] == "measured"
+    assert found.score is None
+    seen = given_demonstrations(path, lesson("picking", keep=0.0)).shown.observations
+    assert np.abs(policy(seen)).max() < 0.1
+
+
+def test_a_clone_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
+    """Interrupted in the middle or not: the same bits; and nothing is done twice."""
+    pytest.importorskip("torch")
+    how = lesson("picking", **QUICK)
+    whole = clone(None, how, out=tmp_path / "whole")
+
+    def interrupt(done: int, _: int) -> None:
+        if done > 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        clone(None, how, out=tmp_path / "parts", progress=interrupt)
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "parts").rglob("*.npz")}
+    parts = clone(None, how, out=tmp_path / "parts")
+    assert parts.policy.read_bytes() == whole.policy.read_bytes()
+    assert before == {p: p.stat().st_mtime_ns for p in before}
+    assert len(before) == 2
+
+
+def test_a_folder_of_other_work_is_refused(tmp_path: Path) -> None:
+    """The message says what is different, or what is there."""
+    pytest.importorskip("torch")
+    how = lesson("picking", **{**QUICK, "rounds": 0})
+    clone(None, how, out=tmp_path / "run")
+    with pytest.raises(UnreadableFile, match=r"seed is 0 there, and 1 was asked for"):
+        clone(None, how, out=tmp_path / "run", seed=1)
+    (tmp_path / "strange").mkdir()
+    (tmp_path / "strange" / "thesis.tex").write_text("x")
+    with pytest.raises(UnreadableFile, match=r"thesis\.tex"):
+        clone(None, how, out=tmp_path / "strange")
+
+
+def test_a_clone_says_how_it_was_made(tmp_path: Path) -> None:
+    """The card has the lesson, the seed, how many episodes were of use, and versions."""
+    pytest.importorskip("torch")
+    trials = {"protocols": ["P0"], "episodes": 1}
+    found = clone(None, lesson("picking", **{**QUICK, "trials": trials}), out=tmp_path / "run")
+    card = load_policy(found.best).about.card
+    assert card["episodes"] in ({"shown": 2, "kept": 2}, {"shown": 3, "kept": 3})
+    assert card["lesson"]["teacher"] == "grasp"  # type: ignore[index,call-overload] # JSON
+    assert "torch" in card["versions"]  # type: ignore[operator] # JSON
+    assert found.score is not None
+    assert json.loads((tmp_path / "run" / "clone.json").read_text())["seed"] == 0

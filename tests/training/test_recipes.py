@@ -1,0 +1,144 @@
+"""Recipes: values that say how an agent is trained."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+
+from scm_world.curricula import Curriculum, goals, physics, together
+from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.tasks import TASKS
+from scm_world.training.recipe import PRESETS, Recipe, curriculum_of, recipe
+from scm_world.training.settings import ALGORITHMS, Hindsight, Sac
+from scm_world.training.worlds import ENV_IDS
+
+EVERY = [(t, a, p) for t in TASKS for a in ALGORITHMS for p in PRESETS]
+
+
+@pytest.mark.parametrize(("task", "algo", "preset"), EVERY)
+def test_every_preset_is_a_recipe(task: str, algo: str, preset: str) -> None:
+    """It goes to JSON and back, and says what it is of."""
+    made = recipe(task, algo, preset=preset)
+    assert Recipe.from_dict(json.loads(made.to_json())) == made
+    assert (made.task, made.algo, made.name) == (task, algo, preset)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("task", TASKS)
+def test_environments_of_presets_exist(task: str, preset: str) -> None:
+    """Their options are some that the environment has."""
+    made = recipe(task, preset=preset)
+    env = gymnasium.make(ENV_IDS[task], backend="fake", **made.options)
+    env.reset(seed=0)
+
+
+def test_published_settings_are_the_published_ones() -> None:
+    """Twenty worlds, batches of 120,000 steps, 83 Hz, absolute joint positions."""
+    made: Any = recipe("pushing", preset="paper", curriculum=2)
+    assert made.round == 120_000
+    assert made.steps == 100_000_000
+    assert made.settings.batch_size * 40 == made.round
+    assert made.options == {
+        "action_mode": "joint_positions",
+        "frame_skip": 3,
+        "task_options": {"weights": "paper"},
+    }
+    assert curriculum_of(made.curriculum).part.kind == "resample"
+    assert recipe("picking", "sac", preset="paper").worlds == 1
+
+
+def test_changes_reach_every_field() -> None:
+    """Fields, settings by their own name, and parts of fields with a dot."""
+    made: Any = recipe(
+        "pushing",
+        n_steps=32,
+        env={"frame_skip": 5},
+        steps=20_000,
+        **{"rate.initial": 1e-4, "network.hidden": [64]},
+    )
+    assert (made.settings.n_steps, made.settings.batch_size) == (32, 1024)
+    assert made.env["frame_skip"] == 5
+    assert made.env["action_mode"] == "delta_joint_positions"
+    assert (made.rate.initial, made.network.hidden, made.steps) == (1e-4, (64,), 20_000)
+    assert made.but(n_steps=16, steps=None).steps == 20_000
+
+
+def test_hindsight_brings_goals_and_sparse_rewards() -> None:
+    """And rewards of one step, which is all that goals decide."""
+    made: Any = recipe("pushing", "sac", hindsight=True)
+    assert made.hindsight == Hindsight()
+    assert made.options["goal_env"]
+    assert made.options["task_options"] == {"weights": "sparse"}
+    assert made.settings.n_steps == 1
+    assert isinstance(made.settings, Sac)
+
+
+def test_privileged_observations_have_every_parameter() -> None:
+    """They are appended to what is observed."""
+    assert recipe("pushing", observations="privileged").options["context"] == "observation"
+
+
+def test_curricula_are_numbers_files_and_values(tmp_path: Path) -> None:
+    """All of them become the same plain data."""
+    own = Curriculum(together(goals("A"), physics("B")))
+    path = tmp_path / "own.json"
+    path.write_text(own.to_json())
+    for given in (own, path, str(path), own.part, own.as_dict()):
+        assert recipe("pushing", curriculum=given).curriculum == own.as_dict()
+    assert recipe("pushing", curriculum=1) == recipe("pushing", curriculum="1")
+    assert recipe("pushing", curriculum=0).curriculum == Curriculum().as_dict()
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"task": "pulling"}, "pushing"),
+    ({"algo": "pp"}, "ppo"),
+    ({"preset": "papers"}, "paper"),
+    ({"curriculum": 3}, "curriculum cannot be 3"),
+    ({"curriculum": "none.json"}, "none.json"),
+    ({"curriculum": 1.5}, "curriculum cannot be 1.5"),
+    ({"n_stepz": 3}, "n_steps"),
+    ({"n_steps": 0}, "settings.n_steps|n_steps"),
+    ({"n_steps": "many"}, "many"),
+    ({"steps": 0}, "steps"),
+    ({"steps": -5}, "steps"),
+    ({"steps": "many"}, "steps"),
+    ({"steps": 100}, "at least 4,096"),
+    ({"steps": float("nan")}, "steps"),
+    ({"worlds": 0}, "worlds"),
+    ({"hindsight": True}, "hindsight with PPO"),
+    ({"algo": "sac", "hindsight": True, "n_steps": 3}, "n_steps with hindsight"),
+    ({"algo": "sac", "scale_rewards": True}, "scale_rewards"),
+    ({"algo": "td3", "rate": {"schedule": "adaptive"}}, "adaptive"),
+    ({"rate": {"schedule": "cosine"}}, "schedule"),
+    ({"observations": "all"}, "observations"),
+    ({"env": {"backend": "bullet"}}, "backend"),
+    ({"env": {"observe": {1, 2}}}, "plain data"),
+    ({"trials": {"protocols": ["P99"]}}, "P99"),
+    ({"network": {"hidden": []}}, "hidden"),
+]
+
+
+@pytest.mark.parametrize(("given", "said"), WRONG)
+def test_what_is_wrong_is_said(given: dict[str, Any], said: str) -> None:
+    """Unknown names, impossible numbers, and what does not go together."""
+    with pytest.raises(ScmWorldError, match=said):
+        recipe(**{"task": "pushing", **given})
+
+
+def test_files_that_are_no_recipe(tmp_path: Path) -> None:
+    """Missing, damaged, or of another kind; and one that is."""
+    path = tmp_path / "recipe.json"
+    for text in (None, "{", "[]", '{"format": "other"}'):
+        if text is not None:
+            path.write_text(text)
+        with pytest.raises(UnreadableFile, match=r"recipe\.json"):
+            Recipe.load(path)
+    made = recipe("reaching", "td3")
+    path.write_text(made.to_json())
+    assert Recipe.load(path) == made
+    with pytest.raises(UnknownOption, match="format"):
+        Recipe.from_dict({})
