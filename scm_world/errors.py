@@ -29,6 +29,7 @@ allowed and what to do::
     ├── Forbidden                a question that a laboratory does not allow
     ├── BudgetExhausted          an experiment that costs more than is left
     ├── EvaluationError          an episode that could not be played, with its place
+    ├── Diverged                 a training whose weights are no finite numbers any more
     └── MissingExtra             an optional package that is not installed
 """
 
@@ -417,6 +418,18 @@ class EvaluationError(ScmWorldError, RuntimeError):
         super().__init__(f"{where}: {reason}")
 
 
+class Diverged(ScmWorldError, ArithmeticError):
+    """A training whose weights are no finite numbers any more, after so many ``steps``."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+        super().__init__(
+            f"the weights are no finite numbers any more after {steps:,} steps; the last "
+            "checkpoint is from before; begin in another folder with a lower learning rate "
+            "(rate.initial) or smaller rewards"
+        )
+
+
 class MissingExtra(ScmWorldError, ImportError):
     """An optional package that is not installed.
 
@@ -435,6 +448,7 @@ __all__ = [
     "ActionError",
     "BudgetExhausted",
     "ConflictingTargets",
+    "Diverged",
     "EngineError",
     "EngineFailure",
     "EvaluationError",

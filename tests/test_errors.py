@@ -14,6 +14,7 @@ from scm_world.errors import (
     ActionError,
     BudgetExhausted,
     ConflictingTargets,
+    Diverged,
     EngineError,
     EngineFailure,
     EvaluationError,
@@ -162,6 +163,13 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         {"versions": {"mujoco": "3.2", "mujoco-core": "4.0"}, "repair": "pip install x"},
     ),
     (EngineFailure("lost", "fake"), "lost", {"engine": "fake"}),
+    (
+        Diverged(4096),
+        "the weights are no finite numbers any more after 4,096 steps; the last checkpoint is from "
+        "before; begin in another folder with a lower learning rate (rate.initial) or smaller "
+        "rewards",
+        {"steps": 4096},
+    ),
     (
         EvaluationError({"protocol": "P2", "episode": 17}, "the policy gave NaN"),
         "protocol P2, episode 17: the policy gave NaN",

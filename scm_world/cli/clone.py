@@ -49,8 +49,8 @@ def clone(
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Any field of the lesson, such as updates=8000, keep=0.8 or "
-            "network='{\"hidden\": [64, 64]}'; the value is JSON or a word. Once for each.",
+            help="Any field of the lesson, such as updates=8000, trials.episodes=40 or "
+            "network.hidden=[64,64]; the value is JSON or a word. Give it once for each.",
         ),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print the result only.")] = False,

@@ -160,6 +160,8 @@ def _show_plan(study: Study, folder: Path) -> int:
 
 
 def _sum(plans: Sequence[Plan]) -> str:
+    if not plans:
+        return "nothing is trained"
     done = sum(one.trained and one.evaluated for one in plans)
     whole = sum(one.training + one.evaluation for one in plans)
     left = sum(one.left for one in plans)
@@ -199,7 +201,8 @@ def _told(found: Reproduction, terminal: Any) -> int:
     terminal.print(made)
     written(terminal, *found.files)
     count = {status: _count(found.outcomes, status) for status in (DONE, STOPPED)}
-    terminal.print(f"{count[DONE]} of {len(found.outcomes)} trainings are done and evaluated")
+    if found.outcomes:
+        terminal.print(f"{count[DONE]} of {len(found.outcomes)} trainings are done and evaluated")
     if count[STOPPED]:
         terminal.print(f"the time is over: {count[STOPPED]} are left; the same command goes on")
     for note in found.notes:

@@ -12,11 +12,14 @@ from scm_world.cli.options import Backend, Seed, Task
 
 def train(
     task: Task,
-    algo: Annotated[str, typer.Option(help="ppo, sac or td3.")] = "ppo",
+    algo: Annotated[str | None, typer.Option(help="ppo, sac or td3.", show_default="ppo")] = None,
     preset: Annotated[
-        str,
-        typer.Option(help="tuned: what works best here; paper: the published settings."),
-    ] = "tuned",
+        str | None,
+        typer.Option(
+            help="tuned: what works best here; paper: the published settings.",
+            show_default="tuned",
+        ),
+    ] = None,
     curriculum: Annotated[
         str | None,
         typer.Option(

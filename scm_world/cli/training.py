@@ -13,9 +13,11 @@ import typer
 from rich.text import Text
 
 from scm_world.cli.console import RESULTS, check_writable, console, table
-from scm_world.errors import ConflictingTargets
+from scm_world.errors import ConflictingTargets, UnknownOption
+from scm_world.training.checkpoints import checkpoints
 from scm_world.training.loop import Trained, train
 from scm_world.training.recipe import Recipe, recipe
+from scm_world.training.runs import CHECKPOINTS
 
 INTERRUPTED = 130
 SET = "'--set'"
@@ -28,8 +30,8 @@ class Options:
 
     Attributes:
         task: Name of the task.
-        algo: Of the algorithm.
-        preset: Of the recipe.
+        algo: Of the algorithm; PPO if None.
+        preset: Of the recipe; the tuned one if None.
         curriculum: A number or a path; that of the preset if None.
         recipe: JSON file of a recipe, in place of a preset.
         backend: Name of the engine.
@@ -48,8 +50,8 @@ class Options:
     """
 
     task: str
-    algo: str
-    preset: str
+    algo: str | None
+    preset: str | None
     curriculum: str | None
     recipe: Path | None
     backend: str
@@ -78,10 +80,24 @@ class Options:
         if not self.evaluate:
             changes["trials.protocols"] = []
         if self.recipe is not None:
-            return Recipe.load(self.recipe).but(curriculum=self.curriculum, **changes)
+            return self._loaded(self.recipe).but(curriculum=self.curriculum, **changes)
         return recipe(
-            self.task, self.algo, preset=self.preset, curriculum=self.curriculum, **changes
+            self.task,
+            self.algo or "ppo",
+            preset=self.preset or "tuned",
+            curriculum=self.curriculum,
+            **changes,
         )
+
+    def _loaded(self, path: Path) -> Recipe:
+        """Read a recipe, which has a task and an algorithm of its own."""
+        found = Recipe.load(path)
+        wanted = {"task": self.task, "algo": self.algo, "preset": self.preset}
+        for name, mine in {"task": found.task, "algo": found.algo, "preset": None}.items():
+            if wanted[name] not in (mine, None):
+                allowed = (f"{mine}, as in {path}" if mine else f"none, beside {path}",)
+                raise UnknownOption(name, wanted[name], allowed)
+        return found
 
     def folder(self, made: Recipe) -> Path:
         """Name the folder of the run."""
@@ -142,8 +158,9 @@ def run(options: Options, *, out: Path | None) -> int:
                 threads=options.threads,
             )
     except KeyboardInterrupt:
-        said = f"interrupted: the last checkpoint is safe in {folder}; the same command goes on"
-        terminal.print(said, soft_wrap=True)
+        safe = [path.name for path in checkpoints(folder / CHECKPOINTS)]
+        kept = f"{int(safe[-1]):,} steps are safe in {folder}" if safe else "nothing was kept yet"
+        terminal.print(f"interrupted: {kept}; the same command goes on", soft_wrap=True)
         return INTERRUPTED
     _tell(found, terminal)
     if options.onnx:

@@ -6,6 +6,8 @@ Which ones a task has is in its ``ready_terms``.
 
 Terms:
     reward.speed: Minus the norm of the joint velocities [rad/s]. Every task.
+    reward.effort: Minus the norm of the joint torques [N m]. It keeps fingers from pressing a block
+        from all sides. Every task.
     reward.goal_kernel: How near the corners of the block are to those of the goal, in [0, 1];
         it is felt within about 10 cm. Tasks with one block.
     reward.goal_kernel_fine: The same with a sharper kernel, felt within about 2 cm.
@@ -134,11 +136,11 @@ def reach_kernel(
 
 
 @njit(cache=True)
-def minus_speed(velocities: Floats) -> float:
-    """Compute minus the norm of the joint velocities [rad/s]."""
+def minus_length(vector: Floats) -> float:
+    """Compute minus the Euclidean norm of a vector."""
     total = 0.0
-    for velocity in velocities:
-        total += velocity * velocity
+    for number in vector:
+        total += number * number
     return -math.sqrt(total)
 
 
@@ -149,9 +151,15 @@ _TIPS = ("end_effector_positions", *(f"goal_{f}.cartesian_position" for f in ("6
 ROBOT: tuple[Measured, ...] = (
     term(
         "reward.speed",
-        minus_speed,
+        minus_length,
         ("joint_velocities",),
         "Minus the norm of the joint velocities [rad/s].",
+    ),
+    term(
+        "reward.effort",
+        minus_length,
+        ("joint_torques",),
+        "Minus the norm of the joint torques [N m].",
     ),
 )
 """Terms of every task."""

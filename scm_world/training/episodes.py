@@ -122,8 +122,9 @@ class Episodes(VectorWrapper):
     def state(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Give what takes other worlds to where these are: arrays, and plain data."""
         longest = int(self._lengths.max())
-        arrays = {
-            "actions": self._actions[:longest].copy(),
+        taken = np.arange(longest)[:, None] < self._lengths
+        arrays: dict[str, NDArray[Any]] = {
+            "actions": self._actions[:longest] * taken[..., None],
             "lengths": self._lengths.copy(),
             "totals": self._totals.copy(),
             "cuts": self._cuts.copy(),

@@ -12,6 +12,7 @@ from typing import Any, final
 
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.policies.weights import load_policy
+from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import locked, made
 from scm_world.queries.progress import Progress
 from scm_world.training.checkpoints import checkpoints, read_checkpoint
@@ -72,7 +73,8 @@ def train(
     """Train an agent.
 
     What is learned follows from the recipe, the seed, the engine, ``threads`` and the versions.
-    If ``out`` holds a part of the same training, it goes on from its last checkpoint; on a CPU
+    If ``out`` holds a part of the same training, it goes on from its last checkpoint, also with
+    more steps than before if the learning rate does not depend on how many there are; on a CPU
     the weights in the end are, bit for bit, those of a training that was not interrupted. Ctrl-C
     lets it write a checkpoint after the present round, and end; a second one ends it at once.
 
@@ -100,7 +102,7 @@ def train(
             last checkpoint is damaged.
         UnwritableFolder: There is no room; the last checkpoint is still whole.
     """
-    library(), torch()
+    library(), torch(), load("tensorboard", "tensorboard", "train")
     if steps is not None:
         recipe = with_steps(recipe, steps)
     number = whole_number("seed", seed, least=0)
@@ -134,6 +136,8 @@ def _trained(
     run: Run, worlds: Worlds, progress: Progress | None, tell: Tell, every: float
 ) -> Trained:
     engine = worlds.engine
+    for line in run.newer(engine):
+        tell(line)
     goes_on = run.open(engine)
     model = make_learner(
         run.recipe, worlds.vec_env, seed=run.seed, length=worlds.length, device=run.device

@@ -61,9 +61,7 @@ def _model(onnx: Any, policy: NetworkPolicy) -> Any:
     for number, layer in enumerate(policy.layers):
         names = [f"weight_{number}", f"bias_{number}"]
         arrays = (np.ascontiguousarray(layer.weight), layer.bias)
-        weights += [
-            onnx.numpy_helper.from_array(a, n) for a, n in zip(arrays, names, strict=True)
-        ]
+        weights += [onnx.numpy_helper.from_array(a, n) for a, n in zip(arrays, names, strict=True)]
         nodes.append(helper.make_node("Gemm", [seen, *names], [f"sum_{number}"]))
         seen = f"sum_{number}"
         if number < last:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, final
 
@@ -18,6 +19,7 @@ from pydantic import (
 )
 
 from scm_world.curricula import Curriculum, as_curriculum, everything, goals
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
@@ -32,6 +34,8 @@ from scm_world.training.settings import (
     Rate,
     Settings,
     Trials,
+    merged,
+    nested,
     refused,
 )
 from scm_world.training.tuned import tuned
@@ -110,10 +114,10 @@ class Recipe(Frozen):
     @field_validator("env")
     @classmethod
     def _plain(cls, env: dict[str, Any]) -> dict[str, Any]:
-        for name in RESERVED:
-            if name in env:
-                allowed = ("options of what is observed and how the robot is commanded",)
-                raise UnknownOption("option of the environment in a recipe", name, allowed)
+        known = [name for name in signature(ScmWorldEnv).parameters if name not in RESERVED]
+        for name in env:
+            if name not in known:
+                raise UnknownOption("option of the environment in a recipe", name, known)
         try:
             return dict(json.loads(json.dumps(env, allow_nan=False)))
         except (TypeError, ValueError) as error:
@@ -313,14 +317,12 @@ def changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, 
     found = copy.deepcopy(dict(fields))
     settings = ALGORITHMS[fields["algo"]].model_fields
     for name, value in changes.items():
-        first, *rest = name.split(".")
+        first, part = nested(name, value)
         if first not in Recipe.model_fields and first in settings:
-            first, rest = "settings", [first, *rest]
+            first, part = nested(f"settings.{name}", value)
         if first not in Recipe.model_fields:
             raise UnknownOption("field of a recipe", name, (*Recipe.model_fields, *settings))
-        for part in reversed(rest):
-            value = {part: value}  # noqa: PLW2901 # from the inside out
-        found[first] = _merged(first, found.get(first), value)
+        found[first] = _merged(first, found.get(first), part)
     return found
 
 
@@ -335,9 +337,7 @@ def _with_hindsight(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> di
 def _merged(name: str, before: Any, value: Any) -> Any:
     if name == "hindsight" and isinstance(value, bool):
         return {} if value else None
-    if name == "curriculum" or not isinstance(value, Mapping) or not isinstance(before, Mapping):
-        return value
-    return {**before, **{k: _merged("", before.get(k), v) for k, v in value.items()}}
+    return value if name == "curriculum" else merged(before, value)
 
 
 def _made(fields: Mapping[str, Any]) -> Recipe:

@@ -18,6 +18,7 @@ from scm_world.training.checkpoints import checkpoints
 from scm_world.training.recipe import Recipe
 
 FORMAT = "scm_world/run/1"
+CHECKPOINTS = "checkpoints"
 LIBRARIES = ("torch", "stable-baselines3")
 
 
@@ -57,7 +58,7 @@ class Run:
     @property
     def checkpoints(self) -> Path:
         """The folder of its checkpoints."""
-        return self.folder / "checkpoints"
+        return self.folder / CHECKPOINTS
 
     @property
     def replay(self) -> Path:
@@ -106,6 +107,8 @@ class Run:
     def open(self, engine: str) -> bool:
         """Begin in the folder, or go on there.
 
+        A training may become longer, unless its learning rate depends on how long it is.
+
         Args:
             engine: Name and version of the physics engine.
 
@@ -116,22 +119,35 @@ class Run:
             UnreadableFile: Another training is in the folder; it says what is different.
             UnwritableFolder: There is no room, or no permission.
         """
-        there = read_about(self.about) if self.about.exists() else None
-        if there is not None:
-            wrong = differences(there, self.identity)
-            if wrong:
-                reason = f"it holds another training: {'; '.join(wrong)}"
-                advice = "give another folder, or the same options as before"
-                raise UnreadableFile(str(self.folder), reason, advice)
-            return bool(checkpoints(self.checkpoints))
-        strangers = [one.name for one in self.folder.iterdir()] if self.folder.exists() else []
-        if strangers:
-            reason = f"there is no training in it, but {', '.join(sorted(strangers)[:5])}"
+        if self.about.exists():
+            self._compare(read_about(self.about))
+        elif self.folder.exists() and (strangers := sorted(p.name for p in self.folder.iterdir())):
+            reason = f"there is no training in it, but {', '.join(strangers[:5])}"
             raise UnreadableFile(str(self.folder), reason, "give an empty folder, or a new one")
-        self.folder.mkdir(parents=True, exist_ok=True)
         data = {"format": FORMAT, **self.card(engine)}
+        self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(json.dumps(data, indent=2, allow_nan=False), self.about)
-        return False
+        return bool(checkpoints(self.checkpoints))
+
+    def _compare(self, there: Mapping[str, Any]) -> None:
+        """Refuse another training."""
+        wanted, steps = self.identity, self.recipe.steps
+        before = there.get("recipe", {}).get("steps")
+        if self.recipe.rate.schedule != "linear" and isinstance(before, int) and before < steps:
+            wanted = {**wanted, "recipe": {**wanted["recipe"], "steps": before}}
+        if wrong := differences(there, wanted):
+            reason = f"it holds another training: {'; '.join(wrong)}"
+            advice = "give another folder, or the same options as before"
+            raise UnreadableFile(str(self.folder), reason, advice)
+
+    def newer(self, engine: str) -> list[str]:
+        """Say which versions are others than when the training began."""
+        before = read_about(self.about).get("versions", {}) if self.about.exists() else {}
+        return [
+            f"{name} was {before[name]} and is {now} now: the last bits may be others"
+            for name, now in self.card(engine)["versions"].items()
+            if before.get(name, now) != now
+        ]
 
 
 def read_about(path: Path) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, final
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, ValidationError
 
@@ -186,6 +187,31 @@ class Trials(Frozen):
 
 ALGORITHMS: dict[str, type[Settings]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
 """The algorithms, each with its settings."""
+
+
+def nested(path: str, value: Any) -> tuple[str, Any]:
+    """Turn ``a.b`` and a value into ``a`` and the part of it that has this value.
+
+    Example:
+        >>> nested("network.hidden", [8])
+        ('network', {'hidden': [8]})
+    """
+    first, *rest = path.split(".")
+    for part in reversed(rest):
+        value = {part: value}
+    return first, value
+
+
+def merged(before: Any, value: Any) -> Any:
+    """Change the parts that a value names; what has no parts is replaced.
+
+    Example:
+        >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 0}})
+        {'a': 1, 'b': {'c': 0, 'd': 3}}
+    """
+    if not (isinstance(before, Mapping) and isinstance(value, Mapping)):
+        return value
+    return {**before, **{name: merged(before.get(name), part) for name, part in value.items()}}
 
 
 def refused(what: str, error: ValidationError) -> ScmWorldError:

@@ -74,21 +74,21 @@ _PUSHING: Fields = {
 _POSE = ("cartesian_position", "orientation")
 _MOTION = ("linear_velocity", "angular_velocity")
 
+_ROBOT = ("joint_positions", "joint_velocities", "end_effector_positions")
 _SEEN = [
-    "joint_positions",
-    "joint_velocities",
-    "end_effector_positions",
+    *_ROBOT,
     *(f"tool_block.{part}" for part in (*_POSE, *_MOTION)),
     *(f"goal_block.{part}" for part in _POSE),
 ]
 """All that moves. Without the time, what is learned in short episodes holds in long ones."""
 
 _REACHING: Fields = {
-    "terms": ["reward.reach_kernel", "reward.speed"],
+    "terms": ["reward.reach_kernel", "reward.reach_kernel_fine", "reward.speed"],
     "weights": {
         "reward.tips_to_goals": 10.0,
-        "fractional_success": 0.1,
         "reward.reach_kernel": 0.1,
+        "reward.reach_kernel_fine": 0.1,
+        "fractional_success": 0.1,
         "reward.speed": 5e-4,
     },
 }
@@ -119,8 +119,20 @@ _FROM_A_CLONE: Fields = {
 
 TUNED: Mapping[str, Mapping[str | None, Fields]] = {
     "reaching": {
-        None: {"env": {"task_options": _REACHING}, "curriculum": 1},
-        "ppo": {"steps": 1_000_000},
+        None: {
+            "env": {
+                "task_options": _REACHING,
+                "observation_mode": "custom",
+                "observe": [*_ROBOT, *(f"goal_{f}.cartesian_position" for f in (60, 120, 300))],
+            },
+            "episode_length": 50,
+            "curriculum": resample("goal_*.cylindrical_position", "A"),
+        },
+        "ppo": {
+            "steps": 200_000,
+            "settings": {"n_steps": 16, "batch_size": 256, "gamma": 0.95},
+            "network": {"scaled": True},
+        },
     },
     "pushing": {
         None: {
@@ -151,9 +163,11 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 }
 """What differs from that, by task and algorithm."""
 
+_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 500, "rounds": 0, "updates": 6_000}
+
 LESSONS: Mapping[str, Fields] = {
-    "pick_and_place": {"protocols": ("P1", "P5"), "episodes": 400, "more": 150},
-    "stacking2": {"protocols": ("P1", "P5"), "updates": 6_000},
+    "pick_and_place": _PLACED,
+    "stacking2": {**_PLACED, "episodes": 350},
 }
 """What differs from the usual lesson of imitation, by task."""
 

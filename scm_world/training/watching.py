@@ -5,13 +5,16 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any, final
 
+from scm_world.errors import Diverged
 from scm_world.evaluation.policies.weights import save_policy
 from scm_world.queries.progress import Progress
 from scm_world.training.checkpoints import Checkpoint, checkpoints, write_checkpoint
 from scm_world.training.curves import Curve
+from scm_world.training.episodes import Ended
 from scm_world.training.export import exported
 from scm_world.training.instants import taken
 from scm_world.training.learners import library
@@ -24,7 +27,7 @@ ROWS = 1_000
 """About how many rows a learning curve has."""
 
 
-class Stopped(Exception):  # noqa: N818 # it is none
+class Stopped(Exception):
     """The training was asked to stop, and has written a checkpoint."""
 
 
@@ -79,12 +82,12 @@ class Watching:
         steps = model.num_timesteps
         if steps == 0 or steps == self._row:
             return
+        self._check(model)
         self._adapt(model)
         self._warm_up(model)
         if steps - self._row >= self.run.recipe.steps / ROWS:
             self._write_row(model)
-        if self._progress is not None:
-            self._progress(min(steps, self.run.recipe.steps), self.run.recipe.steps)
+        self._say(steps)
         self._try(model)
         if self.stop or time.perf_counter() - self._kept >= self._every:
             self.keep(model)
@@ -93,13 +96,24 @@ class Watching:
 
     def ended(self, model: Any) -> None:
         """Keep the last instant."""
+        self._check(model)
         if model.num_timesteps > self._row:
             self._adapt(model)
             self._write_row(model)
+        self._say(model.num_timesteps)
         self._try(model)
         self.keep(model)
 
     # --- parts of that ----------------------------------------------------------------------------
+
+    def _check(self, model: Any) -> None:
+        """Refuse weights that are no numbers, before they are kept."""
+        if not all(bool(part.isfinite().all()) for part in model.policy.parameters()):
+            raise Diverged(model.num_timesteps)
+
+    def _say(self, steps: int) -> None:
+        if self._progress is not None:
+            self._progress(min(steps, self.run.recipe.steps), self.run.recipe.steps)
 
     def _adapt(self, model: Any) -> None:
         divergence = model.logger.name_to_value.get("train/approx_kl")
@@ -178,6 +192,7 @@ class Watching:
             "row": self._row,
             "tries": self._tries,
             "score": self.score,
+            "ended": [astuple(one) for one in self._worlds.episodes.ended],
         }
         checkpoint = Checkpoint(model.num_timesteps, tensors, {**state, "watching": mine})
         place = write_checkpoint(self.run.checkpoints, checkpoint)
@@ -194,6 +209,7 @@ class Watching:
         mine = checkpoint.state["watching"]
         self._spent = (mine["spent"][0], mine["spent"][1])
         self._row, self._tries, self.score = mine["row"], mine["tries"], mine["score"]
+        self._worlds.episodes.ended[:] = [Ended(*one) for one in mine["ended"]]
 
 
 def _words(trial: Trial) -> str:

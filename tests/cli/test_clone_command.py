@@ -9,11 +9,13 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
+from scm_world.cli.cloning import Options
+from scm_world.training.imitation import lesson
 
 QUICK = (
     *("--episodes", "1", "--rounds", "0", "--set", "keep=0", "--set", "updates=5"),
-    *("--set", 'env={"max_episode_length": 5}', "--set", 'network={"hidden": [4]}'),
-    *("--set", 'trials={"protocols": []}'),
+    *("--set", "env.max_episode_length=5", "--set", "network.hidden=[4]"),
+    *("--set", "trials.protocols=[]"),
 )
 
 
@@ -33,6 +35,8 @@ def call(*arguments: str) -> Result:
         (("picking", "--noise", "-1"), "noise of a lesson"),
         (("picking", "--noise", "0.1", "--set", "noise=0.2"), "noise"),
         (("picking", "--set", "noise"), "expected name=value"),
+        (("picking", "--set", "trials.episode=3"), "trials.episode of a lesson"),
+        (("picking", "--set", "episodes.more=3"), "episodes of a lesson"),
     ],
 )
 def test_what_is_impossible_is_one_line(
@@ -43,6 +47,17 @@ def test_what_is_impossible_is_one_line(
     assert done.exit_code == 2
     assert said in done.output
     assert not (tmp_path / "run").exists()
+
+
+def test_parts_are_set_by_their_names() -> None:
+    """A dotted name changes one part, and leaves the others of the same field as they are."""
+    changes = ("trials.episodes=40", "network.hidden=[128, 128]", "env.frame_skip=5")
+    made = Options("picking", "grasp", {}, "mujoco", 0, changes, quiet=True).made()
+    parts = {"trials": {"episodes": 40}, "network": {"hidden": [128, 128]}}
+    assert made == lesson("picking", **parts, env={"frame_skip": 5})
+    assert (made.trials.episodes, made.network.hidden) == (40, (128, 128))
+    assert (made.trials.protocols, made.network.activation) == (("P1", "P5"), "relu")
+    assert made.env == {**lesson("picking").env, "frame_skip": 5}
 
 
 def test_it_says_what_comes_next(tmp_path: Path) -> None:

@@ -95,6 +95,18 @@ def test_native_is_sync_value_by_value(name: str, mode: AutoresetMode) -> None:
         envs.close()
 
 
+@pytest.mark.parametrize("kind", ["loop", "processes"])
+@pytest.mark.parametrize("name", CURRICULA)
+def test_other_crews_are_sync_value_by_value(name: str, kind: str) -> None:
+    """One after another in this process, or several in each of some processes."""
+    mode = AutoresetMode.SAME_STEP
+    pair = [made(one, CURRICULA[name], mode, backend="fake") for one in (kind, "sync")]
+    same(*(envs.reset(seed=3) for envs in pair))
+    roll(*pair, steps=11, mode=mode)
+    for envs in pair:
+        envs.close()
+
+
 @pytest.mark.parametrize("options", OPTIONS)
 def test_whatever_is_observed(options: str) -> None:
     """Relative actions, goals, noise of the sensors, and what is said in words."""

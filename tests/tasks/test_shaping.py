@@ -70,7 +70,7 @@ def test_the_fingertips_have_a_kernel_each() -> None:
     far = np.linalg.norm(tips.reshape(3, 3), axis=1)
     expected = np.mean(4.0 / (np.exp(30.0 * far) + 2.0 + np.exp(-30.0 * far)))
     assert shaping.reach_kernel(tips, *goals, 30.0) == pytest.approx(expected)
-    assert shaping.minus_speed(np.array([3.0, 0.0, 4.0])) == -5.0
+    assert shaping.minus_length(np.array([3.0, 0.0, 4.0])) == -5.0
 
 
 @pytest.mark.parametrize("name", TASKS)

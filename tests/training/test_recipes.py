@@ -60,7 +60,8 @@ def test_changes_reach_every_field() -> None:
         steps=20_000,
         **{"rate.initial": 1e-4, "network.hidden": [64]},
     )
-    assert (made.settings.n_steps, made.settings.batch_size) == (32, 1024)
+    before: Any = recipe("pushing")
+    assert made.settings == before.settings.model_copy(update={"n_steps": 32})
     assert made.env["frame_skip"] == 5
     assert made.env["action_mode"] == "delta_joint_positions"
     assert (made.rate.initial, made.network.hidden, made.steps) == (1e-4, (64,), 20_000)
@@ -106,7 +107,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"steps": 0}, "steps"),
     ({"steps": -5}, "steps"),
     ({"steps": "many"}, "steps"),
-    ({"steps": 100}, "at least 4,096"),
+    ({"steps": 100, "worlds": 64, "n_steps": 64}, "at least 4,096"),
     ({"steps": float("nan")}, "steps"),
     ({"worlds": 0}, "worlds"),
     ({"hindsight": True}, "hindsight with PPO"),
@@ -116,6 +117,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"rate": {"schedule": "cosine"}}, "schedule"),
     ({"observations": "all"}, "observations"),
     ({"env": {"backend": "bullet"}}, "backend"),
+    ({"env": {"colour": "red"}}, "colour"),
     ({"env": {"observe": {1, 2}}}, "plain data"),
     ({"trials": {"protocols": ["P99"]}}, "P99"),
     ({"network": {"hidden": []}}, "hidden"),

@@ -299,9 +299,10 @@ def test_a_published_actor_stands_beside_the_score(two: Path, tmp_path: Path) ->
     folder, archive = tmp_path / "actor", tmp_path / "actor.zip"
     shutil.copytree(two, folder)
     sizes = {"shared_fc0": (OBSERVED, 4), "pi": (4, 9)}
-    tensors = {f"model/{name}/w:0": np.zeros(size) for name, size in sizes.items()}
+    tensors: dict[str, Any] = {f"model/{n}/w:0": np.zeros(size) for n, size in sizes.items()}
     tensors |= {f"model/{name}/b:0": np.zeros(size[1]) for name, size in sizes.items()}
-    np.savez(weights := io.BytesIO(), **tensors, **{"model/pi/logstd:0": np.zeros((1, 9))})
+    tensors["model/pi/logstd:0"] = np.zeros((1, 9))
+    np.savez(weights := io.BytesIO(), **tensors)
     with zipfile.ZipFile(archive, "w") as file:
         file.writestr("parameters", weights.getvalue())
     study = small(protocols=("P0",), episodes=2)

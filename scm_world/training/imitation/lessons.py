@@ -21,6 +21,8 @@ from scm_world.training.settings import (
     Positive,
     Share,
     Trials,
+    merged,
+    nested,
     refused,
 )
 from scm_world.training.tuned import ENV, LESSONS
@@ -131,7 +133,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
     Args:
         task: Name of the task.
         changes: Fields of the ``Lesson``. Those that have parts (``env``, ``network``,
-            ``trials``) change the parts that are named.
+            ``trials``) change the parts that are named; ``a.b`` names a part of ``a``.
 
     Raises:
         UnknownOption: There is no such field, or a value is impossible.
@@ -139,14 +141,16 @@ def lesson(task: str, **changes: Any) -> Lesson:
     Example:
         >>> lesson("picking", episodes=10, env={"frame_skip": 5}).env["frame_skip"]
         5
+        >>> lesson("picking", **{"trials.episodes": 40}).trials.episodes
+        40
     """
     fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
     fields |= LESSONS.get(task, {})
     for name, value in changes.items():
-        if name not in Lesson.model_fields:
+        first, part = nested(name, value)
+        if first not in Lesson.model_fields:
             raise UnknownOption("field of a lesson", name, Lesson.model_fields)
-        has_parts = isinstance(fields[name], Mapping) and isinstance(value, Mapping)
-        fields[name] = {**fields[name], **value} if has_parts else value
+        fields[first] = merged(fields[first], part)
     try:
         made = Lesson.model_validate(fields)
     except ValidationError as error:

@@ -1,0 +1,129 @@
+"""``scm-world train``: what is said before, in and after a training."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from scm_world.cli.app import app
+from scm_world.cli.training import Lines
+from scm_world.training.recipe import Recipe, recipe
+
+SMALL = (
+    "--backend=fake",
+    "--worlds=4",
+    "--steps=64",
+    "--set=n_steps=8",
+    "--set=batch_size=16",
+    "--set=env.max_episode_length=5",
+    "--set=network.hidden=[8]",
+    "--set=trials.episodes=1",
+    "--set=trials.times=1",
+)
+
+
+def called(*arguments: str) -> Any:
+    """Run the command."""
+    return CliRunner().invoke(app, ["train", *arguments])
+
+
+def test_the_recipe_is_shown() -> None:
+    """As JSON, with everything that was changed."""
+    found = called(
+        "picking",
+        "--algo=sac",
+        "--curriculum=2",
+        "--observations=privileged",
+        "--hindsight",
+        "--no-evaluate",
+        "--set=rate.initial=1e-4",
+        "--set=gamma=0.9",
+        "--show-recipe",
+    )
+    made = Recipe.from_dict(json.loads(found.output))
+    wanted = recipe("picking", "sac", curriculum=2, observations="privileged", hindsight=True)
+    changes = {"trials.protocols": [], "rate.initial": 1e-4, "gamma": 0.9}
+    assert made == wanted.but(**changes)
+
+
+def test_a_recipe_is_read_from_a_file(tmp_path: Path) -> None:
+    """And may be changed."""
+    path = tmp_path / "recipe.json"
+    path.write_text(recipe("reaching", "td3").to_json())
+    found = called("reaching", f"--recipe={path}", "--worlds=2", "--curriculum=0", "--show-recipe")
+    made = Recipe.from_dict(json.loads(found.output))
+    assert made == recipe("reaching", "td3", curriculum=0, worlds=2)
+    for other in (("pushing",), ("reaching", "--algo=ppo"), ("reaching", "--preset=paper")):
+        assert called(*other, f"--recipe={path}", "--show-recipe").exit_code == 2
+
+
+WRONG = [
+    (("pulling",), "no task is named 'pulling'"),
+    (("pushing", "--algo=dqn"), "dqn"),
+    (("pushing", "--preset=best"), "best"),
+    (("pushing", "--curriculum=7"), "curriculum"),
+    (("pushing", "--curriculum=none.json"), "none.json"),
+    (("pushing", "--hindsight"), "hindsight with PPO"),
+    (("pushing", "--steps=0"), "steps"),
+    (("pushing", "--steps=-1"), "steps"),
+    (("pushing", "--steps=10"), "at least"),
+    (("pushing", "--set=steps=many"), "many"),
+    (("pushing", "--set=n_steps"), "name=value"),
+    (("pushing", "--set=n_step=5"), "n_steps"),
+    (("pushing", "--set=n_steps=8", "--set=n_steps=9"), "n_steps"),
+    (("pushing", "--recipe=none.json"), "none.json"),
+    (("pushing", "--seed=-1"), "seed"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "said"), WRONG)
+def test_what_is_wrong_is_said(
+    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one line, before anything is written."""
+    monkeypatch.chdir(tmp_path)
+    found = called(*arguments)
+    assert found.exit_code == 2
+    assert said in found.output.replace("\n", " ")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the command that installs it; no folder is left."""
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    found = called("pushing", *SMALL, f"--out={tmp_path / 'run'}")
+    assert found.exit_code == 2
+    assert "pip install 'scm-world[train]'" in found.output
+    assert not (tmp_path / "run").exists()
+
+
+def test_lines_tell_how_far_it_is() -> None:
+    """At each tenth of the way, once."""
+    said: list[str] = []
+    lines = Lines(said.append)
+    for done in (5, 10, 11, 40, 100):
+        lines(done, 100)
+    assert said == ["10 of 100 steps", "40 of 100 steps", "100 of 100 steps"]
+
+
+def test_an_agent_is_trained(tmp_path: Path) -> None:
+    """What is done is said before; at the end, where the policy is and how it is evaluated."""
+    pytest.importorskip("stable_baselines3")
+    folder = tmp_path / "run"
+    found = called("pushing", *SMALL, f"--out={folder}")
+    assert found.exit_code == 0, found.output
+    text = found.output.replace("\n", "")
+    assert "Training PPO on pushing" in text
+    assert "64 of 64 steps" in text
+    assert f"scm-world evaluate {folder / 'best.safetensors'} pushing" in text
+    again = called("pushing", *SMALL, f"--out={folder}", "--quiet")
+    assert again.exit_code == 0
+    assert "Training" not in again.output
+    other = called("pushing", *SMALL, f"--out={folder}", "--seed=1")
+    assert other.exit_code == 2
+    assert "seed is 0 there, and 1 was asked for" in other.output.replace("\n", " ")
