@@ -4,8 +4,6 @@ The training needs the extra ``train``; the rest does not. Run it with
 ``python examples/own_curriculum.py [STEPS [FOLDER]]``; a million steps are a whole training.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import tempfile
@@ -43,7 +41,7 @@ def main(steps: str = "20480", out: str = "") -> None:
         env.unwrapped.do(env.unwrapped.world.task.solution(env.unwrapped.world.values()))
         for _ in range(3):
             _, _, _, _, info = env.step(np.zeros(9, np.float32))
-        (_, names), *_ = env.unwrapped.interventions
+        names = env.unwrapped.interventions[0][1]
         print(f"episode {episode}: drew {', '.join(names)}; success {info['is_success']}")
 
     if importlib.util.find_spec("stable_baselines3") is None:

@@ -1,8 +1,7 @@
 """A learner of one's own for control: the cross-entropy method over a linear policy.
 
-Many worlds with the same draws try as many weights, and the best of them say where to look next
-(Rubinstein, 1999). Each finger moves by a matrix times what its tip lacks. Nothing but numpy is
-needed. Run it with ``python examples/own_rl_learner.py [ITERATIONS [FILE]]``.
+Many worlds with the same draws try as many weights; the best say where to look next (Rubinstein,
+1999). It needs numpy alone. Run it with ``python examples/own_rl_learner.py [ITERATIONS [FILE]]``.
 """
 
 import sys
@@ -13,18 +12,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-import scm_world  # noqa: F401 # registers the environments
 from scm_world.evaluation import evaluate
 from scm_world.evaluation.policies.weights import save_policy
+from scm_world.training.tuned import ENV
 
 GOALS = [f"goal_{finger}.cartesian_position" for finger in (60, 120, 300)]
-FORM = {  # kept with the policy: how it sees and acts
-    "action_mode": "delta_joint_positions",
-    "delta_scale": 0.1,
-    "delta_origin": "measured",
-    "observation_mode": "custom",
-    "observe": ["end_effector_positions", *GOALS],
-}
+FORM = {**ENV, "observation_mode": "custom", "observe": ["end_effector_positions", *GOALS]}
 LACK = np.hstack([-np.eye(9), np.eye(9)])  # from what is observed to what the tips lack
 OWN = np.kron(np.eye(3), np.ones((3, 3)))  # a finger looks at its own tip only
 WORLDS, ELITE, WIDTH = 32, 8, 5.0
@@ -52,9 +45,9 @@ def main(iterations: str = "30", path: str = "") -> None:
         best = tried[np.argsort(found)[-ELITE:]]
         mean, width = best.mean(axis=0), best.std(axis=0) + 0.02 * WIDTH * OWN
         print(f"{iteration}: returns {found.mean():.0f} on average, {found.max():.0f} at best")
+
     file = Path(path or Path(tempfile.mkdtemp()) / "linear.safetensors")
-    layer = {"layers.0.weight": (mean @ LACK).astype(np.float32)}
-    layer["layers.0.bias"] = np.zeros(9, np.float32)
+    layer = {"layers.0.weight": np.float32(mean @ LACK), "layers.0.bias": np.zeros(9, np.float32)}
     save_policy(file, layer, {"task": "reaching", "env": FORM, "card": {"learner": "CEM"}})
     result = evaluate({"mine": str(file), "still": "still"}, "P0,P5,P12", task="reaching", n=5)
     for protocol in result.protocols:

@@ -49,7 +49,7 @@ def test_the_tables_of_variables_are_up_to_date() -> None:
 
 
 EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it short
-    "augmentation": ("4", "60"),
+    "augmentation": ("24", "60"),
     "curricula": (),
     "discovery": (),
     "environments": (),
@@ -69,6 +69,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "transfer_a_to_b": ("sweep", "pushing", "2"),
     "vector": (),
 }
+SHORT = (
+    *("augmentation", "own_backend", "own_curriculum", "own_rl_learner", "own_task"),
+    *("sim_to_sim", "train_and_evaluate", "transfer_a_to_b"),
+)
 LEARNING = {"train_and_evaluate"}  # they need the extra "train", which few machines have
 
 
@@ -79,6 +83,12 @@ def test_examples_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
         pytest.importorskip("stable_baselines3")
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"))["main"](*EXAMPLES[name])
     assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_examples_of_training_are_short(name: str) -> None:
+    """Each has fewer than 60 lines, so that it is read in one go."""
+    assert len((ROOT / "examples" / f"{name}.py").read_text().splitlines()) < 60
 
 
 def test_import_is_silent_and_light() -> None:

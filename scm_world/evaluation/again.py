@@ -23,7 +23,7 @@ from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
 from scm_world.queries.progress import Progress
-from scm_world.tasks import TASKS, Task
+from scm_world.tasks import Task, tasks
 from scm_world.world.start import whole_number
 
 
@@ -99,12 +99,16 @@ def _place(about: Mapping[str, Any], task: Task | None, trusted: Sequence[str]) 
             made = about.get("class", about["task"])
             raise UnknownOption("task", task, (f"{made} with {about['arguments']}",))
         return place
-    if "class" in about or about["task"] not in TASKS:
-        allowed = (*TASKS, "one of your own, if it is given: task=")
+    if about["task"] not in tasks():
+        allowed = (*tasks(), "one of your own, if it is given: task=")
         raise UnknownOption("task", about.get("class", about["task"]), allowed)
     if about["arguments"]:
         options["task_options"] = about["arguments"]
-    return Place(about["task"], options)
+    place = Place(about["task"], options)
+    mine = place.about().get("class", place.name)
+    if mine != about.get("class", place.name):
+        raise UnknownOption("task", mine, (about.get("class", place.name),))
+    return place
 
 
 def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[Seat]:

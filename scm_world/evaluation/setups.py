@@ -15,12 +15,12 @@ from scm_world.backends import backends
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
-from scm_world.evaluation.benchmark import ROLES, protocols_of
+from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.forms import form_of, in_form, shared_options, task_for
 from scm_world.evaluation.protocols import Protocol, chosen
 from scm_world.evaluation.seats import Entry, Seat, entries_of, source_of
 from scm_world.queries.experiments.versions import versions
-from scm_world.tasks import TASKS, Task
+from scm_world.tasks import TASKS, Task, tasks
 from scm_world.world.start import whole_number
 
 SHARD = 25
@@ -64,7 +64,7 @@ class Place:
             ModelError: Something of it cannot be written down.
         """
         arguments = {} if isinstance(self.task, str) else self.task.given
-        kind = TASKS[self.task] if isinstance(self.task, str) else type(self.task)
+        kind = tasks()[self.task] if isinstance(self.task, str) else type(self.task)
         own = {} if kind is TASKS.get(self.name) else {"class": _class(kind)}
         try:
             return json.loads(  # type: ignore[no-any-return]
@@ -226,7 +226,7 @@ def prepare(
     for engine in engines:
         if not isinstance(engine, str) or engine not in backends():
             raise UnknownOption("backend", engine, backends())
-    known = protocols_of(place.name) if place.name in ROLES or protocols is None else ()
+    known = protocols_of(place.name) if place.name in tasks() or protocols is None else ()
     wanted = chosen(protocols, known)
     count = whole_number("n", n, least=1)
     noises = tuple(_seed(seed) for seed in _several("seeds", seeds))
@@ -276,8 +276,8 @@ def _seated(entries: Sequence[Entry], place: Place, shared: ScmWorldEnv) -> Iter
 def _place(task: Task | str | None, env: Any, entries: Sequence[Entry]) -> Place:
     agents = [(entry.agent, entry.made_for) for entry in entries]
     task = task_for(task, agents)
-    if not isinstance(task, Task) and (not isinstance(task, str) or task not in TASKS):
-        raise UnknownOption("task", task, TASKS)
+    if not isinstance(task, Task) and (not isinstance(task, str) or task not in tasks()):
+        raise UnknownOption("task", task, tasks())
     if not isinstance(env, Mapping | None):
         raise UnknownOption("env", env, ("options of the environment, by name",))
     allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]

@@ -21,7 +21,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.policies import Sequence as Given
 from scm_world.queries.stages import Stage, stage_of
 from scm_world.queries.traces import Trace, begin, run
-from scm_world.tasks import TASKS, make_task
+from scm_world.tasks import make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import World
 
@@ -172,8 +172,8 @@ def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
 
 
 def _stage(about: dict[str, Any]) -> Stage:
-    if about["task"] not in TASKS:
-        raise UnknownOption("task", about["task"], (*TASKS, "any, with world=World(your task)"))
+    if about["task"] not in tasks():
+        raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))
     return Stage(World(make_task(about["task"], **about["arguments"]), **about["options"]))
 
 

@@ -158,6 +158,7 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
     "sweep": cache(Sweep),
     "across": cache(partial(Sweep, across=True)),
     "grasp": Grasp,
+    "hold": partial(Grasp, holds=True),
     "mpc": cache(CrossEntropy),
 }
 """Policies that have a name."""
@@ -168,8 +169,8 @@ def as_policy(given: Any) -> Policy:
 
     Args:
         given: A policy, actions, ``"random"``, ``"sweep"`` (to the middle), ``"across"``
-            (one finger), ``"grasp"`` (blocks, to their goals), ``"mpc"`` (plans), or None: where
-            the robot begins it stays.
+            (one finger), ``"grasp"`` (blocks, to their goals), ``"hold"`` (likewise, but the last
+            block is not let go of), ``"mpc"`` (plans), or None: where the robot begins it stays.
 
     Raises:
         ActionError: It is none of these.

@@ -12,6 +12,8 @@ Terms:
         it is felt within about 10 cm. Tasks with one block.
     reward.goal_kernel_fine: The same with a sharper kernel, felt within about 2 cm.
     reward.corners_to_goal: How much nearer the corners came to those of the goal [m].
+    reward.tip_behind_block: How much nearer the nearest fingertip came to the point behind the
+        block from where it can be pushed to the goal [m].
     reward.reach_kernel: How near the fingertips are to their goals, in [0, 1]. Reaching.
     reward.reach_kernel_fine: The same with a sharper kernel.
 
@@ -36,6 +38,8 @@ from scm_world.variables import Function, Measured, Parent
 
 COARSE = 30.0  # [1/m] the kernel falls to a half at 6 cm
 FINE = 150.0  # [1/m] and here at 12 mm
+BEHIND = 0.05  # [m] from the center of a block to where a fingertip pushes it
+NEAR = 0.01  # [m] nearer to the goal, where to push from moves towards the center of the block
 
 _TOOL, _GOAL = "tool_block", "goal_block"
 _MOVES = ("cartesian_position", "orientation")
@@ -124,6 +128,35 @@ def corners_progress(
 
 
 @njit(cache=True)
+def pushing_distance(tips: Floats, block: Floats, goal: Floats) -> float:
+    """Compute how far the nearest fingertip is from behind the block, seen from its goal [m].
+
+    Args:
+        tips: Shape (9,) [m].
+        block: Center, shape (3,) [m].
+        goal: Center, shape (3,) [m].
+    """
+    x, y = goal[0] - block[0], goal[1] - block[1]
+    scale = BEHIND / max(math.sqrt(x * x + y * y), NEAR)
+    nearest = math.inf
+    for finger in range(3):
+        dx = tips[3 * finger] - block[0] + scale * x
+        dy = tips[3 * finger + 1] - block[1] + scale * y
+        dz = tips[3 * finger + 2] - block[2]
+        nearest = min(nearest, dx * dx + dy * dy + dz * dz)
+    return math.sqrt(nearest)
+
+
+@njit(cache=True)
+def pushing_progress(
+    tips: Floats, tips_before: Floats, block: Floats, block_before: Floats, goal: Floats
+) -> float:
+    """Compute how much nearer the nearest fingertip came to behind the block [m]."""
+    before = pushing_distance(tips_before, block_before, goal)
+    return before - pushing_distance(tips, block, goal)
+
+
+@njit(cache=True)
 def reach_kernel(
     tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Floats, sharpness: Value
 ) -> float:
@@ -183,6 +216,16 @@ ONE_BLOCK: tuple[Measured, ...] = (
         corners_progress,
         (*_BLOCK, *(Parent(f"{_TOOL}.{part}", 1) for part in _MOVES), *_WANTED),
         "How much nearer the corners of the block came to those of the goal [m].",
+    ),
+    term(
+        "reward.tip_behind_block",
+        pushing_progress,
+        (
+            *("end_effector_positions", Parent("end_effector_positions", 1)),
+            *(f"{_TOOL}.cartesian_position", Parent(f"{_TOOL}.cartesian_position", 1)),
+            f"{_GOAL}.cartesian_position",
+        ),
+        "How much nearer a fingertip came to where it can push the block to its goal [m].",
     ),
 )
 """Terms of tasks with one block and one goal."""

@@ -58,9 +58,10 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
         UnwritableFolder: There is no room, or no permission; those before are still there.
     """
     made(folder)
+    for left in folder.glob(".*.part"):  # somebody was killed while it was written
+        shutil.rmtree(left, ignore_errors=True)
     target = folder / str(checkpoint.steps)
     draft = target.with_name(f".{target.name}.part")
-    shutil.rmtree(draft, ignore_errors=True)
     arrays = {name: np.ascontiguousarray(array) for name, array in checkpoint.tensors.items()}
     data = safetensors.numpy.save(arrays)
     state = {

@@ -74,6 +74,8 @@ def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
                     _fill(layer.bias, tensors[f"{name}.{number}.bias"])
         if "log_std" in tensors and recipe.algo == "ppo":
             _fill(model.policy.log_std, tensors["log_std"])
+        if recipe.algo == "td3":
+            model.actor_target.load_state_dict(model.actor.state_dict())
 
 
 def _differences(mine: NetworkPolicy, given: NetworkPolicy) -> list[str]:

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from scm_world.errors import UnknownOption
+from scm_world.errors import Diverged, UnknownOption
+from scm_world.evaluation.policies.trained import in_run
 from scm_world.evaluation.policies.weights import load_policy
+from scm_world.evaluation.zoo.shelf import PREFIX, path_of
 from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import locked, made
 from scm_world.queries.progress import Progress
@@ -22,11 +24,12 @@ from scm_world.training.learners import device_for, library, make_learner, torch
 from scm_world.training.memory import Memory
 from scm_world.training.recipe import Recipe
 from scm_world.training.runs import Run
-from scm_world.training.watching import Stopped, Watching, watch
+from scm_world.training.watching import Stopped, Watching, is_finite, watch
 from scm_world.training.worlds import Worlds, make_worlds
 from scm_world.world.start import whole_number
 
 EVERY = 60.0  # [s] between checkpoints
+LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
 
 Tell = Callable[[str], None]
 
@@ -84,7 +87,7 @@ def train(
         seed: Of everything that is drawn.
         backend: Name of the engine.
         steps: Control steps, in place of those of the recipe.
-        start: Policy file to begin with.
+        start: Policy to begin with: a file, the folder of a run, or one of the zoo.
         progress: Told how many steps are done, and how many there are.
         tell: Told in words what happens.
         device: ``"cpu"``, ``"cuda"``, or ``"auto"``.
@@ -106,17 +109,32 @@ def train(
     if steps is not None:
         recipe = with_steps(recipe, steps)
     number = whole_number("seed", seed, least=0)
+    if number > LARGEST_SEED:
+        raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
     count = None if threads is None else whole_number("threads", threads, least=1)
     where = device_for(recipe, device)
-    first = None if start is None else Path(start)
+    first = None if start is None else named(start)
     run = Run(Path(out), recipe, number, backend, count or 1, where, first)
     run.identity  # noqa: B018 # refuses a start that is not there before a folder is made
-    with locked_new(run.folder), _threads(run.threads):
+    with locked_new(run.folder), torch_threads(run.threads):
         worlds = make_worlds(recipe, backend=backend, seed=number, threads=count)
         try:
             return _trained(run, worlds, progress, tell or _nobody, every)
         finally:
             worlds.close()
+
+
+def named(start: Path | str) -> Path:
+    """Give the file of a policy: of a run, of the zoo, or the one that is given.
+
+    Raises:
+        UnknownOption: There is none of this name in the zoo.
+        UnreadableFile: The folder is of no run.
+    """
+    text = str(start)
+    if text.startswith(PREFIX):
+        return path_of(text)
+    return in_run(Path(text)) if Path(text).is_dir() else Path(text)
 
 
 def with_steps(recipe: Recipe, steps: int) -> Recipe:
@@ -138,10 +156,12 @@ def _trained(
     engine = worlds.engine
     for line in run.newer(engine):
         tell(line)
-    goes_on = run.open(engine)
     model = make_learner(
         run.recipe, worlds.vec_env, seed=run.seed, length=worlds.length, device=run.device
     )
+    if run.start is not None:
+        begin_with(model, run.recipe, run.start)
+    goes_on = run.open(engine)
     worlds.begin_with(run.seed)  # the algorithm has set other seeds
     memory = Memory(model, run.replay) if hasattr(model, "replay_buffer") else None
     watching = Watching(run, worlds, memory, run.card(engine), progress, tell, every)
@@ -150,8 +170,10 @@ def _trained(
         resumed(model, worlds, memory, checkpoint.tensors, checkpoint.state)
         watching.resume(checkpoint)
         tell(f"goes on after {checkpoint.steps:,} steps")
-    elif run.start is not None:
-        begin_with(model, run.recipe, run.start)
+    elif memory is not None:
+        memory.clear()
+    if getattr(model, "learning_starts", 0) >= run.recipe.steps:
+        tell(f"nothing will be learned: learning starts after {model.learning_starts:,} steps")
     left = run.recipe.steps - model.num_timesteps
     if left > 0:
         with _interruptible(watching, tell):
@@ -170,6 +192,10 @@ def _learn(model: Any, watching: Watching, left: int) -> None:
         model.learn(left, callback=watch(watching), reset_num_timesteps=False, log_interval=1)
     except Stopped:
         raise KeyboardInterrupt from None
+    except ValueError:
+        if is_finite(model.policy):
+            raise
+        raise Diverged(model.num_timesteps) from None  # torch found it before a round was over
     finally:
         model.logger.close()
 
@@ -190,7 +216,8 @@ def locked_new(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch have so many threads for a while; its last bits depend on them."""
     before = torch().get_num_threads()
     torch().set_num_threads(count)
     try:

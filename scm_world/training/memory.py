@@ -83,6 +83,11 @@ class Memory:
                 with suppress(OSError):
                     path.unlink()
 
+    def clear(self) -> None:
+        """Remove all files: nothing was added yet."""
+        for _, _, path in self._files():
+            path.unlink()
+
     def resume(self, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> None:
         """Fill the buffer as it was at a checkpoint.
 

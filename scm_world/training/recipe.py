@@ -23,7 +23,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
-from scm_world.tasks import TASKS
+from scm_world.tasks import TASKS, tasks
 from scm_world.training.paper import paper
 from scm_world.training.settings import (
     ALGORITHMS,
@@ -58,6 +58,14 @@ RESERVED = ("task", "backend", "render_mode", "normalize_actions")
 """Options of the environment that a recipe does not set."""
 
 SPARSE = {"weights": "sparse"}
+REWARDS = (
+    "terms",
+    "weights",
+    "fractional_reward_weight",
+    "dense_reward_weights",
+    "activate_sparse_reward",
+)
+"""Options of tasks that say what the reward is."""
 
 
 @final
@@ -107,8 +115,8 @@ class Recipe(Frozen):
     @field_validator("task")
     @classmethod
     def _known(cls, task: str) -> str:
-        if task not in TASKS:
-            raise UnknownOption("task", task, TASKS)
+        if task not in tasks():
+            raise UnknownOption("task", task, tasks())
         return task
 
     @field_validator("env")
@@ -118,6 +126,9 @@ class Recipe(Frozen):
         for name in env:
             if name not in known:
                 raise UnknownOption("option of the environment in a recipe", name, known)
+        if env.get("observation_mode") == "pixel":
+            allowed = ("structured", "full", "custom: networks here take vectors of numbers")
+            raise UnknownOption("observation_mode of a recipe", "pixel", allowed)
         try:
             return dict(json.loads(json.dumps(env, allow_nan=False)))
         except (TypeError, ValueError) as error:
@@ -149,6 +160,8 @@ class Recipe(Frozen):
                 allowed = ("constant", "linear", "adaptive with PPO")
                 raise UnknownOption(f"schedule of {self.algo}", "adaptive", allowed)
         kept: Any = self.settings
+        if self.algo == "ppo" and self.round < 2:
+            raise UnknownOption("n_steps of PPO in 1 world", 1, ("any whole number from 2 on",))
         if self.hindsight is not None and kept.n_steps > 1:
             raise UnknownOption("n_steps with hindsight", kept.n_steps, ("1",))
         if self.steps < self.round:
@@ -182,7 +195,9 @@ class Recipe(Frozen):
         if self.observations == "privileged":
             found["context"] = "observation"
         if self.hindsight is not None:
-            found |= {"goal_env": True, "task_options": SPARSE}
+            given = found.get("task_options") or {}
+            kept = {name: value for name, value in given.items() if name not in REWARDS}
+            found |= {"goal_env": True, "task_options": kept | SPARSE}
         return found
 
     @property
@@ -220,7 +235,7 @@ class Recipe(Frozen):
         """
         try:
             return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             advice = "give a file with the text of Recipe.to_json()"
             raise UnreadableFile(str(path), str(error), advice) from None
 
@@ -270,7 +285,7 @@ def recipe(
     """Make a recipe from a preset.
 
     Args:
-        task: Name of the task.
+        task: Name of the task; of one's own after ``scm_world.tasks.register``.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
         preset: ``"tuned"``: what we found to work best; ``"paper"``: the published settings.
         curriculum: See ``curriculum_of``; that of the preset if None.
@@ -290,7 +305,7 @@ def recipe(
         True
     """
     for what, given, known in (
-        ("task", task, TASKS),
+        ("task", task, tasks()),
         ("algorithm", algo, ALGORITHMS),
         ("preset", preset, PRESETS),
     ):
@@ -298,6 +313,8 @@ def recipe(
             raise UnknownOption(what, given, known)
     fields: dict[str, Any] = {"task": task, "algo": algo, "name": preset}
     fields |= PRESETS[preset](task, algo)
+    if task not in TASKS:
+        fields["trials"] = merged(fields.get("trials", {}), {"protocols": ("P0",)})
     if curriculum is not None:
         fields["curriculum"] = curriculum
     return _made(_with_hindsight(changed(fields, changes), changes))

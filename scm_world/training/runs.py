@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.errors import UnreadableFile
-from scm_world.output.durable import write_whole
+from scm_world.evaluation.setups import Place
+from scm_world.output.durable import draft_of, write_whole
 from scm_world.queries.experiments.versions import versions
 from scm_world.training.checkpoints import checkpoints
 from scm_world.training.recipe import Recipe
@@ -90,7 +91,9 @@ class Run:
             except OSError as error:
                 advice = "give a policy file to start from"
                 raise UnreadableFile(str(self.start), str(error), advice) from None
+        own = Place(self.recipe.task).about().get("class")
         return {
+            **({} if own is None else {"class": own}),
             "recipe": self.recipe.as_dict(),
             "seed": self.seed,
             "backend": self.backend,
@@ -121,7 +124,7 @@ class Run:
         """
         if self.about.exists():
             self._compare(read_about(self.about))
-        elif self.folder.exists() and (strangers := sorted(p.name for p in self.folder.iterdir())):
+        elif strangers := strangers_in(self.folder, self.about):
             reason = f"there is no training in it, but {', '.join(strangers[:5])}"
             raise UnreadableFile(str(self.folder), reason, "give an empty folder, or a new one")
         data = {"format": FORMAT, **self.card(engine)}
@@ -148,6 +151,12 @@ class Run:
             for name, now in self.card(engine)["versions"].items()
             if before.get(name, now) != now
         ]
+
+
+def strangers_in(folder: Path, about: Path) -> list[str]:
+    """Name what is in a folder besides the draft of a file, which a crash may leave there."""
+    names = (path.name for path in folder.iterdir()) if folder.exists() else ()
+    return sorted(name for name in names if name != draft_of(about).name)
 
 
 def read_about(path: Path) -> dict[str, Any]:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, Literal, Self, final
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.variables.spaces import Frozen
 
 Count = Annotated[int, Field(ge=1)]
-Positive = Annotated[float, Field(gt=0.0)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+AUTO = r"^auto(_(0\.\d*[1-9]\d*|[1-9]\d*(\.\d+)?))?$"
 
 
 class Settings(Frozen):
@@ -76,6 +78,13 @@ class OffPolicy(Settings):
     gradient_steps: Annotated[int, Field(ge=-1)] = 8
     n_steps: Count = 3
 
+    @field_validator("gradient_steps")
+    @classmethod
+    def _some(cls, number: int) -> int:
+        if number == 0:
+            raise UnknownOption("gradient_steps", 0, ("any whole number from 1 on", "-1"))
+        return number
+
 
 @final
 class Sac(OffPolicy):
@@ -87,8 +96,8 @@ class Sac(OffPolicy):
         target_update_interval: Updates between those of the target network.
     """
 
-    ent_coef: Annotated[str, Field(pattern=r"^auto(_\d+(\.\d+)?)?$")] | NotNegative = "auto"
-    target_entropy: Literal["auto"] | float = "auto"
+    ent_coef: Annotated[str, Field(pattern=AUTO)] | NotNegative = "auto"
+    target_entropy: Literal["auto"] | Finite = "auto"
     target_update_interval: Count = 1
 
 
@@ -150,6 +159,13 @@ class Rate(Frozen):
     lowest: Positive = 1e-5
     highest: Positive = 1e-2
 
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.lowest > self.highest:
+            allowed = (f"at most {self.highest}, the highest rate",)
+            raise UnknownOption("lowest learning rate", self.lowest, allowed)
+        return self
+
 
 @final
 class Network(Frozen):
@@ -165,7 +181,7 @@ class Network(Frozen):
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 256)
     activation: Literal["tanh", "relu"] = "tanh"
-    log_std: float = 0.0
+    log_std: Finite = 0.0
     orthogonal: bool = True
     scaled: bool = False
 
@@ -221,5 +237,7 @@ def refused(what: str, error: ValidationError) -> ScmWorldError:
     if isinstance(cause, ScmWorldError):
         return cause
     path = ".".join(str(step) for step in first["loc"]) or "value"
+    if first["type"] == "extra_forbidden":
+        return UnknownOption(f"field {path!r} of {what}", first["input"], ("nothing: none such",))
     said = str(first["msg"])
     return UnknownOption(f"{path} of {what}", first["input"], (said[:1].lower() + said[1:],))

@@ -54,15 +54,17 @@ COMMON: Mapping[str, Fields] = {
 
 _PUSHING: Fields = {
     "terms": [
+        "reward.tip_behind_block",
         "reward.corners_to_goal",
         "reward.goal_kernel",
         "reward.goal_kernel_fine",
         "reward.speed",
     ],
     "weights": {
-        "reward.tips_to_block": 10.0,
+        "reward.tips_to_block": 0.0,
         "reward.block_to_goal": 0.0,
         "reward.orientation": 0.0,
+        "reward.tip_behind_block": 20.0,
         "reward.corners_to_goal": 30.0,
         "reward.goal_kernel": 0.1,
         "reward.goal_kernel_fine": 0.1,
@@ -79,6 +81,7 @@ _SEEN = [
     *_ROBOT,
     *(f"tool_block.{part}" for part in (*_POSE, *_MOTION)),
     *(f"goal_block.{part}" for part in _POSE),
+    "joint_torques",
 ]
 """All that moves. Without the time, what is learned in short episodes holds in long ones."""
 
@@ -138,6 +141,8 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         None: {
             "env": {
                 "task_options": _PUSHING,
+                "delta_scale": 0.04,
+                "delta_origin": "command",
                 "observation_mode": "custom",
                 "observe": _SEEN,
             },
@@ -146,9 +151,9 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
         },
         "ppo": {
             "steps": 2_000_000,
-            "settings": {"n_steps": 16, "batch_size": 256},
+            "settings": {"n_steps": 32, "batch_size": 512},
             "rate": {"initial": 5e-4, "schedule": "adaptive", "target_kl": 0.02, "lowest": 5e-5},
-            "network": {"log_std": -1.0, "scaled": True},
+            "network": {"scaled": True},
         },
     },
     "picking": {

@@ -108,7 +108,7 @@ class Watching:
 
     def _check(self, model: Any) -> None:
         """Refuse weights that are no numbers, before they are kept."""
-        if not all(bool(part.isfinite().all()) for part in model.policy.parameters()):
+        if not is_finite(model.policy):
             raise Diverged(model.num_timesteps)
 
     def _say(self, steps: int) -> None:
@@ -116,8 +116,9 @@ class Watching:
             self._progress(min(steps, self.run.recipe.steps), self.run.recipe.steps)
 
     def _adapt(self, model: Any) -> None:
+        """Follow the divergence, unless the policy stayed as it was in the last update."""
         divergence = model.logger.name_to_value.get("train/approx_kl")
-        if divergence is not None:
+        if divergence is not None and model.policy.action_net.bias.requires_grad:
             model.learning_rate.adapt(float(divergence))
 
     def _warm_up(self, model: Any) -> None:
@@ -162,9 +163,9 @@ class Watching:
 
     def _try(self, model: Any) -> None:
         """Evaluate, if it is time, and keep the policy if none was better."""
-        trials, recipe = self.run.recipe.trials, self.run.recipe
-        due = trials.times * model.num_timesteps // recipe.steps
-        if not trials.protocols or due <= self._tries:
+        recipe = self.run.recipe
+        due = self._due(model.num_timesteps)
+        if not recipe.trials.protocols or due <= self._tries:
             return
         self._tries = due
         policy = exported(model, recipe, self._said(model))
@@ -178,6 +179,10 @@ class Watching:
             card = {"trial": {"steps": trial.steps, "scores": dict(trial.scores)}}
             save_policy(self.run.best, policy, policy.about.with_card(**card))
 
+    def _due(self, steps: int) -> int:
+        """Tell how many evaluations there should have been after so many steps."""
+        return self.run.recipe.trials.times * steps // self.run.recipe.steps
+
     def _said(self, model: Any) -> dict[str, Any]:
         wall, cpu = self.spent
         return {**self._card, "steps": model.num_timesteps, "wall_s": wall, "cpu_s": cpu}
@@ -185,12 +190,13 @@ class Watching:
     # --- checkpoints ------------------------------------------------------------------------------
 
     def keep(self, model: Any) -> Path:
-        """Write a checkpoint, and the policy."""
+        """Write the policy, and a checkpoint: after the last one nothing is left to do."""
+        policy = exported(model, self.run.recipe, self._said(model))
+        save_policy(self.run.policy, policy)
         tensors, state = taken(model, self._worlds, self._memory)
         mine = {
             "spent": list(self.spent),
             "row": self._row,
-            "tries": self._tries,
             "score": self.score,
             "ended": [astuple(one) for one in self._worlds.episodes.ended],
         }
@@ -199,17 +205,24 @@ class Watching:
         if self._memory is not None:
             oldest = int(checkpoints(self.run.checkpoints)[0].name)
             self._memory.forget(oldest // self.run.recipe.worlds)
-        policy = exported(model, self.run.recipe, self._said(model))
-        save_policy(self.run.policy, policy)
         self._kept = time.perf_counter()
         return place
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Go on where a checkpoint was written."""
+        """Go on where a checkpoint was written, perhaps of a training that has become longer."""
         mine = checkpoint.state["watching"]
         self._spent = (mine["spent"][0], mine["spent"][1])
-        self._row, self._tries, self.score = mine["row"], mine["tries"], mine["score"]
+        self._row, self.score = mine["row"], mine["score"]
+        self._tries = self._due(checkpoint.steps)
         self._worlds.episodes.ended[:] = [Ended(*one) for one in mine["ended"]]
+
+
+def is_finite(policy: Any) -> bool:
+    """Tell whether all weights of a policy, and its standard deviations, are finite numbers."""
+    parts = list(policy.parameters())
+    if hasattr(policy, "log_std"):
+        parts += [policy.log_std.exp(), (-policy.log_std).exp()]
+    return all(bool(part.isfinite().all()) for part in parts)
 
 
 def _words(trial: Trial) -> str:

@@ -71,12 +71,13 @@ def make_worlds(recipe: Recipe, *, backend: str, seed: int, threads: int | None 
     crew = fastest(backend, recipe.worlds, workers=None)
     several = {"native": {"threads": threads}, "processes": {"workers": threads}}.get(crew, {})
     envs = make_vec(
-        ENV_IDS[recipe.task],
+        ENV_IDS.get(recipe.task, ENV_IDS["general"]),  # the task decides, not the id
         recipe.worlds,
         curriculum_of(recipe.curriculum),
         vectorization_mode=crew,
         autoreset_mode=AutoresetMode.SAME_STEP,
         backend=backend,
+        task=recipe.task,
         **several,
         **recipe.trained_in,
     )

@@ -12,7 +12,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.scene import PhysicalState
 from scm_world.scene.feasibility import TOLERANCE, overlaps
-from scm_world.tasks import TASKS, Task, make_task
+from scm_world.tasks import Task, make_task, tasks
 from scm_world.variables import Measured, Subset
 from scm_world.variables.checks import check_bounds, check_subset
 from scm_world.variables.subsets import AnyRegion
@@ -88,7 +88,7 @@ def the_task(task: Any) -> Task:
     if isinstance(task, str):
         return make_task(task)
     made = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
-    raise UnknownOption("task", task, (*TASKS, f"a task that is made, such as {made}"))
+    raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {made}"))
 
 
 def the_backend(backend: Any) -> Backend:

@@ -64,6 +64,18 @@ def test_corners_come_nearer() -> None:
     assert shaping.corners_progress(SIZE, np.zeros(3), still, np.zeros(3), turned, *want) > 0.01
 
 
+def test_a_block_is_pushed_from_behind() -> None:
+    """Five centimeters behind it, seen from the goal; the nearest fingertip counts."""
+    block, goal = np.array([0.0, -0.08, 0.03]), np.array([0.0, 0.02, 0.03])
+    behind = np.array([0.0, -0.13, 0.03])
+    tips = np.concatenate([behind, behind + 1.0, behind - 1.0])
+    assert shaping.pushing_distance(tips, block, goal) == pytest.approx(0.0, abs=1e-12)
+    away = tips + np.tile([0.03, 0.0, 0.04], 3)
+    assert shaping.pushing_progress(tips, away, block, block, goal) == pytest.approx(0.05)
+    there = np.concatenate([goal, goal, goal])
+    assert shaping.pushing_distance(there, goal, goal) == 0.0
+
+
 def test_the_fingertips_have_a_kernel_each() -> None:
     """Its mean over the three; speed is a norm."""
     tips, goals = np.arange(9) / 100, np.zeros((3, 3))

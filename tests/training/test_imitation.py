@@ -56,6 +56,31 @@ def constant(action: float) -> NetworkPolicy:
     return NetworkPolicy.of(tensors, {"task": "picking"})
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"action_mode": "delta_joint_positions"},
+        {"action_mode": "delta_joint_positions", "delta_scale": 0.1, "delta_origin": "measured"},
+        {"action_mode": "delta_end_effector_positions", "delta_scale": 0.2},
+        {"action_mode": "delta_joint_positions", "normalize_actions": False},
+    ],
+)
+def test_an_action_does_what_a_command_says(options: dict[str, Any]) -> None:
+    """Whatever actions mean, the one that stands for a command within reach is that command."""
+    env = ScmWorldEnv("picking", **options)
+    env.reset(seed=0)
+    env.step(np.zeros(9, np.float32))
+    mode = options.get("action_mode", "joint_positions").removeprefix("delta_")
+    command = np.clip(env.world[mode] + 0.01, env.world.action_low, env.world.action_high)
+
+    action: Any = env.toward(command)
+    env.step(action)
+
+    np.testing.assert_allclose(env.world["action"], command, atol=1e-12)
+    env.close()
+
+
 def test_demonstrations_follow_from_the_seed_and_the_number() -> None:
     """An episode is the same, whichever ones are shown with it."""
     both, school = shown(2), School(lesson("picking", **QUICK), backend="mujoco", seed=0)

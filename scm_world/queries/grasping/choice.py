@@ -64,16 +64,19 @@ class Choice:
 
     Args:
         sight: Of the world.
+        holds: Whether the block with the highest goal is held there, even if it could stand.
     """
 
-    def __init__(self, sight: Sight) -> None:
+    def __init__(self, sight: Sight, *, holds: bool = False) -> None:
         self._sight = sight
         self._bodies = sight.solid()
         self._goals = {goal: sight.body(goal) for _, goal in sight.pairs}
         height = {goal: float(body.place[2]) for goal, body in self._goals.items()}
+        pairs = sorted(sight.pairs, key=lambda pair: height[pair[1]])
+        self._kept = pairs[-1][1] if holds and pairs else None
         self._todo = [
             (tool, goal)
-            for tool, goal in sorted(sight.pairs, key=lambda pair: height[pair[1]])
+            for tool, goal in pairs
             if sight.filled(tool, goal) < self._enough() or self._hangs(tool, goal)
         ]
 
@@ -100,11 +103,14 @@ class Choice:
         return ENOUGH if self._sight.left > LATE else FAIR
 
     def _hangs(self, tool: str, goal: str) -> bool:
-        """Tell whether there is nothing below a goal, so that its block must be held there."""
+        """Tell whether a block is held at its goal: there is nothing below, or it is asked for."""
         end = self._goals[goal]
-        return end.bottom > ON_FLOOR and not any(
-            abs(end.bottom - body.top) < ON_TOP and end.depth_in(body, flat=True) > 0.0
-            for body in self._others(tool)
+        return goal == self._kept or (
+            end.bottom > ON_FLOOR
+            and not any(
+                abs(end.bottom - body.top) < ON_TOP and end.depth_in(body, flat=True) > 0.0
+                for body in self._others(tool)
+            )
         )
 
     def _waits(self, tool: str, goal: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any, final
 from weakref import WeakKeyDictionary
@@ -93,6 +94,8 @@ class Grasp:
 
     Args:
         pace: How fast it is; ``Pace()`` if None.
+        holds: Whether the last block is not let go of, but held at its goal. That is easier to
+            imitate: what fingers do while they let go depends on what they did before.
 
     Example:
         >>> from scm_world.queries import World
@@ -102,13 +105,13 @@ class Grasp:
         True
     """
 
-    def __init__(self, pace: Pace | None = None) -> None:
-        self.pace = pace or Pace()
+    def __init__(self, pace: Pace | None = None, *, holds: bool = False) -> None:
+        self.pace, self.holds = pace or Pace(), holds
         self._programs: WeakKeyDictionary[World, _Program] = WeakKeyDictionary()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle without what is going on."""
-        return Grasp, (self.pace,)
+        return partial(Grasp, holds=self.holds), (self.pace,)
 
     def __call__(self, world: World) -> Floats:
         """Give the action of the present step.
@@ -121,7 +124,7 @@ class Grasp:
             raise ActionError(problem, world.action_mode)
         program = self._programs.get(world)
         if program is None or not program.goes_on(world):
-            program = self._programs[world] = _Program(world, self.pace)
+            program = self._programs[world] = _Program(world, self.pace, holds=self.holds)
         return program.action(world)
 
 
@@ -129,8 +132,8 @@ class Grasp:
 class _Program:
     """What is done in one episode, as a generator of steps."""
 
-    def __init__(self, world: World, pace: Pace) -> None:
-        self._pace = pace
+    def __init__(self, world: World, pace: Pace, *, holds: bool) -> None:
+        self._pace, self._holds = pace, holds
         self._sight = Sight(world)
         self._unit, self._next = _unit(world), world.index
         self._tips = self._sight.hand.tips(self._sight.joints)
@@ -151,7 +154,7 @@ class _Program:
 
     def _work(self) -> Iterator[Step]:
         while True:
-            job = Choice(self._sight).job()
+            job = Choice(self._sight, holds=self._holds).job()
             if job is None:
                 yield from self._rise(SAFE)
                 for _ in range(AGAIN):

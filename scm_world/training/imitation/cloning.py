@@ -25,9 +25,9 @@ from scm_world.training.imitation.demonstrations import (
 from scm_world.training.imitation.fitting import fitted
 from scm_world.training.imitation.lessons import Lesson
 from scm_world.training.learners import torch
-from scm_world.training.loop import Tell
+from scm_world.training.loop import Tell, torch_threads
 from scm_world.training.recipe import Recipe
-from scm_world.training.runs import differences
+from scm_world.training.runs import differences, strangers_in
 from scm_world.training.trials import tried
 from scm_world.world.start import whole_number
 
@@ -106,7 +106,7 @@ def clone(
         lesson = given.lesson
     school = None if given else School(lesson, backend=backend, seed=number)
     try:
-        with locked(folder):
+        with locked(folder), torch_threads(1):
             course = _Course(folder, lesson, number, backend, progress, tell or (lambda _: None))
             course.open(given)
             return course.run(given, school)
@@ -198,8 +198,7 @@ class _Course:
                 reason = f"it holds other work: {'; '.join(wrong)}"
                 raise UnreadableFile(str(self.folder), reason, "give another folder")
             return
-        strangers = sorted(one.name for one in self.folder.iterdir())
-        if strangers:
+        if strangers := strangers_in(self.folder, about):
             reason = f"there is no clone in it, but {', '.join(strangers[:5])}"
             raise UnreadableFile(str(self.folder), reason, "give an empty folder, or a new one")
         write_whole(json.dumps({"format": FORMAT, **identity}, indent=2), about)
@@ -236,7 +235,8 @@ class _Course:
 
     def _learned(self, round_: int, shown: Demonstrations, engine: str) -> NetworkPolicy:
         """Fit a network in a round, or read the one that was fitted before."""
-        path = made(self.folder / "rounds") / f"{round_:02}.safetensors"
+        path = self._round(round_)
+        made(path.parent)
         if not path.exists():
             self.tell(
                 f"round {round_}: learns from {len(shown):,} control steps, of "
@@ -250,6 +250,9 @@ class _Course:
             self.tell(f"round {round_}: loss {found.loss:.4f}; {said or 'not evaluated'}")
             save_policy(path, policy, policy.about.with_card(trials=scores, versions=made_with))
         return load_policy(str(path))
+
+    def _round(self, number: int) -> Path:
+        return self.folder / "rounds" / f"{number:02}.safetensors"
 
     def _about(self, round_: int, shown: Demonstrations, loss: float) -> PolicyAbout:
         lesson = self.lesson
@@ -276,7 +279,7 @@ class _Course:
 
     def _finished(self) -> Cloned:
         """Put the policies where they are looked for."""
-        policies = [load_policy(str(path)) for path in sorted((self.folder / "rounds").iterdir())]
+        policies = [load_policy(self._round(number)) for number in range(self.lesson.rounds + 1)]
         means = [_mean(policy.about.card.get("trials")) for policy in policies]
         last, best = self.folder / "policy.safetensors", self.folder / "best.safetensors"
         save_policy(last, policies[-1])

@@ -13,7 +13,7 @@ from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.policies.cards import OPTIONS
 from scm_world.evaluation.protocols import Protocol, chosen
 from scm_world.queries.policies import NAMED
-from scm_world.tasks import TASKS
+from scm_world.tasks import tasks
 from scm_world.training.settings import (
     Count,
     Network,
@@ -80,8 +80,8 @@ class Lesson(Frozen):
     @field_validator("task")
     @classmethod
     def _known(cls, task: str) -> str:
-        if task not in TASKS:
-            raise UnknownOption("task", task, TASKS)
+        if task not in tasks():
+            raise UnknownOption("task", task, tasks())
         return task
 
     @field_validator("teacher")
