@@ -29,6 +29,7 @@ from scm_world.evaluation.zoo import page as zoo_page
 from scm_world.evaluation.zoo import shelf
 from scm_world.evaluation.zoo.texts import COMMAND, LIMITS, RESULTS, SCORES
 from scm_world.output.durable import write_whole
+from scm_world.training.recipe import Recipe, recipe
 
 LARGEST = 1_000_000  # [bytes] of a file in the package
 PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
@@ -78,16 +79,24 @@ def command_of(card: Mapping[str, Any]) -> str:
     """Give the command that trains such a policy, from its card.
 
     Raises:
-        UnknownOption: The card does not say which recipe it was.
+        UnknownOption: The card does not say how, or in another way than a preset does.
     """
-    recipe = card.get("recipe")
-    if not isinstance(recipe, Mapping) or "task" not in recipe or "algo" not in recipe:
+    preset = _preset(card)
+    if preset is None or card.get("start") is not None:
         raise UnknownOption("command", None, ("the one that trained it: --command '…'",))
-    words = ["scm-world", "train", recipe["task"], "--algo", recipe["algo"]]
-    words += ["--preset", recipe["name"]] if recipe.get("name") not in (None, "own") else []
-    words += ["--backend", card.get("backend", "mujoco"), "--seed", card.get("seed", 0)]
-    words += ["--steps", recipe["steps"]] if "steps" in recipe else []
+    words = ["scm-world", "train", preset.task, "--algo", preset.algo, "--preset", preset.name]
+    words += ["--backend", card["backend"], "--seed", card["seed"], "--steps", preset.steps]
     return shlex.join(map(str, words))
+
+
+def _preset(card: Mapping[str, Any]) -> Recipe | None:
+    """Give the recipe of a card if nothing but its steps is another than in its preset."""
+    try:
+        made = Recipe.from_dict(card.get("recipe"))
+        usual = recipe(made.task, made.algo, preset=made.name, steps=made.steps)
+    except UnknownOption:
+        return None
+    return made if made == usual and {"backend", "seed"} <= card.keys() else None
 
 
 def published(

@@ -68,7 +68,7 @@ def train(
             "env.frame_skip=5; the value is JSON or a word. Give it once for each.",
         ),
     ] = None,
-    start: Annotated[Path | None, typer.Option(help="Policy file to begin with.")] = None,
+    start: Annotated[Path | None, typer.Option(help="Policy to begin with.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     evaluate: Annotated[
         bool,

@@ -21,6 +21,12 @@ from scm_world.training.runs import CHECKPOINTS
 
 INTERRUPTED = 130
 SET = "'--set'"
+OWN = {
+    "task": "none: the task stands before the options",
+    "algo": "none: give --algo",
+    "preset": "none: give --preset",
+}
+"""What is no change of a recipe, and where it is said."""
 
 
 @final
@@ -71,23 +77,26 @@ class Options:
     def made(self) -> Recipe:
         """Make the recipe."""
         changes = assigned(self.changes)
-        for name in ("observations", "worlds", "steps"):
-            value = getattr(self, name)
-            if value is not None:
-                changes[name] = value
-        if self.hindsight:
-            changes["hindsight"] = True
+        for name, value in self._given().items():
+            if name in changes:
+                raise ConflictingTargets((f"--{name}", f"--set {name}"), name)
+            changes[name] = value
+        for name in OWN:
+            if name in changes:
+                raise UnknownOption(f"{name} after --set", changes[name], (OWN[name],))
         if not self.evaluate:
             changes["trials.protocols"] = []
         if self.recipe is not None:
-            return self._loaded(self.recipe).but(curriculum=self.curriculum, **changes)
-        return recipe(
-            self.task,
-            self.algo or "ppo",
-            preset=self.preset or "tuned",
-            curriculum=self.curriculum,
-            **changes,
-        )
+            return self._loaded(self.recipe).but(**changes)
+        return recipe(self.task, self.algo or "ppo", preset=self.preset or "tuned", **changes)
+
+    def _given(self) -> dict[str, Any]:
+        """List the fields of the recipe that were given as options of their own."""
+        names = ("curriculum", "observations", "worlds", "steps")
+        given = {name: getattr(self, name) for name in names} | {
+            "hindsight": self.hindsight or None
+        }
+        return {name: value for name, value in given.items() if value is not None}
 
     def _loaded(self, path: Path) -> Recipe:
         """Read a recipe, which has a task and an algorithm of its own."""

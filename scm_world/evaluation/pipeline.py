@@ -6,13 +6,16 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, final
 
+from scm_world.errors import UnreadableFile
 from scm_world.evaluation.arena import Arena, Row
 from scm_world.evaluation.lockstep import Episodes, Lockstep
 from scm_world.evaluation.parts import read_part, write_part
 from scm_world.evaluation.policies import Player, as_player
 from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.seats import Seat
 from scm_world.evaluation.setups import SHARD, Setup, Shard, prepare
 from scm_world.evaluation.tables import columns_of
 from scm_world.output.durable import locked
@@ -77,9 +80,16 @@ class Bench:
         return self.locksteps[key]
 
     def player(self, seat: int) -> Player:
-        """Give who acts."""
+        """Give who acts.
+
+        Raises:
+            UnreadableFile: It is a file, and another one than it was when the evaluation began.
+        """
         if seat not in self.players:
-            self.players[seat] = as_player(self.setup.seats[seat].policy, trusted=self.trusted)
+            given = self.setup.seats[seat]
+            player = as_player(given.policy, trusted=self.trusted)
+            _refuse_another(player, given)
+            self.players[seat] = player
         return self.players[seat]
 
     def close(self) -> None:
@@ -90,6 +100,17 @@ class Bench:
             arena.close()
         self.locksteps.clear()
         self.arenas.clear()
+
+
+def _refuse_another(player: Player, seat: Seat) -> None:
+    """Refuse a file that was written anew meanwhile, as a training does it."""
+    if isinstance(seat.policy, str | Path):
+        then, now = (about.get("sha256") for about in (seat.about, player.about))
+        if then != now:
+            advice = "copy it if a training still writes it, and evaluate the copy"
+            raise UnreadableFile(
+                str(seat.policy), "it has changed since the evaluation began", advice
+            )
 
 
 def evaluate(

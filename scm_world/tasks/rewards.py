@@ -117,7 +117,7 @@ def further_terms(
         UnknownOption: A name stands for none, or a term is no measured number with a mechanism, or
             has the wrong name.
     """
-    single = isinstance(asked, str) or not isinstance(asked, Iterable)
+    single = isinstance(asked, str | Mapping) or not isinstance(asked, Iterable)
     offered = {term.name: term for term in ready}
     names = [*known, SUCCESS]
     found: list[Measured] = []

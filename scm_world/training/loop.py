@@ -77,9 +77,10 @@ def train(
 
     What is learned follows from the recipe, the seed, the engine, ``threads`` and the versions.
     If ``out`` holds a part of the same training, it goes on from its last checkpoint, also with
-    more steps than before if the learning rate does not depend on how many there are; on a CPU
-    the weights in the end are, bit for bit, those of a training that was not interrupted. Ctrl-C
-    lets it write a checkpoint after the present round, and end; a second one ends it at once.
+    more steps than before if neither the learning rate nor the ceiling of the standard deviations
+    depends on how many there are; on a CPU the weights in the end are, bit for bit, those of a
+    training that was not interrupted. Ctrl-C lets it write a checkpoint after the present round,
+    and end; a second one ends it at once.
 
     Args:
         recipe: How it is trained.

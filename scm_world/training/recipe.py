@@ -153,9 +153,13 @@ class Recipe(Frozen):
         if self.algo == "ppo" and self.hindsight is not None:
             raise UnknownOption("hindsight with PPO", True, ("none: it needs SAC or TD3",))
         if self.algo != "ppo":
-            for name in ("scale_rewards", "critic_warmup"):
-                if getattr(self, name):
-                    raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
+            own = {
+                "scale_rewards": self.scale_rewards,
+                "critic_warmup": self.critic_warmup > 0,
+                "log_std_end": self.network.log_std_end is not None,
+            }
+            for name in (name for name, given in own.items() if given):
+                raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
             if self.rate.schedule == "adaptive":
                 allowed = ("constant", "linear", "adaptive with PPO")
                 raise UnknownOption(f"schedule of {self.algo}", "adaptive", allowed)
@@ -187,6 +191,11 @@ class Recipe(Frozen):
         """Control steps in all worlds from one update to the next."""
         kept: Any = self.settings
         return self.worlds * int(kept.n_steps if self.algo == "ppo" else kept.train_freq)
+
+    @property
+    def may_grow(self) -> bool:
+        """Whether its beginning is the same, however long it is."""
+        return self.rate.schedule != "linear" and self.network.log_std_end is None
 
     @property
     def options(self) -> dict[str, Any]:

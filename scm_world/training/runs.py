@@ -110,7 +110,7 @@ class Run:
     def open(self, engine: str) -> bool:
         """Begin in the folder, or go on there.
 
-        A training may become longer, unless its learning rate depends on how long it is.
+        A training may become longer, unless its settings depend on how long it is.
 
         Args:
             engine: Name and version of the physics engine.
@@ -136,7 +136,7 @@ class Run:
         """Refuse another training."""
         wanted, steps = self.identity, self.recipe.steps
         before = there.get("recipe", {}).get("steps")
-        if self.recipe.rate.schedule != "linear" and isinstance(before, int) and before < steps:
+        if self.recipe.may_grow and isinstance(before, int) and before < steps:
             wanted = {**wanted, "recipe": {**wanted["recipe"], "steps": before}}
         if wrong := differences(there, wanted):
             reason = f"it holds another training: {'; '.join(wrong)}"

@@ -175,6 +175,8 @@ class Network(Frozen):
         hidden: Widths of its hidden layers.
         activation: What follows each of them.
         log_std: Logarithm of the standard deviation with which PPO begins.
+        log_std_end: Ceiling of it at the end of the training; it falls in a straight line from the
+            beginning. None: there is no ceiling.
         orthogonal: Whether PPO's weights begin as orthogonal matrices.
         scaled: Whether observations are multiplied by fixed scales first; see ``scales``.
     """
@@ -182,6 +184,7 @@ class Network(Frozen):
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 256)
     activation: Literal["tanh", "relu"] = "tanh"
     log_std: Finite = 0.0
+    log_std_end: Finite | None = None
     orthogonal: bool = True
     scaled: bool = False
 
@@ -238,6 +241,7 @@ def refused(what: str, error: ValidationError) -> ScmWorldError:
         return cause
     path = ".".join(str(step) for step in first["loc"]) or "value"
     if first["type"] == "extra_forbidden":
-        return UnknownOption(f"field {path!r} of {what}", first["input"], ("nothing: none such",))
+        allowed = ("nothing: there is no such field",)
+        return UnknownOption(f"{path} of {what}", first["input"], allowed)
     said = str(first["msg"])
     return UnknownOption(f"{path} of {what}", first["input"], (said[:1].lower() + said[1:],))

@@ -150,10 +150,10 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
             "curriculum": resample("goal_block.cylindrical_position", "A"),
         },
         "ppo": {
-            "steps": 2_000_000,
+            "steps": 1_200_000,
             "settings": {"n_steps": 32, "batch_size": 512},
             "rate": {"initial": 5e-4, "schedule": "adaptive", "target_kl": 0.02, "lowest": 5e-5},
-            "network": {"scaled": True},
+            "network": {"log_std_end": -2.5, "scaled": True},
         },
     },
     "picking": {
@@ -168,9 +168,10 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 }
 """What differs from that, by task and algorithm."""
 
-_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 500, "rounds": 0, "updates": 6_000}
+_PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
 
 LESSONS: Mapping[str, Fields] = {
+    "picking": {"updates": 4_000},
     "pick_and_place": _PLACED,
     "stacking2": {**_PLACED, "episodes": 350},
 }

@@ -17,7 +17,7 @@ from scm_world.training.curves import Curve
 from scm_world.training.episodes import Ended
 from scm_world.training.export import exported
 from scm_world.training.instants import taken
-from scm_world.training.learners import library
+from scm_world.training.learners import library, torch
 from scm_world.training.memory import Memory
 from scm_world.training.runs import Run
 from scm_world.training.trials import Trial, tried
@@ -85,6 +85,7 @@ class Watching:
         self._check(model)
         self._adapt(model)
         self._warm_up(model)
+        self._calm(model)
         if steps - self._row >= self.run.recipe.steps / ROWS:
             self._write_row(model)
         self._say(steps)
@@ -99,6 +100,7 @@ class Watching:
         self._check(model)
         if model.num_timesteps > self._row:
             self._adapt(model)
+            self._calm(model)
             self._write_row(model)
         self._say(model.num_timesteps)
         self._try(model)
@@ -130,6 +132,16 @@ class Watching:
         for part in (policy.mlp_extractor.policy_net, policy.action_net):
             part.requires_grad_(learns)
         policy.log_std.requires_grad_(learns)
+
+    def _calm(self, model: Any) -> None:
+        """Lower the ceiling of PPO's standard deviations."""
+        network = self.run.recipe.network
+        if network.log_std_end is None:
+            return
+        done = min(model.num_timesteps / self.run.recipe.steps, 1.0)
+        ceiling = network.log_std + done * (network.log_std_end - network.log_std)
+        with torch().no_grad():
+            model.policy.log_std.clamp_(max=ceiling)
 
     def _write_row(self, model: Any) -> None:
         self._row = model.num_timesteps

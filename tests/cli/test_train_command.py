@@ -51,6 +51,12 @@ def test_the_recipe_is_shown() -> None:
     assert made == wanted.but(**changes)
 
 
+def test_a_curriculum_is_a_change_like_others() -> None:
+    """With an option of its own, or after --set."""
+    found = called("pushing", "--set=curriculum=2", "--show-recipe")
+    assert Recipe.from_dict(json.loads(found.output)) == recipe("pushing", curriculum=2)
+
+
 def test_a_recipe_is_read_from_a_file(tmp_path: Path) -> None:
     """And may be changed."""
     path = tmp_path / "recipe.json"
@@ -77,6 +83,11 @@ WRONG = [
     (("pushing", "--set=n_step=5"), "n_steps"),
     (("pushing", "--set=n_steps=8", "--set=n_steps=9"), "n_steps"),
     (("pushing", "--recipe=none.json"), "none.json"),
+    (("pushing", "--set=curriculum=1", "--curriculum=2"), "--set curriculum"),
+    (("pushing", "--set=steps=8192", "--steps=8192"), "--set steps"),
+    (("pushing", "--set=task=picking"), "the task stands before"),
+    (("pushing", "--set=algo=sac"), "give --algo"),
+    (("pushing", "--set=preset=paper"), "give --preset"),
     (("pushing", "--seed=-1"), "seed"),
 ]
 

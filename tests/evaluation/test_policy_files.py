@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,15 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path, how: str, match: 
     assert "give " in str(caught.value)
 
 
+def test_what_is_no_file_is_not_opened(tmp_path: Path) -> None:
+    """A folder, or a pipe that nobody writes to, for which one would wait for ever."""
+    (tmp_path / "folder.safetensors").mkdir()
+    os.mkfifo(tmp_path / "pipe.safetensors")
+    for name in ("folder", "pipe"):
+        with pytest.raises(UnreadableFile, match="it is no file"):
+            load_policy(tmp_path / f"{name}.safetensors")
+
+
 def test_a_file_that_is_too_large_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +203,14 @@ NAN = np.full(9, np.nan, np.float32)
         ({**FULL, "log_std": np.zeros(9)}, "log_std: expected an array of float32, got float64"),
         ({**FULL, **tensors(55, 1, prefix="value.layers")}, "take 56 numbers, not 55"),
         ({**FULL, **tensors(56, 2, prefix="value.layers")}, "give 1 numbers, not 2"),
+        (
+            {
+                **FULL,
+                "layers.0.weight": np.array(1.0, np.float32),
+                **tensors(56, 1, prefix="value.layers"),
+            },
+            r"layers\.0: .*got \(\)",
+        ),
     ],
 )
 def test_tensors_that_do_not_fit_are_refused(given: dict[str, Any], match: str) -> None:
@@ -209,11 +227,14 @@ def test_tensors_that_do_not_fit_are_refused(given: dict[str, Any], match: str) 
         ({"task": "pushing", "activation": "gelu"}, "activation: "),
         ({"task": "pushing", "inputs": ("a", "a")}, "each once"),
         ({"task": "pushing", "card": {"x": object()}}, "card"),
+        ({"task": "pushing", "card": {"scores": [float("nan")]}}, "card: .*not finite"),
+        ('{"task": "pushing", "card": {"score": NaN}}', "card: .*not finite"),
+        ({"task": "pushing", "env": {"delta_scale": float("inf")}}, "env: .*not finite"),
         ({"task": "pushing", "colour": 1}, "colour: "),
     ],
 )
-def test_what_is_said_of_a_policy_is_checked(about: dict[str, Any], match: str) -> None:
-    """Every field has to be what the format says."""
+def test_what_is_said_of_a_policy_is_checked(about: Any, match: str) -> None:
+    """Every field has to be what the format says, as data and as text."""
     with pytest.raises(ModelError, match=match):
         save_policy("never.safetensors", FULL, about)
 

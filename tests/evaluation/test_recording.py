@@ -253,6 +253,21 @@ def test_recorded_actions_can_be_played(tmp_path: Path) -> None:
         as_player(f"{path}#2")
 
 
+@pytest.mark.parametrize("other", [{"delta_scale": 0.2}, {"delta_origin": "command"}], ids=repr)
+def test_recorded_relative_actions_keep_their_meaning(other: dict[str, Any]) -> None:
+    """Where an action of 1 is another distance, or from elsewhere, they are not played."""
+    how = {"action_mode": "delta_joint_positions", "delta_scale": 0.1, "delta_origin": "measured"}
+    player = as_player(record("random", make(**how), n=1)[0])
+    for options in (how, {**how, **other}):
+        env = make(**options).unwrapped
+        env.reset(seed=0)
+        if options == how:
+            player.begin(env)
+            continue
+        with pytest.raises(UnknownOption, match=next(iter(other))):
+            player.begin(env)
+
+
 def test_pairs_are_what_was_seen_and_done() -> None:
     """In single precision, and without the last instants."""
     recording = lived(goal_env=True)

@@ -10,7 +10,7 @@ import pytest
 from evaluation_samples import SHORT
 from policy_samples import RELATIVE, policy, trained
 
-from scm_world.errors import EvaluationError, UnknownOption
+from scm_world.errors import EvaluationError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation, WorldPolicy, check, evaluate, merge, why
 from scm_world.evaluation.forms import shared_options, task_for
 from scm_world.evaluation.pipeline import Bench
@@ -97,6 +97,26 @@ def test_finished_episodes_are_used_again(agents: dict[str, Any], tmp_path: Path
     assert parts == {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "parts").iterdir()}
     trained(Path(agents["one"]) / "policy.safetensors", seed=3, task="picking")
     assert small(agents, out=tmp_path / "out") != first
+
+
+def test_a_file_that_a_training_replaces_is_told_of(tmp_path: Path) -> None:
+    """What stands in the results is what acted, even if the file changes meanwhile."""
+    path = trained(tmp_path / "run" / "best.safetensors")
+    setup = prepare(
+        str(path.parent),
+        "P0",
+        task=None,
+        n=1,
+        seeds=0,
+        backend="fake",
+        env=SHORT,
+        trusted=None,
+    )
+    trained(path, seed=1)
+    bench = Bench(setup)
+    with pytest.raises(UnreadableFile, match="changed since the evaluation began"):
+        bench(setup.shards()[0])
+    bench.close()
 
 
 def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:

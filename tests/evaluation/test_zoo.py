@@ -15,16 +15,11 @@ from scm_world.evaluation import check, evaluate
 from scm_world.evaluation.policies import as_player, load_policy, player_from, save_policy
 from scm_world.evaluation.zoo import card, card_text, page, shelf, zoo
 from scm_world.evaluation.zoo.texts import best_known
+from scm_world.training.recipe import recipe
 
 PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
 CARD = {
-    "recipe": {
-        "task": "pushing",
-        "algo": "ppo",
-        "name": "tuned",
-        "steps": 1000,
-        "env": {"delta_scale": 0.1, "delta_origin": "measured"},
-    },
+    "recipe": recipe("pushing", steps=1_000_000).as_dict(),
     "seed": 4,
     "backend": "mujoco",
     "steps": 1024,
@@ -32,7 +27,9 @@ CARD = {
     "versions": {"numpy": "2.0", "mujoco": "3.3"},
     "trial": {"steps": 512, "scores": {"P0": 0.5}},
 }
-COMMAND = "scm-world train pushing --algo ppo --preset tuned --backend mujoco --seed 4 --steps 1000"
+COMMAND = (
+    "scm-world train pushing --algo ppo --preset tuned --backend mujoco --seed 4 --steps 1000000"
+)
 
 
 @pytest.fixture
@@ -144,6 +141,23 @@ def test_results_of_another_policy_are_not_published(folder: Path, tmp_path: Pat
         command_of({})
     assert not page_path.exists()
     assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"recipe": recipe("pushing", n_steps=31).as_dict()},
+        {"recipe": recipe("pushing", curriculum=2).as_dict()},
+        {"recipe": {"task": "pushing", "algo": "ppo"}},
+        {"start": "5f52"},
+    ],
+    ids=["settings", "curriculum", "part", "start"],
+)
+def test_a_command_that_would_train_something_else_is_not_made_up(other: dict[str, Any]) -> None:
+    """Where a recipe is none of the presets the command has to be given."""
+    assert command_of(CARD) == COMMAND
+    with pytest.raises(UnknownOption, match="--command"):
+        command_of({**CARD, **other})
 
 
 def test_large_policies_are_not_published(folder: Path, tmp_path: Path) -> None:

@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
+from scm_world.errors import (
+    ActionError,
+    InterventionError,
+    ModelError,
+    UnknownOption,
+    UnknownVariable,
+)
 from scm_world.geometry import from_rotation_vector
 from scm_world.queries import World
 from scm_world.queries.planning import CrossEntropy, Model, Score, Search, nearness
@@ -203,6 +209,21 @@ def test_the_end_of_a_plan_may_count_by_itself() -> None:
 # --- scores ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("given", ["joint_velocities", {"joint_velocities": -0.1, "gravity": 1.0}])
+def test_the_sum_of_several_numbers_counts(given: Any) -> None:
+    """Along a plan and at its end, also where no variable with one number stands beside them."""
+    world = begun("reaching")
+    one, two = (as_score(given), Score(("joint_velocities",), lambda v: v.sum(axis=-1)))
+    values = {"joint_velocities": np.ones((2, 3, 9)), "gravity": np.ones((2, 3, 3))}
+    wanted = 9.0 if isinstance(given, str) else 2.1
+    assert one.of(values, (2, 3)) == pytest.approx(np.full((2, 3), wanted))
+    actions = {
+        CrossEntropy(objective=score, terminal=score, **SMALL)(world).tobytes()
+        for score in (one, two)
+    }
+    assert len(actions) == (1 if isinstance(given, str) else 2)
+
+
 def test_nearness_is_zero_at_the_goal() -> None:
     """Tips at their goals, and corners of a turned box at those of its goal."""
     goals = np.arange(9.0)
@@ -251,6 +272,7 @@ def test_corners_turn_with_the_box() -> None:
         ({"iterations": 2.5}, "iterations"),
         ({"elites": 100}, "elites"),
         ({"spread": -1.0}, "spread"),
+        ({"spread": 1e308}, "spread"),
         ({"color": "pink"}, "color"),
         ({"momentum": 1.5}, "momentum"),
         ({"every": 13}, "every"),
@@ -276,6 +298,17 @@ def test_wrong_names_are_refused() -> None:
         CrossEntropy(backend="ode", **SMALL)(world)
     with pytest.raises(InterventionError, match=r"tool_block\.mas"):
         CrossEntropy(do={"tool_block.mas": 1.0}, **SMALL)(world)
+
+
+@pytest.mark.parametrize("shape", [(3, 2, 9), (2, 9), (2, 2, 8)])
+def test_actions_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    """More sequences than there are copies, too few axes, too few numbers."""
+    world = begun(backend="fake")
+    model = Model(world, 2, ["reward"])
+    with pytest.raises(ActionError, match=r"shape \(n, steps, 9\), with n up to 2, got"):
+        model.rollouts(model.present(world), np.zeros(shape))
+    with pytest.raises(UnknownOption, match="threads"):
+        Model(world, 2, ["reward"], threads=0)
 
 
 @pytest.mark.parametrize("wrong", [lambda _: np.nan, lambda _: "much", lambda a, b: a])

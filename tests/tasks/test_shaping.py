@@ -100,6 +100,12 @@ def _id(name: str) -> str:
     return "".join(word.capitalize() for word in name.split("_"))
 
 
+def test_weights_are_no_terms() -> None:
+    """Weights beside the names would be lost; there is an option for them."""
+    with pytest.raises(UnknownOption, match="terms cannot be"):
+        TASKS["pushing"](terms={"reward.speed": 1.0})  # type: ignore[call-arg] # every task has it
+
+
 @pytest.mark.parametrize("terms", [["reward.goal_kernl"], ["reward.reach_kernel"]], ids=repr)
 def test_an_unknown_name_is_answered_with_those_of_the_task(terms: list[str]) -> None:
     """And so is a name that only another task has."""

@@ -87,6 +87,14 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(
     assert not [*tmp_path.glob(".*")]
 
 
+def test_what_a_crash_left_half_is_removed(tmp_path: Path) -> None:
+    """With the next checkpoint, whichever it is."""
+    (tmp_path / ".8.part").mkdir()
+    (tmp_path / ".8.part" / "tensors.safetensors").write_bytes(b"half")
+    write_checkpoint(tmp_path, instant(16))
+    assert [path.name for path in tmp_path.iterdir()] == ["16"]
+
+
 def test_a_curve_goes_on_where_a_checkpoint_was(tmp_path: Path) -> None:
     """Later rows and a last line that is not whole are forgotten."""
     path = tmp_path / "progress.csv"
@@ -131,6 +139,15 @@ def test_a_folder_holds_one_training(tmp_path: Path, monkeypatch: pytest.MonkeyP
             other.open("fake 1")
     with pytest.raises(UnreadableFile, match="nothing"):
         Run(folder, made, 0, "fake", start=tmp_path / "nothing").open("fake 1")
+
+
+def test_a_crash_at_the_very_beginning_leaves_no_stranger(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The draft of the first file is nobody else's work."""
+    monkeypatch.setattr("scm_world.training.runs.LIBRARIES", ())
+    (tmp_path / ".run.json.part").write_text("{")
+    assert not Run(tmp_path, recipe("pushing"), 0, "fake").open("fake 1")
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
 from scm_world.evaluation.recording import record
-from scm_world.training.imitation import clone, lesson
+from scm_world.training.imitation import clone, cloning, lesson
 from scm_world.training.imitation.cloning import given_demonstrations
 from scm_world.training.imitation.demonstrations import (
     Demonstrations,
@@ -227,6 +227,15 @@ def test_recordings_of_something_else_are_refused(tmp_path: Path) -> None:
         given_demonstrations(tmp_path / "empty", lesson("picking"))
 
 
+def test_recordings_of_what_no_network_learns_are_refused(tmp_path: Path) -> None:
+    """The message says which option of their environment it is."""
+    env = gymnasium.make("scm_world/Picking-v0", max_episode_length=2, normalize_actions=False)
+    record(np.zeros(9), env, 1, out=tmp_path / "own.parquet")
+    env.close()
+    with pytest.raises(UnknownOption, match="normalize_actions of a lesson"):
+        given_demonstrations(tmp_path / "own.parquet", lesson("picking", keep=0.0))
+
+
 def test_without_torch_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,3 +304,34 @@ def test_a_clone_says_how_it_was_made(tmp_path: Path) -> None:
     assert "torch" in card["versions"]  # type: ignore[operator] # JSON
     assert found.score is not None
     assert json.loads((tmp_path / "run" / "clone.json").read_text())["seed"] == 0
+
+
+def test_weights_that_are_no_numbers_are_no_clone(tmp_path: Path) -> None:
+    """The message says what to do, and no policy is written."""
+    pytest.importorskip("torch")
+    how = lesson("picking", **{**QUICK, "rounds": 0, "rate": 1e30})
+    with pytest.raises(ModelError, match="smaller rate"):
+        clone(None, how, out=tmp_path / "run")
+    assert not [*(tmp_path / "run").rglob("*.safetensors")]
+
+
+def test_a_clone_does_not_depend_on_the_threads_of_torch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has one while it learns, and as many as before afterwards."""
+    torch = pytest.importorskip("torch")
+    seen: list[int] = []
+    fit = cloning.fitted
+
+    def counted(*given: Any, **options: Any) -> Any:
+        seen.append(torch.get_num_threads())
+        return fit(*given, **options)
+
+    monkeypatch.setattr(cloning, "fitted", counted)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        clone(None, lesson("picking", **{**QUICK, "rounds": 0}), out=tmp_path / "run")
+        assert (seen, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(before)

@@ -78,6 +78,13 @@ def test_hindsight_brings_goals_and_sparse_rewards() -> None:
     assert isinstance(made.settings, Sac)
 
 
+def test_hindsight_leaves_the_task_as_it_is() -> None:
+    """Only what says what the reward is makes place for sparse rewards."""
+    env = {"task_options": {"tool_block_mass": 0.5, "fractional_reward_weight": 2.0}}
+    made = recipe("pushing", "sac", hindsight=True, env=env)
+    assert made.options["task_options"] == {"tool_block_mass": 0.5, "weights": "sparse"}
+
+
 def test_privileged_observations_have_every_parameter() -> None:
     """They are appended to what is observed."""
     assert recipe("pushing", observations="privileged").options["context"] == "observation"
@@ -121,6 +128,15 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"env": {"observe": {1, 2}}}, "plain data"),
     ({"trials": {"protocols": ["P99"]}}, "P99"),
     ({"network": {"hidden": []}}, "hidden"),
+    ({"network": {"log_std": float("nan")}}, "log_std of a recipe cannot be nan.*finite"),
+    ({"rate": {"initial": float("inf")}}, "rate.initial of a recipe cannot be inf.*finite"),
+    ({"rate": {"lowest": 0.1, "highest": 0.01}}, "lowest learning rate"),
+    ({"rate": {"speed": 1}}, "rate.speed of a recipe .*no such field"),
+    ({"env": {"observation_mode": "pixel"}}, "observation_mode of a recipe"),
+    ({"worlds": 1, "n_steps": 1}, "n_steps of PPO in 1 world"),
+    ({"algo": "sac", "gradient_steps": 0}, "gradient_steps"),
+    ({"algo": "sac", "ent_coef": "auto_0"}, "ent_coef"),
+    ({"algo": "sac", "target_entropy": float("nan")}, "target_entropy"),
 ]
 
 
@@ -134,7 +150,7 @@ def test_what_is_wrong_is_said(given: dict[str, Any], said: str) -> None:
 def test_files_that_are_no_recipe(tmp_path: Path) -> None:
     """Missing, damaged, or of another kind; and one that is."""
     path = tmp_path / "recipe.json"
-    for text in (None, "{", "[]", '{"format": "other"}'):
+    for text in (None, "{", "[]", '{"format": "other"}', "[" * 100_000):
         if text is not None:
             path.write_text(text)
         with pytest.raises(UnreadableFile, match=r"recipe\.json"):

@@ -7,6 +7,7 @@ import io
 import json
 import shutil
 import zipfile
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from scm_world.training.study import Cell, Study, holding, planned, published
 from scm_world.training.study import reproduce as with_pictures
 from scm_world.training.study.actors import evaluate_actor
 from scm_world.training.study.runs import Job
+from scm_world.training.study.scores import Findings
+from scm_world.training.study.tables import lacks
 
 OBSERVED = 56
 SHORT = {"max_episode_length": 3}
@@ -228,6 +231,18 @@ def test_a_part_of_the_budget_is_no_reproduction(two: Path) -> None:
     assert "<html" in (two / "reports/pushing-ppo/report.html").read_text()
 
 
+@pytest.mark.parametrize(
+    "other", [{"policy": "best"}, {"conventions": "scm_world"}, {"preset": "tuned"}], ids=repr
+)
+def test_what_is_measured_otherwise_is_no_reproduction(two: Path, other: dict[str, str]) -> None:
+    """However much was trained: the published scores are of the last policy, and by its rules."""
+    found = Findings.read(small(**other), two)
+    (option, value), *_ = other.items()
+    assert f"{option} {value}, not the paper's" in lacks(found, "pushing", "ppo", 1)
+    usual = Findings.read(small(), two)
+    assert not any("the paper's" in said for said in lacks(usual, "pushing", "ppo", 1))
+
+
 def test_more_can_be_added_but_nothing_else(two: Path, tmp_path: Path) -> None:
     """Protocols and episodes are added to what there is; another scale needs another folder."""
     folder = tmp_path / "more"
@@ -249,6 +264,8 @@ def test_other_folders_are_refused(tmp_path: Path, two: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UnreadableFile, match="something else"):
         reproduce(small(), tmp_path, trainer=Fake())
+    with pytest.raises(UnreadableFile, match="no folder"):
+        reproduce(small(), tmp_path / "notes.txt", trainer=Fake())
     folder = tmp_path / "damaged"
     shutil.copytree(two, folder)
     record = folder / "trained" / "pushing-ppo-c1-0.json"
@@ -312,6 +329,9 @@ def test_a_published_actor_stands_beside_the_score(two: Path, tmp_path: Path) ->
     job = Job(Cell("pushing", "ppo", 1, 0), study, folder)
     evaluate_actor(actor, archive, job, lambda done, total: told.append((done, total)))
     assert told[-1] == (2, 2)
+    less = replace(job, study=small(protocols=("P1",), episodes=1))
+    evaluate_actor(actor, archive, less, lambda done, total: told.append((done, total)))
+    assert told[-1] == (4, 4)  # nothing that was there is lost
     reproduce(study, folder, trainer=Fake())
     text = (folder / "table.md").read_text()
     assert "published actor, here" in text

@@ -16,10 +16,12 @@ from scm_world.variables.spaces import Frozen
 KEY = "scm_world"
 """Under which a file keeps it, among its metadata."""
 
+RELATIVE = ("delta_scale", "delta_origin")
+"""Options of an environment that say what relative actions mean."""
+
 FORM = (
     "action_mode",
-    "delta_scale",
-    "delta_origin",
+    *RELATIVE,
     "normalize_actions",
     "observation_mode",
     "observe",
@@ -80,6 +82,15 @@ class PolicyAbout(Frozen):
     output: Literal["clip", "tanh"] = "clip"
     inputs: tuple[str, ...] | None = None
     card: dict[str, JsonValue] = Field(default_factory=dict)
+
+    @field_validator("env", "card")
+    @classmethod
+    def _finite(cls, given: Any) -> Any:
+        try:
+            json.dumps(given, allow_nan=False)
+        except ValueError:
+            raise ValueError("JSON has no numbers that are not finite; give None instead") from None
+        return given
 
     @field_validator("env", mode="before")
     @classmethod

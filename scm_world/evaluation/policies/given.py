@@ -28,6 +28,7 @@ class OpenLoop(Playing):
         about: What they are.
         action_mode: What they mean; the same as the environment's if None.
         normalized: Whether they lie in [-1, 1], or are in SI units.
+        relative: Options of the environment that say what relative actions mean, if it is known.
 
     Raises:
         ActionError: They have another shape, or are not finite.
@@ -40,6 +41,7 @@ class OpenLoop(Playing):
         *,
         action_mode: str | None = None,
         normalized: bool = False,
+        relative: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(about)
         given = np.asarray(actions)
@@ -48,6 +50,7 @@ class OpenLoop(Playing):
         for action in given:
             self._checked(action)
         self._given, self._mode, self._normalized = given, action_mode, normalized
+        self._relative = dict(relative or {})
         self._actions, self._step = given, 0
 
     @property
@@ -63,7 +66,8 @@ class OpenLoop(Playing):
         """Begin with the first action.
 
         Raises:
-            UnknownOption: The environment has another action mode.
+            UnknownOption: The environment has another action mode, or relative actions mean
+                something else in it.
         """
         self._env, self._step = env, 0
         self._actions = self._given if self._mode is None else self._converted(env, self._mode)
@@ -77,6 +81,9 @@ class OpenLoop(Playing):
     def _converted(self, env: ScmWorldEnv, mode: str) -> Actions:
         if env.action_mode != mode:
             raise UnknownOption(f"action_mode for {self._name!r}", env.action_mode, (mode,))
+        for option, wanted in self._relative.items():
+            if (there := env.made_with[option]) != wanted:
+                raise UnknownOption(f"{option} for {self._name!r}", there, (repr(wanted),))
         if is_normalized(env) == self._normalized:
             return self._given
         if env.action_mode.startswith(PREFIX):

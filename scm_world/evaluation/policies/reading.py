@@ -76,6 +76,10 @@ class Played(Protocol):
     def normalized(self) -> bool:
         """Whether they lie in [-1, 1], or are in SI units."""
 
+    @property
+    def relative(self) -> Mapping[str, Any]:
+        """Options of the environment that say what relative actions mean."""
+
 
 def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
     """Read a policy.
@@ -218,6 +222,7 @@ def _of_recorded(recorded: Played, about: About) -> Player:
         _summed(about, recorded.actions),
         action_mode=recorded.action_mode,
         normalized=recorded.normalized,
+        relative=recorded.relative,
     )
 
 

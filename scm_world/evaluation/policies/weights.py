@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import stat
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -60,10 +61,10 @@ class NetworkPolicy:
     value: tuple[Layer, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
-        problems = [*_misfits("layers", self.layers, None, ACTIONS)]
         if not self.layers:
             raise ModelError(["there is no tensor 'layers.0.weight'"])
-        if self.value:
+        problems = [*_misfits("layers", self.layers, None, ACTIONS)]
+        if self.value and self.layers[0].weight.ndim == 2:
             problems += _misfits(f"{VALUE}layers", self.value, self.n_observed, 1)
         if self.log_std is not None and not _is_good(self.log_std, (ACTIONS,)):
             problems.append(f"{LOG_STD}: expected shape ({ACTIONS},) and finite numbers")
@@ -235,7 +236,10 @@ def load_policy(path: Path | str) -> NetworkPolicy:
     """
     name = str(path)
     try:
-        if Path(name).stat().st_size > LARGEST:
+        status = Path(name).stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise UnreadableFile(name, "it is no file", _ADVICE)
+        if status.st_size > LARGEST:
             raise UnreadableFile(name, f"it has more than {LARGEST} bytes", _ADVICE)
         with safetensors.safe_open(name, framework="np") as file:
             text = (file.metadata() or {}).get(KEY)

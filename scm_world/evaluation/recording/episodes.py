@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.env.observer import Observation
+from scm_world.evaluation.policies.cards import RELATIVE, USUAL
 from scm_world.queries.plans import Plan
 from scm_world.scene import PhysicalState
 
@@ -76,6 +77,11 @@ class Recorded:
     def normalized(self) -> bool:
         """Whether the actions are in units of the range of commands, or in SI units."""
         return bool(self.environment["normalize_actions"])
+
+    @property
+    def relative(self) -> dict[str, Any]:
+        """Options of the environment that say what relative actions mean."""
+        return {name: self.environment.get(name, USUAL[name]) for name in RELATIVE}
 
     def done_at(self, step: int) -> Iterator[Plan]:
         """List what was done at a control step, in order."""

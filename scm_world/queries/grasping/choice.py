@@ -21,6 +21,7 @@ FAIR = 0.8
 LATE = 70
 """So many control steps before the end less is enough, since there is no time to do it better."""
 
+HOVER = 0.001  # [m] above its goal, where a block is held that is not let go of
 ON_FLOOR = 0.006  # [m] that a goal may be above the floor and still be on it
 ON_TOP = 0.01  # [m] that it may be above or in the block below it
 ROOM = 0.03  # [m] for fingers about a block that is put down on the way
@@ -85,7 +86,7 @@ class Choice:
         for tool, goal in self._todo:
             if self._waits(tool, goal):
                 continue
-            hangs, end, start = self._hangs(tool, goal), self._goals[goal], self._bodies[tool]
+            hangs, end, start = self._hangs(tool, goal), self._end(goal), self._bodies[tool]
             ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
             move = self._best(tool, start, ways, release=not hangs)
             if move is not None and (not hangs or move.grip.firm):
@@ -112,6 +113,11 @@ class Choice:
                 for body in self._others(tool)
             )
         )
+
+    def _end(self, goal: str) -> Body:
+        """Say where a block should be for its goal: a block that is held does not rub."""
+        end = self._goals[goal]
+        return end.at(end.place + lifted(self._kept == goal), end.yaw)
 
     def _waits(self, tool: str, goal: str) -> bool:
         """Tell whether a block cannot stand before another goal below its own is filled."""
@@ -184,6 +190,11 @@ class Choice:
             for bodies in (near, wide)
             for body, margin in bodies
         )
+
+
+def lifted(held: bool) -> Floats:
+    """Say by how much a block is held higher than its goal, so that nothing is in its way [m]."""
+    return np.array([0.0, 0.0, HOVER * held])
 
 
 def _length(start: Body, stop: Floats, end: Body) -> float:

@@ -122,17 +122,18 @@ class Hold:
                 return
             yield self.step()
 
-    def stay(self, sight_of_goal: str, rate: float) -> Iterator[Step]:
+    def stay(self, sight_of_goal: str, rate: float, beside: Floats) -> Iterator[Step]:
         """Keep the block where its goal is, wherever that goes, until it is lost.
 
         Args:
             sight_of_goal: Name of the goal.
             rate: How far the block follows per control step [m].
+            beside: Where it is held, seen from the goal, shape (3,) [m].
         """
         while not self.lost:
             yield self.step()
             self._watch()
-            way = self._sight.body(sight_of_goal).place - self._wanted.place
+            way = self._sight.body(sight_of_goal).place + beside - self._wanted.place
             share = min(rate / max(math.dist(way, np.zeros(3)), 1e-9), 1.0)
             self._wanted = self._wanted.at(self._wanted.place + share * way, self._wanted.yaw)
 

@@ -15,7 +15,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.queries.grasping.bodies import QUARTER, Body, smallest, turn_about_z
-from scm_world.queries.grasping.choice import Choice, Job
+from scm_world.queries.grasping.choice import Choice, Job, lifted
 from scm_world.queries.grasping.grips import Grip
 from scm_world.queries.grasping.hold import Hold, Step
 from scm_world.queries.grasping.sight import Sight
@@ -215,7 +215,7 @@ class _Program:
             yield from hold.carry(station, rate, self._pace.turn)
         if not move.release:
             goal = next(goal for block, goal in self._sight.pairs if block == tool)
-            yield from hold.stay(goal, self._pace.carry)
+            yield from hold.stay(goal, self._pace.carry, lifted(self._holds))
         yield from hold.settle()
         for share in LETTING_GO:
             yield hold.step(share)

@@ -10,6 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats
+from scm_world.errors import ActionError
 from scm_world.queries.stages import Stage
 from scm_world.work.threads import cores
 from scm_world.world import World, WorldSnapshot
@@ -68,7 +69,8 @@ class Model:
         self._do, self._foresees = dict(do or {}), foresees
         self.names = tuple(dict.fromkeys(names))
         self._shapes = {name: world.model.declared(name).shape for name in self.names}
-        self._batch = Batch(self._copies, threads=threads or cores(), names=self.names)
+        share = cores() if threads is None else threads
+        self._batch = Batch(self._copies, threads=share, names=self.names)
 
     def __len__(self) -> int:
         """Count the copies."""
@@ -114,8 +116,12 @@ class Model:
             By name, the values after each control step, shape (n, steps, *shape).
 
         Raises:
+            ActionError: Actions have another shape.
             EngineFailure: The engine lost a state.
         """
+        if actions.ndim != 3 or actions.shape[2] != 9 or len(actions) > len(self):
+            allowed = f"(n, steps, 9), with n up to {len(self)}"
+            raise ActionError(f"actions have shape {allowed}, got {actions.shape}", actions)
         n, steps = actions.shape[:2]
         which = np.arange(len(self._copies)) < n
         commands = np.zeros((len(which), steps, 9))

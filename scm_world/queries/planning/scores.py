@@ -33,6 +33,8 @@ class Score:
         names: Of the variables.
         function: Told the values in this order, each of shape (..., *shape) of its variable; gives
             numbers of shape (...), the higher the better. It can be pickled if it has a name.
+        sums: Whether it is told the sum of a variable with several numbers instead, where it is
+            known which axes are those of the variable.
 
     Example:
         >>> import numpy as np
@@ -43,6 +45,7 @@ class Score:
 
     names: tuple[str, ...]
     function: Callable[..., Any]
+    sums: bool = False
 
     def of(self, values: Mapping[str, Floats], shape: tuple[int, ...] | None = None) -> Floats:
         """Compute it.
@@ -57,8 +60,11 @@ class Score:
         Raises:
             ModelError: The function gave something else, or numbers that are not finite.
         """
+        given = [values[name] for name in self.names]
+        if self.sums and shape is not None:
+            given = [value.reshape(*shape, -1).sum(axis=-1) for value in given]
         try:
-            found = np.asarray(self.function(*(values[n] for n in self.names)), dtype=np.float64)
+            found = np.asarray(self.function(*given), dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ModelError([f"the score of a plan cannot be computed: {error}"]) from error
         if not np.isfinite(found).all():
@@ -83,29 +89,27 @@ def as_score(given: Any) -> Score:
     Example:
         >>> import numpy as np
         >>> score = as_score({"reward": 1.0, "joint_velocities": -0.1})
-        >>> score.of({"reward": np.ones(2), "joint_velocities": np.ones((2, 9))}).round(3)
+        >>> score.of({"reward": np.ones(2), "joint_velocities": np.ones((2, 9))}, (2,)).round(3)
         array([0.1, 0.1])
     """
     allowed = ("the name of a variable", "weights by name", "a Score")
     if isinstance(given, Score):
         return given
     if isinstance(given, str):
-        return Score((given,), partial(_weighted, (1.0,)))
+        return as_score({given: 1.0})
     if not isinstance(given, Mapping) or not given:
         raise UnknownOption("objective", given, allowed)
     for name, weight in given.items():
         is_number = isinstance(weight, int | float | np.number) and np.isfinite(weight)
         if not isinstance(name, str) or not is_number:
             raise UnknownOption(f"weight of {name}", weight, ("a finite number",))
-    return Score(tuple(given), partial(_weighted, tuple(map(float, given.values()))))
+    return Score(tuple(given), partial(_weighted, tuple(map(float, given.values()))), sums=True)
 
 
 def _weighted(weights: tuple[float, ...], *values: Floats) -> Floats:
-    """Add values up; those with more axes than the first one's leading ones are summed."""
-    axes = min(value.ndim for value in values)
-    sums = (value.reshape(*value.shape[:axes], -1).sum(axis=-1) for value in values)
-    total: Floats = sum(weight * value for weight, value in zip(weights, sums, strict=True))
-    return total
+    """Add values up."""
+    shares = [weight * value for weight, value in zip(weights, values, strict=True)]
+    return np.asarray(sum(shares))
 
 
 def nearness(task: Task) -> Score:

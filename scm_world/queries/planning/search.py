@@ -57,9 +57,12 @@ class Search:
             whole_number(name, getattr(self, name), least=least)
         if self.elites is not None and whole_number("elites", self.elites, least=1) > self.samples:
             raise UnknownOption("elites", self.elites, (f"1 to {self.samples}, the samples",))
-        for name, low, high in (("spread", 0.0, math.inf), ("color", 0.0, 10.0)):
+        for name, low, high in (
+            ("spread", 0.0, 10.0),
+            ("color", 0.0, 10.0),
+            ("momentum", 0.0, 1.0),
+        ):
             _check(name, getattr(self, name), low, high)
-        _check("momentum", self.momentum, 0.0, 1.0)
 
     @property
     def n_elites(self) -> int:

@@ -9,6 +9,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, final
 
+from pydantic import ValidationError
+
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.policies.cards import OPTIONS, PolicyAbout
 from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
@@ -28,6 +30,7 @@ from scm_world.training.learners import torch
 from scm_world.training.loop import Tell, torch_threads
 from scm_world.training.recipe import Recipe
 from scm_world.training.runs import differences, strangers_in
+from scm_world.training.settings import refused
 from scm_world.training.trials import tried
 from scm_world.world.start import whole_number
 
@@ -157,7 +160,10 @@ def given_demonstrations(source: Recording | Path | str, lesson: Lesson) -> Give
         raise ModelError(["the recordings were made in environments with different options"])
     plain = json.loads(json.dumps(kept[0]))
     learned = lesson.model_copy(update={"env": plain, "rounds": 0})
-    Lesson.model_validate(learned.model_dump(mode="json"))  # refuses what cannot be learned
+    try:
+        Lesson.model_validate(learned.model_dump(mode="json"))
+    except ValidationError as error:
+        raise refused("a recording to learn from", error) from None
     shown = joined([recorded(one, lesson.keep) for one in recordings])
     digest = sha256(shown.observations.tobytes() + shown.actions.tobytes()).hexdigest()
     return Given(shown, learned, digest)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
+from scm_world.errors import ModelError
 from scm_world.training.imitation.demonstrations import Demonstrations
 from scm_world.training.imitation.lessons import Lesson
 from scm_world.training.learners import torch
@@ -51,6 +52,7 @@ def fitted(shown: Demonstrations, lesson: Lesson, *, seed: int) -> Fitted:
 
     Raises:
         MissingExtra: torch is not installed.
+        ModelError: The rate is so large that the network's weights grow without end.
     """
     lib = torch()
     turn, shift = whitening(shown.observations)
@@ -60,6 +62,8 @@ def fitted(shown: Demonstrations, lesson: Lesson, *, seed: int) -> Fitted:
         lib.manual_seed(seed)
         network = _network(lib, lesson, seen.shape[1])
         loss = _optimized(lib, network, (seen, done), lesson)
+    if not np.isfinite(loss):
+        raise ModelError(["the loss is no finite number any more: take a smaller rate"])
     return Fitted(_folded(network, turn, shift), loss)
 
 

@@ -69,10 +69,10 @@ class Lesson(Frozen):
     more: Count = 100
     noise: NotNegative = 0.04
     share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.3
-    stretch: Annotated[float, Field(ge=1.0)] = 10.0
+    stretch: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 10.0
     keep: Share = 0.9
     network: Network = Field(default_factory=lambda: Network(activation="relu"))
-    updates: Count = 4_000
+    updates: Count = 20_000
     batch: Count = 512
     rate: Positive = 1e-3
     trials: Trials = Field(default_factory=lambda: Trials(protocols=("P1", "P5")))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+from contextlib import suppress
 from pathlib import Path
 
 from scm_world.errors import UnreadableFile
-from scm_world.evaluation import evaluate
 from scm_world.queries.progress import Progress
 from scm_world.training.study.cells import Study
 from scm_world.training.study.published import Actor, published
 from scm_world.training.study.records import ACTORS
-from scm_world.training.study.runs import Job, OutOfTime, table_kind
+from scm_world.training.study.runs import Job, OutOfTime, evaluate_in
 
 ENV = {"conventions": "causal_world", "frame_skip": 3}
 """What the actors were trained in."""
@@ -46,21 +46,9 @@ def evaluate_actor(actor: Actor, archive: Path, job: Job, progress: Progress) ->
     Args:
         actor: Which one.
         archive: Of it.
-        job: Says in which study, where, and until when.
+        job: Says in which study and task, where, and until when.
         progress: Told how many episodes are done.
     """
-    place, study = job.folder / ACTORS / actor.task, job.study
-    try:
-        found = evaluate(
-            {"published actor": str(archive)},
-            study.protocols,
-            task=actor.task,
-            n=study.episodes,
-            backend=study.backend,
-            env=ENV,
-            out=place,
-            progress=progress,
-        )
-    except OutOfTime:
-        return
-    found.save(place, kind=table_kind())
+    place = job.folder / ACTORS / actor.task
+    with suppress(OutOfTime):
+        evaluate_in(place, {"published actor": str(archive)}, job, progress, ENV)

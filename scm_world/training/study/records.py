@@ -129,6 +129,8 @@ def begin(study: Study, folder: Path) -> None:
     """
     path, head = folder / HEAD, study.head
     if not path.exists():
+        if folder.exists() and not folder.is_dir():
+            raise UnreadableFile(str(folder), "it is no folder", "give a folder for the study")
         taken = [one.name for one in folder.iterdir()] if folder.exists() else []
         if any(not name.startswith(".") for name in taken):
             advice = "give an empty folder, or one in which a study was begun"

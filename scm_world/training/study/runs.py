@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -173,23 +173,46 @@ class Hand:
         return record
 
     def _evaluated(self, job: Job, record: Record) -> None:
-        study, cell = job.study, job.cell
-        if is_evaluated(study, job.folder, record):
+        if is_evaluated(job.study, job.folder, record):
             return
         job.check_time()
-        place = evaluation_of(job.folder, cell)
-        before = read_evaluation(place)
-        more = () if before is None else before.protocols
-        found = evaluate(
-            {f"{cell.algo.upper()} curriculum {cell.curriculum}": _policy(job)},
-            tuple(dict.fromkeys((*study.protocols, *more))),
-            task=cell.task,
-            n=max(study.episodes, 0 if before is None else int(before.about["n"])),
-            backend=study.backend,
-            out=place,
-            progress=progress_of(job, "evaluated", self.tell),
-        )
-        found.save(place, kind=table_kind())
+        agent = f"{job.cell.algo.upper()} curriculum {job.cell.curriculum}"
+        place = evaluation_of(job.folder, job.cell)
+        evaluate_in(place, {agent: _policy(job)}, job, progress_of(job, "evaluated", self.tell))
+
+
+def evaluate_in(
+    place: Path,
+    agent: Mapping[str, str],
+    job: Job,
+    progress: Progress,
+    env: Mapping[str, Any] | None = None,
+) -> None:
+    """Evaluate as the study asks for it; protocols and episodes that are there already stay.
+
+    Args:
+        place: Folder of the evaluation.
+        agent: The file of a policy, by the name of the agent.
+        job: Says in which study, and in which task.
+        progress: Told how many episodes are done.
+        env: Options of the environment that the policy does not say itself.
+
+    Raises:
+        OutOfTime: The time is over; what is finished is kept.
+    """
+    study, before = job.study, read_evaluation(place)
+    more = () if before is None else before.protocols
+    found = evaluate(
+        agent,
+        tuple(dict.fromkeys((*study.protocols, *more))),
+        task=job.cell.task,
+        n=max(study.episodes, 0 if before is None else int(before.about["n"])),
+        backend=study.backend,
+        env=env,
+        out=place,
+        progress=progress,
+    )
+    found.save(place, kind=table_kind())
 
 
 def progress_of(job: Job, what: str, tell: Tell | None) -> Progress:

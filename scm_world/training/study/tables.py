@@ -13,7 +13,7 @@ from typing import Any
 from scm_world.evaluation import Interval, protocols_of
 from scm_world.output.durable import write_whole
 from scm_world.queries.experiments.versions import versions
-from scm_world.training.study.cells import FORMAT, PROTOCOLS
+from scm_world.training.study.cells import FORMAT, PRESETS, PROTOCOLS
 from scm_world.training.study.published import Published, published
 from scm_world.training.study.records import Record
 from scm_world.training.study.scores import OVERALL, Findings, Row
@@ -22,6 +22,8 @@ NOT_RUN, UNKNOWN = "not run", "–"
 NAMES = ("table.md", "table.csv", "table.json")
 WHOLE = "Reproduction"
 PARTIAL = "Partial budget, not a reproduction"
+AS_PUBLISHED = {"preset": "paper", "conventions": PRESETS["paper"], "policy": "last"}
+"""Options of a study whose scores are measured as the published ones are."""
 
 
 def write_tables(found: Findings, folder: Path, notes: Sequence[str] = ()) -> tuple[Path, ...]:
@@ -60,8 +62,9 @@ def lacks(found: Findings, task: str, algo: str, curriculum: int) -> list[str]:
     protocols = min(len({*PROTOCOLS} & {*one.protocols}) for one in evaluations.values())
     steps = min(record.steps for record in group)
     problems = []
-    if found.study.preset != "paper":
-        problems.append(f"preset {found.study.preset}, not the paper's")
+    for name, its in AS_PUBLISHED.items():
+        if (mine := found.study.head[name]) != its:
+            problems.append(f"{name} {mine}, not the paper's")
     for what, here, there in (
         ("control steps", steps, budget.steps[algo]),
         ("seeds", len(group), budget.seeds),
@@ -94,7 +97,8 @@ def as_markdown(found: Findings, notes: Sequence[str] = ()) -> str:
         f"{study.scale:g} of its steps, conventions {study.rules}, engine {study.backend}, the "
         f"{study.policy} policy of each training. Intervals are of 95 %, over seeds, or, marked "
         "with an e, over the episodes of the only seed. IQM is the interquartile mean over the "
-        "same. What was published belongs to "
+        f"same. Published actors act with the conventions {PRESETS['paper']}. What was published "
+        "belongs to "
         f"{known.work}; “{UNKNOWN}” stands where a score is not known. Numbers in parentheses "
         "refer to the sources below.",
         "",
