@@ -23,7 +23,7 @@ from scm_world.training.imitation.demonstrations import (
     School,
     joined,
 )
-from scm_world.training.imitation.fitting import whitening
+from scm_world.training.imitation.fitting import fitted, whitening
 
 SHORT = {"max_episode_length": 12}
 QUICK: dict[str, Any] = {
@@ -321,11 +321,10 @@ def test_a_clone_does_not_depend_on_the_threads_of_torch(
     """It has one while it learns, and as many as before afterwards."""
     torch = pytest.importorskip("torch")
     seen: list[int] = []
-    fit = cloning.fitted
 
     def counted(*given: Any, **options: Any) -> Any:
         seen.append(torch.get_num_threads())
-        return fit(*given, **options)
+        return fitted(*given, **options)
 
     monkeypatch.setattr(cloning, "fitted", counted)
     before = torch.get_num_threads()
