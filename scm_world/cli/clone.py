@@ -15,13 +15,14 @@ _OF_TASK = "what works for the task"
 def clone(
     task: Task,
     source: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--from",
             help="A policy that looks at the world, such as grasp; a recording (.parquet), or a "
             "folder of recordings.",
+            show_default=_OF_TASK,
         ),
-    ] = "grasp",
+    ] = None,
     episodes: Annotated[
         int | None,
         typer.Option(help="That the teacher shows alone.", show_default=_OF_TASK),

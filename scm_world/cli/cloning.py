@@ -25,7 +25,7 @@ class Options:
 
     Attributes:
         task: Name of the task.
-        source: Name of a teacher, or path of recordings.
+        source: Name of a teacher, or path of recordings; None for the teacher of the lesson.
         fields: Of the lesson, that have an option of their own.
         backend: Name of the engine.
         seed: Of everything that is drawn.
@@ -34,7 +34,7 @@ class Options:
     """
 
     task: str
-    source: str
+    source: str | None
     fields: Mapping[str, Any]
     backend: str
     seed: int
@@ -47,7 +47,8 @@ class Options:
         for name in self.fields:
             if name in changes:
                 raise ConflictingTargets((f"--{name}", f"--set {name}"), name)
-        teacher = {"teacher": self.source} if self.path is None else {}
+        is_named = self.source is not None and self.path is None
+        teacher = {"teacher": self.source} if is_named else {}
         return lesson(self.task, **teacher, **self.fields, **changes)
 
     @property
@@ -57,7 +58,7 @@ class Options:
         Raises:
             UnknownOption: There are none, and there is no such teacher.
         """
-        if self.source in NAMED:
+        if self.source is None or self.source in NAMED:
             return None
         if not Path(self.source).exists():
             raise UnknownOption("--from", self.source, (*NAMED, "a recording or a folder of some"))
@@ -102,7 +103,7 @@ def _about(options: Options, made: Lesson, folder: Path) -> Any:
     """Say what will be done."""
     about = table("", "", title=f"Learning {made.task} by imitation")
     about.show_header = False
-    rows = {"from": options.source}
+    rows = {"from": options.source or made.teacher}
     if options.path is None:
         rows["episodes"] = f"{made.episodes} on {options.backend}, in {', '.join(made.protocols)}"
         rows["noise"] = f"up to {made.noise:g} of the largest action"

@@ -171,6 +171,14 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 _PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
 
 LESSONS: Mapping[str, Fields] = {
+    # A block that was let go of is dragged along by fingers that retreat a little too early.
+    "pushing": {
+        "teacher": "hold",
+        "protocols": ("P5",),
+        "episodes": 1_200,
+        "rounds": 0,
+        "trials": {"protocols": ("P0", "P5"), "episodes": 40},
+    },
     "picking": {"updates": 4_000},
     "pick_and_place": _PLACED,
     "stacking2": {**_PLACED, "episodes": 350},
