@@ -13,6 +13,8 @@ from scm_world.backends import BackendWrapper, make_backend, register
 from scm_world.evaluation import evaluate
 from scm_world.scene.controller import ControlMode
 
+AHEAD = 0.02  # [rad] that a command is ahead of the joints, at most
+
 
 @register  # at the top level, so that other processes know it, too
 class SlowMotors(BackendWrapper):
@@ -27,7 +29,7 @@ class SlowMotors(BackendWrapper):
         """Hold a command for some physics steps."""
         if mode is ControlMode.JOINT_POSITIONS:
             joints = self.state().joint_positions
-            command = joints + np.clip(command - joints, -0.02, 0.02)  # [rad]
+            command = joints + np.clip(command - joints, -AHEAD, AHEAD)
         super().step(mode, command, substeps)
 
 
@@ -41,7 +43,6 @@ def main(episodes: str = "4", length: str = "250") -> None:
         world.step(before + 0.3)
         moved = np.abs(world["joint_positions"] - before).max()
         print(f"{engine}: joints moved by {moved:.2f} rad in a control step, towards 0.30 rad")
-
     if importlib.util.find_spec("pytest"):  # docs/extending.md has the whole suite
         from scm_world.testing.backend import BackendConformance
         from scm_world.testing.scenes import busy_scene
