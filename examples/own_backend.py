@@ -29,18 +29,17 @@ class SlowMotors(BackendWrapper):
         """Hold a command for some physics steps."""
         if mode is ControlMode.JOINT_POSITIONS:
             joints = self.state().joint_positions
-            command = joints + np.clip(command - joints, -AHEAD, AHEAD)
+            command = np.clip(command, joints - AHEAD, joints + AHEAD)
         super().step(mode, command, substeps)
 
 
 def main(episodes: str = "4", length: str = "250") -> None:
     """Step it, hold it against a part of the suite of engines, and let it pick a block up."""
-    both = ("mujoco", SlowMotors.name)
-    for engine in both:
+    for engine in (both := ("mujoco", SlowMotors.name)):
         world = World("pushing", backend=engine)
         world.reset(seed=0)
         before = world["joint_positions"]
-        world.step(before + 0.3)
+        world.step(before + 0.3)  # [rad]
         moved = np.abs(world["joint_positions"] - before).max()
         print(f"{engine}: joints moved by {moved:.2f} rad in a control step, towards 0.30 rad")
     if importlib.util.find_spec("pytest"):  # docs/extending.md has the whole suite
