@@ -107,8 +107,8 @@ def _place(about: Mapping[str, Any], task: Task | None, trusted: Sequence[str]) 
     place = Place(about["task"], options)
     mine = place.about().get("class", place.name)
     if mine != about.get("class", place.name):
-        allowed = f"{about.get('class', place.name)}, if it is given: task="
-        raise UnknownOption("task", mine, (allowed,))
+        made = about.get("class", place.name)
+        raise UnknownOption("task", mine, (f"{made}, if it is given: task=",))
     return place
 
 
