@@ -14,8 +14,10 @@ from scm_world.cli.console import RESULTS, check_writable, console, table
 from scm_world.cli.questions import shown_episodes
 from scm_world.cli.training import INTERRUPTED, assigned
 from scm_world.errors import ConflictingTargets, UnknownOption
+from scm_world.evaluation.policies.cards import OPTIONS
 from scm_world.queries.policies import NAMED
 from scm_world.training.imitation import Cloned, Lesson, clone, lesson
+from scm_world.training.recipe import recipe
 
 
 @final
@@ -115,14 +117,23 @@ def _about(options: Options, made: Lesson, folder: Path) -> Any:
     return about
 
 
+def _is_a_start(learned: Lesson) -> bool:
+    """Tell whether the preset of the task trains a policy of this form."""
+    preset = recipe(learned.task)
+    names = {name for name in (*preset.env, *learned.env) if name in OPTIONS}
+    same = all(preset.env.get(name) == learned.env.get(name) for name in names)
+    return same and preset.network.activation == learned.network.activation
+
+
 def _tell(found: Cloned, terminal: Any) -> None:
     score = "" if found.score is None else f", {found.score:.3f} in the evaluations between rounds"
     task = found.lesson.task
-    lines = (
+    lines = [
         f"policy:   {found.policy}",
         f"best:     {found.best}{score}",
         f"evaluate: scm-world evaluate {found.best} {task}",
-        f"go on:    scm-world train {task} --start {found.best}",
-    )
+    ]
+    if _is_a_start(found.lesson):
+        lines.append(f"go on:    scm-world train {task} --start {found.best}")
     for line in lines:
         terminal.print(Text(line), soft_wrap=True)
