@@ -147,7 +147,7 @@ def _steps(
 
     Normalized actions fill [-1, 1] whatever the scale is; others keep their unit.
     """
-    number = checked_share("delta_scale", scale)
+    number = _share("delta_scale", scale)
     normalized = bool(np.any(half != 1.0) or np.any(middle != 0.0))
     reach = (high - low) / 2.0
     return (number, reach) if normalized else (1.0, number * reach)
@@ -167,7 +167,7 @@ def _read(mode: str, origin: str) -> str | None:
     return JOINTS
 
 
-def checked_share(name: str, share: Any) -> float:
+def _share(name: str, share: Any) -> float:
     """Check that an option is a share of something.
 
     Raises:

@@ -60,8 +60,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         action_mode: ``"joint_positions"``, ``"joint_torques"`` or ``"end_effector_positions"``,
             or one of them after ``"delta_"``: see ``DeltaAction``.
         delta_scale: Share of half of the range that the largest relative action stands for.
-        delta_origin: What relative joint positions are relative to: ``"command"``, the last
-            target, or ``"measured"``, where the joints are.
+        delta_origin: Joint positions are relative to the last ``"command"``, or ``"measured"``.
         normalize_actions: Take actions in [-1, 1] instead of SI units.
         observation_mode: ``"structured"``: the published layout; ``"full"``: that and every other
             variable; ``"custom"``: the variables in ``observe``; ``"pixel"``: pictures.
@@ -215,7 +214,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self.action_space = self._delta.space() if self._delta else box(*bounds)
 
     def relative(self) -> Delta:
-        """Give what turns relative actions into those that this environment would take."""
+        """Give what makes relative actions absolute."""
         return Delta(self.world, self._middle, self._half)
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
@@ -224,10 +223,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return found
 
     def toward(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Give the action, now, that leads to a command in SI units, shape (9,).
-
-        Relative actions that are too small for it go as near to it as they can.
-        """
+        """Give the action, now, that leads to a command in SI units or near it, shape (9,)."""
         if self._delta is None:
             return self.as_action(command)
         return self._delta.toward(np.asarray(command, dtype=np.float64))

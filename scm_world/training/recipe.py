@@ -33,6 +33,7 @@ from scm_world.training.settings import (
     Ppo,
     Rate,
     Settings,
+    TaskName,
     Trials,
     merged,
     nested,
@@ -94,7 +95,7 @@ class Recipe(Frozen):
         trials: Evaluations while it is trained.
     """
 
-    task: str
+    task: TaskName
     algo: Literal["ppo", "sac", "td3"] = "ppo"
     name: str = "own"
     env: dict[str, Any] = Field(default_factory=dict)
@@ -111,13 +112,6 @@ class Recipe(Frozen):
     hindsight: Hindsight | None = None
     observations: Literal["plain", "privileged"] = "plain"
     trials: Trials = Field(default_factory=Trials)
-
-    @field_validator("task")
-    @classmethod
-    def _known(cls, task: str) -> str:
-        if task not in tasks():
-            raise UnknownOption("task", task, tasks())
-        return task
 
     @field_validator("env")
     @classmethod

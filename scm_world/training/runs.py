@@ -159,18 +159,23 @@ def strangers_in(folder: Path, about: Path) -> list[str]:
     return sorted(name for name in names if name != draft_of(about).name)
 
 
-def read_about(path: Path) -> dict[str, Any]:
-    """Read what a folder says of its training.
+def read_about(path: Path, form: str = FORMAT, command: str = "train") -> dict[str, Any]:
+    """Read what a folder says of the work in it.
+
+    Args:
+        path: Of the file.
+        form: The format that it has to have.
+        command: Of ``scm-world``, which writes such folders.
 
     Raises:
         UnreadableFile: It is damaged, or of another kind.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ValueError(f"it is not of the format {FORMAT!r}")
+        if not isinstance(data, dict) or data.get("format") != form:
+            raise ValueError(f"it is not of the format {form!r}")
     except (OSError, ValueError) as error:
-        advice = "give a folder that scm-world train has written, or a new one"
+        advice = f"give a folder that scm-world {command} has written, or a new one"
         raise UnreadableFile(str(path), str(error), advice) from None
     return data
 

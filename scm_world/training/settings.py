@@ -5,11 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, final
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from scm_world.errors import ScmWorldError, UnknownOption
+from scm_world.tasks import tasks
 from scm_world.variables.spaces import Frozen
 
+
+def known_task(task: str) -> str:
+    """Check that there is a task of this name.
+
+    Raises:
+        UnknownOption: There is none.
+    """
+    if task not in tasks():
+        raise UnknownOption("task", task, tasks())
+    return task
+
+
+TaskName = Annotated[str, AfterValidator(known_task)]
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -211,3 +211,14 @@ def test_a_block_on_another_face_is_seen() -> None:
     assert body.bottom == pytest.approx(0.0)
     np.testing.assert_allclose(sorted(body.half[:2]), [0.03, 0.05])
     np.testing.assert_allclose(body.lean, 0.0, atol=1e-12)
+
+
+def test_one_that_holds_keeps_the_block_above_the_floor() -> None:
+    """In the end it is at its goal, a millimeter higher; after a copy, too."""
+    episode = World("pushing").rollout(pickle.loads(pickle.dumps(Grasp(holds=True))))  # noqa: S301 # our own
+    block, goal = (
+        episode[f"{name}.cartesian_position"][-1] for name in ("tool_block", "goal_block")
+    )
+    assert 0.0005 < block[2] - goal[2] < 0.0015
+    assert math.dist(block[:2], goal[:2]) < 0.001
+    assert episode.final("success")

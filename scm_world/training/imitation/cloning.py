@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -29,7 +28,7 @@ from scm_world.training.imitation.lessons import Lesson
 from scm_world.training.learners import torch
 from scm_world.training.loop import Tell, torch_threads
 from scm_world.training.recipe import Recipe
-from scm_world.training.runs import differences, strangers_in
+from scm_world.training.runs import differences, read_about, strangers_in
 from scm_world.training.settings import refused
 from scm_world.training.trials import tried
 from scm_world.world.start import whole_number
@@ -199,7 +198,7 @@ class _Course:
         }
         about = self.folder / "clone.json"
         if about.exists():
-            wrong = differences(_read(about), identity)
+            wrong = differences(read_about(about, FORMAT, "clone"), identity)
             if wrong:
                 reason = f"it holds other work: {'; '.join(wrong)}"
                 raise UnreadableFile(str(self.folder), reason, "give another folder")
@@ -298,14 +297,3 @@ class _Course:
 
 def _mean(scores: Any) -> float | None:
     return sum(scores.values()) / len(scores) if scores else None
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ValueError(f"it is not of the format {FORMAT!r}")
-    except (OSError, ValueError) as error:
-        advice = "give a folder that scm-world clone has written, or a new one"
-        raise UnreadableFile(str(path), str(error), advice) from None
-    return data

@@ -13,13 +13,13 @@ from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.policies.cards import OPTIONS
 from scm_world.evaluation.protocols import Protocol, chosen
 from scm_world.queries.policies import NAMED
-from scm_world.tasks import tasks
 from scm_world.training.settings import (
     Count,
     Network,
     NotNegative,
     Positive,
     Share,
+    TaskName,
     Trials,
     merged,
     nested,
@@ -60,7 +60,7 @@ class Lesson(Frozen):
         what is not far from it.
     """
 
-    task: str
+    task: TaskName
     teacher: str = "grasp"
     env: dict[str, Any] = Field(default_factory=lambda: dict(ENV))
     protocols: Annotated[tuple[str, ...], Field(min_length=1)] = ("P0", "P1", "P5")
@@ -76,13 +76,6 @@ class Lesson(Frozen):
     batch: Count = 512
     rate: Positive = 1e-3
     trials: Trials = Field(default_factory=lambda: Trials(protocols=("P1", "P5")))
-
-    @field_validator("task")
-    @classmethod
-    def _known(cls, task: str) -> str:
-        if task not in tasks():
-            raise UnknownOption("task", task, tasks())
-        return task
 
     @field_validator("teacher")
     @classmethod
