@@ -100,7 +100,7 @@ class Otherwise:
         was, would_be = (_numbers(value) for value in (self.was, self.would_be))
         return (
             f"with {self.variable} = {would_be} instead of {was} it {success}: "
-            f"{self.would_score:.2f} instead of {self.score:.2f}"
+            f"{self.would_score:.3g} ({self.gain:+.3g})"
         )
 
 

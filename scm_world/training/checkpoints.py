@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.output.durable import made, synced, write_durably
 
-FORMAT = "scm_world/checkpoint/1"
+FORMAT = "scm_world/checkpoint/2"
 KEPT = 2
 STATE, TENSORS = "state.json", "tensors.safetensors"
 
@@ -64,16 +64,12 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     draft = target.with_name(f".{target.name}.part")
     arrays = {name: np.ascontiguousarray(array) for name, array in checkpoint.tensors.items()}
     data = safetensors.numpy.save(arrays)
-    state = {
-        "format": FORMAT,
-        "steps": checkpoint.steps,
-        "sum": blake2b(data, digest_size=16).hexdigest(),
-        **checkpoint.state,
-    }
+    state = {"format": FORMAT, "steps": checkpoint.steps, **checkpoint.state}
+    signed = json.dumps({"sum": _sum(data, state), **state}, allow_nan=False)
     try:
         made(draft)
         write_durably(draft / TENSORS, data)
-        write_durably(draft / STATE, json.dumps(state, allow_nan=False).encode())
+        write_durably(draft / STATE, signed.encode())
         shutil.rmtree(target, ignore_errors=True)
         draft.replace(target)
         synced(folder)
@@ -104,14 +100,20 @@ def read_checkpoint(path: Path) -> Checkpoint:
     try:
         state = json.loads((path / STATE).read_text(encoding="utf-8"))
         data = (path / TENSORS).read_bytes()
-        if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
+        if not isinstance(state, dict) or state.get("format") != FORMAT:
             raise ValueError(f"{STATE} is not of the format {FORMAT!r}")
-        if blake2b(data, digest_size=16).hexdigest() != state.pop("sum", None):
-            raise ValueError(f"{TENSORS} is not what was written")
+        if state.pop("sum", None) != _sum(data, state):
+            raise ValueError(f"{TENSORS} or {STATE} is not what was written")
+        del state["format"]
         tensors = safetensors.numpy.load(data)
         return Checkpoint(int(state.pop("steps")), tensors, state)
     except (OSError, ValueError, TypeError, KeyError, SafetensorError) as error:
         raise UnreadableFile(str(path), str(error), ADVICE) from None
+
+
+def _sum(data: bytes, state: Mapping[str, Any]) -> str:
+    """Compute the sum over both files; JSON that was read is written as it was before."""
+    return blake2b(data + json.dumps(state).encode(), digest_size=16).hexdigest()
 
 
 ADVICE = "remove this folder to go on from the checkpoint before it, or from the beginning"

@@ -279,6 +279,8 @@ def test_corners_turn_with_the_box() -> None:
         ({"seed": -1}, "seed"),
         ({"threads": 0}, "threads"),
         ({"population": 10}, "population"),
+        ({"do": [1]}, "dictionary of variables"),
+        ({"foresees": "no"}, "foresees"),
         ({"objective": 3}, "objective"),
         ({"objective": {"reward": float("nan")}}, "weight of reward"),
     ],

@@ -52,7 +52,8 @@ def test_damage_is_found(tmp_path: Path) -> None:
         ("tensors.safetensors", lambda data: data[:-5]),
         ("tensors.safetensors", lambda data: data[:-5] + b"wrong"),
         ("state.json", lambda data: data[:-5]),
-        ("state.json", lambda data: data.replace(b"checkpoint/1", b"checkpoint/9")),
+        ("state.json", lambda data: data.replace(b"checkpoint/2", b"checkpoint/9")),
+        ("state.json", lambda data: data.replace(b"0.3", b"0.4")),
         ("state.json", lambda _: b"[]"),
     ):
         path = write_checkpoint(tmp_path, instant(8))

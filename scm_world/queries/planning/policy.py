@@ -10,6 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
+from scm_world.graph import flatten
 from scm_world.queries.planning.model import Model
 from scm_world.queries.planning.scores import Score, as_score, nearness
 from scm_world.queries.planning.search import Found, Search, search
@@ -24,8 +25,9 @@ class CrossEntropy:
 
     Every ``every`` control steps it searches anew, from the present and from what is left of its
     last plan. It sees everything, since it looks at the world and not at an observation. What
-    it does follows from the world, its noise and ``seed``; how many threads there are does not
-    matter. One instance serves any number of episodes and worlds.
+    it does follows from the world, its noise, ``seed``, and the steps of the episode at which it
+    was asked: a world that is restored in the middle of an episode has no last plan. How many
+    threads there are does not matter. One instance serves any number of episodes and worlds.
 
     Args:
         objective: What is summed up over the control steps of a plan: the name of a variable such
@@ -42,7 +44,8 @@ class CrossEntropy:
         numbers: Of the search: ``samples``, ``horizon``, ``iterations`` …; see ``Search``.
 
     Raises:
-        UnknownOption: A number is none, or out of its range.
+        UnknownOption: A number is none, or out of its range; ``do`` is no mapping; ``foresees`` is
+            neither True nor False.
 
     Example:
         >>> from scm_world.queries import World
@@ -71,7 +74,9 @@ class CrossEntropy:
         self.every = whole_number("every", every, least=1)
         if self.every > self.search.horizon:
             raise UnknownOption("every", every, (f"1 to {self.search.horizon}, the horizon",))
-        self.do, self.backend, self.foresees = dict(do or {}), backend, foresees
+        if not isinstance(foresees, bool):
+            raise UnknownOption("foresees", foresees, ("True", "False"))
+        self.do, self.backend, self.foresees = flatten(do or {}), backend, foresees
         self.seed = whole_number("seed", seed, least=0)
         self.threads = None if threads is None else whole_number("threads", threads, least=1)
         self._forget()
