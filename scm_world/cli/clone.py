@@ -39,6 +39,13 @@ def clone(
         int | None,
         typer.Option(help="In which the network plays along.", show_default=_OF_TASK),
     ] = None,
+    observations: Annotated[
+        str | None,
+        typer.Option(
+            help="Of the network: plain, or privileged: with every causal parameter.",
+            show_default="plain",
+        ),
+    ] = None,
     backend: Backend = "mujoco",
     seed: Seed = 0,
     out: Annotated[
@@ -68,6 +75,7 @@ def clone(
         "protocols": None if protocols is None else [p.strip() for p in protocols.split(",")],
         "noise": noise,
         "rounds": rounds,
+        "observations": observations,
     }
     fields = {name: value for name, value in given.items() if value is not None}
     options = cloning.Options(task, source, fields, backend, seed, tuple(changes or ()), quiet)

@@ -110,6 +110,7 @@ def _about(options: Options, made: Lesson, folder: Path) -> Any:
         rows["episodes"] = f"{made.episodes} on {options.backend}, in {', '.join(made.protocols)}"
         rows["noise"] = f"up to {made.noise:g} of the largest action"
         rows["rounds"] = f"{made.rounds} more, of {made.more} episodes"
+    rows["observations"] = made.observations
     rows["seed"] = str(options.seed)
     rows["folder"] = str(folder)
     for name, value in rows.items():
@@ -119,9 +120,10 @@ def _about(options: Options, made: Lesson, folder: Path) -> Any:
 
 def _is_a_start(learned: Lesson) -> bool:
     """Tell whether the preset of the task trains a policy of this form."""
-    preset = recipe(learned.task)
-    names = {name for name in (*preset.env, *learned.env) if name in OPTIONS}
-    same = all(preset.env.get(name) == learned.env.get(name) for name in names)
+    preset = recipe(learned.task, observations=learned.observations)
+    here, there = preset.options, learned.options
+    names = {name for name in (*here, *there) if name in OPTIONS}
+    same = all(here.get(name) == there.get(name) for name in names)
     return same and preset.network.activation == learned.network.activation
 
 
@@ -134,6 +136,8 @@ def _tell(found: Cloned, terminal: Any) -> None:
         f"evaluate: scm-world evaluate {found.best} {task}",
     ]
     if _is_a_start(found.lesson):
-        lines.append(f"go on:    scm-world train {task} --start {found.best}")
+        seen = found.lesson.observations
+        option = "" if seen == "plain" else f" --observations {seen}"
+        lines.append(f"go on:    scm-world train {task}{option} --start {found.best}")
     for line in lines:
         terminal.print(Text(line), soft_wrap=True)

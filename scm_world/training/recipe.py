@@ -30,6 +30,7 @@ from scm_world.training.settings import (
     Count,
     Hindsight,
     Network,
+    Observations,
     Ppo,
     Rate,
     Settings,
@@ -38,6 +39,7 @@ from scm_world.training.settings import (
     merged,
     nested,
     refused,
+    seen,
 )
 from scm_world.training.tuned import tuned
 from scm_world.variables.spaces import Frozen
@@ -110,7 +112,7 @@ class Recipe(Frozen):
     staggered: bool = True
     critic_warmup: Annotated[int, Field(ge=0)] = 0
     hindsight: Hindsight | None = None
-    observations: Literal["plain", "privileged"] = "plain"
+    observations: Observations = "plain"
     trials: Trials = Field(default_factory=Trials)
 
     @field_validator("env")
@@ -194,9 +196,7 @@ class Recipe(Frozen):
     @property
     def options(self) -> dict[str, Any]:
         """Options of the environment, with all that follows from the other fields."""
-        found = dict(self.env)
-        if self.observations == "privileged":
-            found["context"] = "observation"
+        found = seen(self.env, self.observations)
         if self.hindsight is not None:
             given = found.get("task_options") or {}
             kept = {name: value for name, value in given.items() if name not in REWARDS}

@@ -29,7 +29,19 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Observations = Literal["plain", "privileged"]
+"""What a policy sees: its task, or every causal parameter besides."""
 AUTO = r"^auto(_(0\.\d*[1-9]\d*|[1-9]\d*(\.\d+)?))?$"
+
+
+def seen(env: Mapping[str, Any], observations: Observations) -> dict[str, Any]:
+    """Give options of an environment in which a policy sees what it may.
+
+    Example:
+        >>> seen({"frame_skip": 5}, "privileged")
+        {'frame_skip': 5, 'context': 'observation'}
+    """
+    return {**env, "context": "observation"} if observations == "privileged" else dict(env)
 
 
 class Settings(Frozen):

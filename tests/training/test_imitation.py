@@ -92,6 +92,17 @@ def test_demonstrations_follow_from_the_seed_and_the_number() -> None:
     np.testing.assert_array_equal(both.observations[12:], alone.observations)
 
 
+def test_privileged_observations_have_the_causes_besides() -> None:
+    """The teacher does the same, and the network sees more."""
+    plain, more = shown(1), shown(1, observations="privileged")
+    np.testing.assert_array_equal(more.actions, plain.actions)
+    width = plain.observations.shape[1]
+    np.testing.assert_array_equal(more.observations[:, :width], plain.observations)
+    assert more.observations.shape[1] > width
+    with pytest.raises(UnknownOption, match="observations of a lesson"):
+        lesson("picking", observations="everything")
+
+
 def test_a_quiet_teacher_is_itself() -> None:
     """Without noise, what is shown leads from each observation to the next one."""
     first = shown(1, noise=0.0, protocols=["P0"])
@@ -222,6 +233,8 @@ def test_recordings_of_something_else_are_refused(tmp_path: Path) -> None:
         given_demonstrations(path, lesson("pushing", keep=0.0))
     with pytest.raises(ModelError, match="ended well"):
         given_demonstrations(path, lesson("picking", keep=0.9))
+    with pytest.raises(UnknownOption, match="plain: these recordings"):
+        given_demonstrations(path, lesson("picking", keep=0.0, observations="privileged"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(UnreadableFile, match="no Parquet file"):
         given_demonstrations(tmp_path / "empty", lesson("picking"))

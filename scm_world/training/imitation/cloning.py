@@ -141,7 +141,8 @@ def given_demonstrations(source: Recording | Path | str, lesson: Lesson) -> Give
         lesson: What should be learned from them.
 
     Raises:
-        UnknownOption: They are of another task, or their actions are not in [-1, 1].
+        UnknownOption: They are of another task, their actions are not in [-1, 1], or they lack what
+            privileged observations have.
         UnreadableFile: There are none.
         ModelError: None ended well.
     """
@@ -163,6 +164,9 @@ def given_demonstrations(source: Recording | Path | str, lesson: Lesson) -> Give
         Lesson.model_validate(learned.model_dump(mode="json"))
     except ValidationError as error:
         raise refused("a recording to learn from", error) from None
+    if learned.options != learned.env:
+        allowed = ("plain: these recordings do not have the causal parameters",)
+        raise UnknownOption("observations", lesson.observations, allowed)
     shown = joined([recorded(one, lesson.keep) for one in recordings])
     digest = sha256(shown.observations.tobytes() + shown.actions.tobytes()).hexdigest()
     return Given(shown, learned, digest)
@@ -272,14 +276,14 @@ class _Course:
             "loss": loss,
         }
         return PolicyAbout(
-            task=lesson.task, env=lesson.env, activation=lesson.network.activation, card=card
+            task=lesson.task, env=lesson.options, activation=lesson.network.activation, card=card
         )
 
     def _scores(self, policy: NetworkPolicy, steps: int) -> dict[str, float]:
         lesson = self.lesson
         if not lesson.trials.protocols:
             return {}
-        recipe = Recipe(task=lesson.task, env=lesson.env, trials=lesson.trials)
+        recipe = Recipe(task=lesson.task, env=lesson.options, trials=lesson.trials)
         return dict(tried(policy, recipe, backend=self.backend, steps=steps).scores)
 
     def _finished(self) -> Cloned:

@@ -130,7 +130,7 @@ class School:
     def __init__(self, lesson: Lesson, *, backend: str, seed: int) -> None:
         self._lesson, self._seed = lesson, seed
         self._protocols = lesson.taught()
-        self._env = ScmWorldEnv(lesson.task, backend=backend, **lesson.env)
+        self._env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
         self._arena = Arena(self._env)
         self.engine = self._env.world.engine
         try:

@@ -17,6 +17,7 @@ from scm_world.training.settings import (
     Count,
     Network,
     NotNegative,
+    Observations,
     Positive,
     Share,
     TaskName,
@@ -24,6 +25,7 @@ from scm_world.training.settings import (
     merged,
     nested,
     refused,
+    seen,
 )
 from scm_world.training.tuned import ENV, LESSONS
 from scm_world.variables.spaces import Frozen
@@ -48,6 +50,7 @@ class Lesson(Frozen):
         share: Of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
         keep: Fractional success of an episode, in the end, that is learned from.
+        observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
         network: What learns.
         updates: Steps of the optimizer, each time.
         batch: Control steps that each of them sees.
@@ -71,6 +74,7 @@ class Lesson(Frozen):
     share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.3
     stretch: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 10.0
     keep: Share = 0.9
+    observations: Observations = "plain"
     network: Network = Field(default_factory=lambda: Network(activation="relu"))
     updates: Count = 20_000
     batch: Count = 512
@@ -92,6 +96,11 @@ class Lesson(Frozen):
                 raise UnknownOption("option of the environment of a lesson", name, OPTIONS)
             _refuse_others(name, value)
         return env
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the environment, with all that follows from the other fields."""
+        return seen(self.env, self.observations)
 
     def about(self) -> dict[str, Any]:
         """Write it as plain data."""
