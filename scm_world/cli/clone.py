@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from scm_world.cli.options import Backend, Seed, Task
+from scm_world.cli.options import Backend, Observations, Seed, Task
 
 _OF_TASK = "what works for the task"
 
@@ -39,13 +39,7 @@ def clone(
         int | None,
         typer.Option(help="In which the network plays along.", show_default=_OF_TASK),
     ] = None,
-    observations: Annotated[
-        str | None,
-        typer.Option(
-            help="Of the network: plain, or privileged: with every causal parameter.",
-            show_default="plain",
-        ),
-    ] = None,
+    observations: Observations = None,
     backend: Backend = "mujoco",
     seed: Seed = 0,
     out: Annotated[

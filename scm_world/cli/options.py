@@ -74,3 +74,10 @@ Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
 Policy = Annotated[
     str, typer.Option(help="random, grasp, still, or sweep: the fingertips go to the middle.")
 ]
+Observations = Annotated[
+    str | None,
+    typer.Option(
+        help="Of the policy: plain, or privileged: with every causal parameter.",
+        show_default="plain",
+    ),
+]

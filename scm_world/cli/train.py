@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from scm_world.cli.options import Backend, Seed, Task
+from scm_world.cli.options import Backend, Observations, Seed, Task
 
 
 def train(
@@ -41,12 +41,7 @@ def train(
         Path | None,
         typer.Option(help="Folder of the run.", show_default="under scm-world-results"),
     ] = None,
-    observations: Annotated[
-        str | None,
-        typer.Option(
-            help="plain, or privileged: with every causal parameter.", show_default="plain"
-        ),
-    ] = None,
+    observations: Observations = None,
     hindsight: Annotated[
         bool, typer.Option("--hindsight", help="Hindsight replay and sparse rewards (sac, td3).")
     ] = False,
