@@ -221,10 +221,11 @@ def test_every_error_is_shown_here() -> None:
 
 @pytest.mark.parametrize("kind", CLASSES, ids=lambda c: c.__name__)
 def test_every_error_is_documented_and_exported(kind: type[ScmWorldError]) -> None:
-    """It is drawn in the tree of the module, listed in __all__, and has a docstring."""
+    """It is drawn in the tree, listed in __all__, has a docstring, and is named as imported."""
     assert kind.__doc__
     assert kind.__name__ in errors.__all__
     assert kind.__name__ in (errors.__doc__ or "")
+    assert f"{kind.__module__}.{kind.__qualname__}" == f"scm_world.errors.{kind.__name__}"
 
 
 def test_all_is_honest() -> None:

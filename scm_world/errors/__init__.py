@@ -102,3 +102,7 @@ __all__ = [
     "nearest",
     "raise_all",
 ]
+
+for _name in __all__:  # tracebacks and pickles name them as one imports them
+    globals()[_name].__module__ = __name__
+del _name
