@@ -11,7 +11,7 @@ import numpy as np
 from scm_world import World
 from scm_world.backends import BackendWrapper, make_backend, register
 from scm_world.evaluation import evaluate
-from scm_world.scene.controller import ControlMode
+from scm_world.models.scene import ControlMode
 
 AHEAD = 0.02  # [rad] that a command is ahead of the joints, at most
 

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
 from scm_world._types import Floats, Integers
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference
-from scm_world.scene.scene import ParameterKey, Parameters, Scene
+from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
 
 

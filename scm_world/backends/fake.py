@@ -11,10 +11,16 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
 from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    complete,
+)
 from scm_world.scene import trifinger
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference, complete
-from scm_world.scene.scene import ParameterKey, Parameters, Scene, Structure
+from scm_world.scene.scene import Structure
 from scm_world.scene.state import PhysicalState
 
 

@@ -9,9 +9,7 @@ from typing import ClassVar
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
 from scm_world.errors import SnapshotMismatch
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference
-from scm_world.scene.scene import ParameterKey, Parameters, Scene
+from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene
 from scm_world.scene.state import PhysicalState
 
 

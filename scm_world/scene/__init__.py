@@ -1,14 +1,18 @@
 """An engine-free description of the world: what stands in it, where, and what it is made of."""
 
-from scm_world.scene.controller import TIMESTEP, ControllerSpec, ControlMode
-from scm_world.scene.difference import Difference, diff
-from scm_world.scene.presets import FAST, PRECISE, PRESETS, Preset, preset
-from scm_world.scene.scene import (
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
     Goal,
     Light,
     ParameterKey,
     Parameters,
     Scene,
+    diff,
+)
+from scm_world.scene.controller import TIMESTEP, ControllerSpec
+from scm_world.scene.presets import FAST, PRECISE, PRESETS, Preset, preset
+from scm_world.scene.scene import (
     Structure,
     controller_spec,
     default_parameters,

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from scm_world._types import Floats
+from scm_world.models.scene import ControlMode
 
 TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, whatever the preset
-
-
-class ControlMode(StrEnum):
-    """What the nine numbers of a command mean."""
-
-    JOINT_POSITIONS = "joint_positions"
-    JOINT_TORQUES = "joint_torques"
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@ from scm_world.geometry.hulls import box_hull
 from scm_world.geometry.penetration import box_capsule
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, sweep
+from scm_world.models.scene import Goal, Scene
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
-from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS, Goal, Scene
+from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS
 
 TOLERANCE = 1e-3
 """How deep two bodies may lie in one another after an intervention [m]."""

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.geometry.hulls import Hull
+from scm_world.models.scene import ParameterKey, Parameters, Scene
+from scm_world.models.state import State, StateLayout
 from scm_world.scene import trifinger
 from scm_world.scene.controller import ControllerSpec
 from scm_world.scene.presets import FAST, Preset
-from scm_world.scene.state import PhysicalState
-
-ParameterKey = tuple[str, str]
-"""A body and a property of it, for example ``("tool_block", "mass")``."""
-
-Parameters = Mapping[ParameterKey, Floats]
-"""Physical parameters: scalars have shape (), sizes, colors and gravity shape (3,)."""
+from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState, state_layout
 
 ARENA_HALF_WIDTH = 0.15  # [m]
 ARENA_HEIGHT = 0.3  # [m]
@@ -49,71 +45,40 @@ class Structure:
     obstacles: tuple[str, ...] = ()
     hulls: tuple[tuple[str, Hull], ...] = ()
 
+    @property
+    def timestep(self) -> float:
+        """Physics step [s]."""
+        return self.preset.timestep
+
+    @property
+    def n_commands(self) -> int:
+        """How many numbers a command has."""
+        return trifinger.N_JOINTS
+
+    @property
+    def layout(self) -> StateLayout:
+        """Where each state stands in the vector."""
+        return state_layout(len(self.blocks))
+
+    def empty_state(self) -> PhysicalState:
+        """Give a state to read into."""
+        return PhysicalState(len(self.blocks))
+
+    def default_scene(self) -> Scene:
+        """Give the scene in which every parameter and every state has its default."""
+        return default_scene(self)
+
+    def carried(self, state: State, before: Scene) -> None:
+        """Copy the robot and the blocks that another structure has too."""
+        state.vector[:ROBOT_SIZE] = before.state.vector[:ROBOT_SIZE]
+        blocks = state.vector[ROBOT_SIZE:].reshape(-1, BLOCK_SIZE)
+        for index, name in enumerate(self.blocks):
+            if name in before.structure.blocks:
+                blocks[index] = before.state.blocks[before.structure.blocks.index(name)]
+
     def hull(self, block: str) -> Hull | None:
         """Give the shape of a block that is no box; None for a box."""
         return next((hull for name, hull in self.hulls if name == block), None)
-
-
-@final
-@dataclass(frozen=True)
-class Light:
-    """How a picture is lit.
-
-    Attributes:
-        direction: Towards the light, of any length, shape (3,).
-        ambient: How bright surfaces are that the light does not reach, in [0, 1].
-    """
-
-    direction: tuple[float, float, float] = (0.25, -0.5, 0.83)
-    ambient: float = 0.3
-
-
-@final
-@dataclass(frozen=True)
-class Goal:
-    """A place where something should be. Goals are never bodies: nothing can touch them.
-
-    Attributes:
-        name: Of the entity.
-        shape: ``"box"``, ``"sphere"`` or ``"hull"``.
-        size: Full edge lengths, or three times the diameter, shape (3,) [m].
-        position: Center, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        color: Red, green, blue in [0, 1].
-        hull: The shape where it is a ``"hull"``.
-    """
-
-    name: str
-    shape: str
-    size: Floats
-    position: Floats
-    orientation: Floats
-    color: Floats
-    hull: Hull | None = None
-
-
-@final
-@dataclass(frozen=True)
-class Scene:
-    """Everything an engine needs to know, and everything a picture shows.
-
-    Attributes:
-        structure: The bodies there are.
-        parameters: Their properties, complete (see ``parameter_keys``).
-        state: Where everything is and how it moves.
-        goals: Silhouettes, for pictures and rewards.
-        light: Of pictures; no engine knows it.
-    """
-
-    structure: Structure
-    parameters: Parameters
-    state: PhysicalState
-    goals: tuple[Goal, ...] = ()
-    light: Light = field(default_factory=Light)
-
-    def with_(self, **changes: object) -> Scene:
-        """Copy the scene with some fields replaced."""
-        return replace(self, **changes)  # type: ignore[arg-type]
 
 
 SURFACE = ("size", "friction", "color")

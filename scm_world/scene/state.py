@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from typing import final
-
-import numpy as np
+from functools import lru_cache
+from typing import Any, final
 
 from scm_world._types import Floats
+from scm_world.models.state import State, StateLayout
 from scm_world.scene.trifinger import N_JOINTS
 
 ROBOT_SIZE = 3 * N_JOINTS
 BLOCK_SIZE = 13
 
 
+@lru_cache(maxsize=128)
+def state_layout(n_blocks: int) -> StateLayout:
+    """Give the layout of the state of the robot and some blocks."""
+    robot = ("joint_positions", "joint_velocities", "joint_torques")
+    block = ((0.0,) * 6, 1.0, (0.0,) * 6)
+    return StateLayout(
+        (*robot, *map(str, range(n_blocks))),
+        (N_JOINTS,) * 3 + (BLOCK_SIZE,) * n_blocks,
+        (0.0,) * ROBOT_SIZE + (*block[0], block[1], *block[2]) * n_blocks,
+        frozenset({"joint_torques"}),
+    )
+
+
 @final
-class PhysicalState:
+class PhysicalState(State):
     """What moves.
 
     The vector is ``[joint positions (9) | joint velocities (9) | joint torques (9) | block 0 (13)
@@ -31,18 +44,18 @@ class PhysicalState:
         vector: The numbers, shape (27 + 13 n,); zeros and unit quaternions if not given.
     """
 
-    __slots__ = ("n_blocks", "vector")
+    __slots__ = ()
 
     def __init__(self, n_blocks: int, vector: Floats | None = None) -> None:
-        self.n_blocks = n_blocks
-        if vector is None:
-            vector = np.zeros(ROBOT_SIZE + BLOCK_SIZE * n_blocks)
-            vector[ROBOT_SIZE + 6 :: BLOCK_SIZE] = 1.0
-        self.vector = vector
+        super().__init__(state_layout(n_blocks), vector)
 
-    def copy(self) -> PhysicalState:
-        """Copy the numbers."""
-        return PhysicalState(self.n_blocks, self.vector.copy())
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PhysicalState, (self.n_blocks, self.vector)
+
+    @property
+    def n_blocks(self) -> int:
+        """How many movable blocks there are."""
+        return len(self.layout.names) - 3
 
     @property
     def joint_positions(self) -> Floats:
@@ -83,22 +96,6 @@ class PhysicalState:
     def angular_velocities(self) -> Floats:
         """Shape (n, 3) [rad/s], in the world frame."""
         return self.blocks[:, 10:13]
-
-    def coincides(self, other: PhysicalState) -> bool:
-        """Tell whether all numbers but the torques are the same."""
-        mine, others = self.vector, other.vector
-        return bool((mine[:18] == others[:18]).all() and (mine[27:] == others[27:]).all())
-
-    def settable(self) -> Floats:
-        """Copy all numbers but the torques, shape (18 + 13 n,)."""
-        return np.concatenate([self.vector[:18], self.vector[27:]])
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, PhysicalState):
-            return NotImplemented
-        return bool(np.array_equal(self.vector, other.vector))
-
-    __hash__ = None  # type: ignore[assignment] # mutable
 
     def __repr__(self) -> str:
         return f"PhysicalState(n_blocks={self.n_blocks}, vector={self.vector!r})"

@@ -20,16 +20,9 @@ import pytest
 from scm_world._types import Floats
 from scm_world.backends.base import Backend
 from scm_world.errors import EngineFailure
+from scm_world.models.scene import ControlMode, Difference, Parameters, Scene
 from scm_world.scene import trifinger
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference
-from scm_world.scene.scene import (
-    Parameters,
-    Scene,
-    Structure,
-    controller_spec,
-    default_scene,
-)
+from scm_world.scene.scene import Structure, controller_spec, default_scene
 from scm_world.scene.state import PhysicalState
 from scm_world.testing.effects import EffectConformance
 from scm_world.testing.parameters import ParameterConformance

@@ -10,10 +10,10 @@ import pytest
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
+from scm_world.models.scene import ControlMode, ParameterKey, Scene
 from scm_world.scene import trifinger
-from scm_world.scene.controller import ControlMode
 from scm_world.scene.kinematics import forward, inverse
-from scm_world.scene.scene import ParameterKey, Scene, Structure, default_scene
+from scm_world.scene.scene import Structure, default_scene
 from scm_world.testing.scenes import STONE, named, same
 from scm_world.testing.suite import Suite
 

@@ -5,13 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world.backends.base import Backend
+from scm_world.models.scene import Difference, Scene
 from scm_world.scene import trifinger
-from scm_world.scene.difference import Difference
-from scm_world.scene.scene import (
-    Scene,
-    Structure,
-    parameter_keys,
-)
+from scm_world.scene.scene import Structure, parameter_keys
 from scm_world.scene.state import PhysicalState
 from scm_world.testing.scenes import (
     STONE,

@@ -13,17 +13,10 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
+from scm_world.models.scene import ControlMode, ParameterKey, Parameters, Scene
 from scm_world.scene import trifinger
-from scm_world.scene.controller import ControlMode
 from scm_world.scene.presets import FAST, PRECISE, Preset
-from scm_world.scene.scene import (
-    CONTROLLER,
-    ParameterKey,
-    Parameters,
-    Scene,
-    Structure,
-    default_scene,
-)
+from scm_world.scene.scene import CONTROLLER, Structure, default_scene
 from scm_world.scene.state import PhysicalState
 
 SUBSTEPS = 10

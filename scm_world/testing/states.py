@@ -11,14 +11,8 @@ import pytest
 
 from scm_world.backends.base import Backend, EngineSnapshot
 from scm_world.errors import SnapshotMismatch
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference
-from scm_world.scene.scene import (
-    Scene,
-    Structure,
-    default_scene,
-    parameter_keys,
-)
+from scm_world.models.scene import ControlMode, Difference, Scene
+from scm_world.scene.scene import Structure, default_scene, parameter_keys
 from scm_world.scene.state import PhysicalState
 from scm_world.testing.scenes import (
     another,

@@ -13,9 +13,7 @@ import pytest
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, EngineBatch, EngineSnapshot
 from scm_world.errors import EngineFailure
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference
-from scm_world.scene.scene import Scene
+from scm_world.models.scene import ControlMode, Difference, Scene
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
 from scm_world.scene.trifinger import REST
 from scm_world.testing.scenes import SUBSTEPS, other_value

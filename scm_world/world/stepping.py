@@ -11,8 +11,8 @@ from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.entities import ACTUATOR_NOISE
 from scm_world.graph import SCM, Moment
+from scm_world.models.scene import ControlMode
 from scm_world.scene import PhysicalState
-from scm_world.scene.controller import ControlMode
 from scm_world.scene.kinematics import inverse_kernel
 from scm_world.world.commands import clipped, disturbed
 from scm_world.world.declared import Declared

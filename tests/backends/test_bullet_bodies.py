@@ -16,6 +16,7 @@ from scm_world.backends.bullet import BulletBackend
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull, box_hull
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
+from scm_world.models.scene import ParameterKey
 from scm_world.scene import (
     ControlMode,
     Difference,
@@ -26,7 +27,6 @@ from scm_world.scene import (
     parameter_keys,
     trifinger,
 )
-from scm_world.scene.scene import ParameterKey
 from scm_world.testing.scenes import busy_scene, named, octahedron, other_value, play
 
 pytestmark = pytest.mark.skipif(

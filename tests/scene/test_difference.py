@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from scm_world.geometry.hulls import box_hull
+from scm_world.models.scene import complete
 from scm_world.scene import (
     PRECISE,
     Difference,
@@ -18,7 +19,6 @@ from scm_world.scene import (
     parameter_keys,
 )
 from scm_world.scene.controller import ControllerSpec
-from scm_world.scene.difference import complete
 from scm_world.testing.scenes import busy_scene, other_value
 
 

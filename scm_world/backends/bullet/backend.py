@@ -17,9 +17,14 @@ from scm_world.backends.bullet.engine import load, version
 from scm_world.backends.bullet.history import History, Record, SavedState, relive
 from scm_world.backends.bullet.values import Instant, Values
 from scm_world.errors import EngineFailure, SnapshotMismatch
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference, complete
-from scm_world.scene.scene import ParameterKey, Parameters, Scene
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    complete,
+)
 from scm_world.scene.state import PhysicalState
 
 LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper than a replay

@@ -18,8 +18,8 @@ from scm_world.backends.bullet.law import Law, compile_law
 from scm_world.backends.bullet.passive import MASSES, Resistance, resistance
 from scm_world.backends.bullet.values import Instant, Values, arrays, heavy, number, numbers
 from scm_world.errors import EngineFailure
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.scene import ParameterKey, Structure, controller_spec
+from scm_world.models.scene import ControlMode, ParameterKey
+from scm_world.scene.scene import Structure, controller_spec
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s

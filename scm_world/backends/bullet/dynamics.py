@@ -19,8 +19,8 @@ from scm_world.backends.bullet.arena import (
 from scm_world.backends.bullet.description import link_index
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull
+from scm_world.models.scene import ParameterKey
 from scm_world.scene import trifinger
-from scm_world.scene.scene import ParameterKey
 
 TIP, LOWER = 4, 3  # links of a finger
 

@@ -10,7 +10,7 @@ from typing import Any, final
 
 from scm_world.backends.bullet.client import Client
 from scm_world.backends.bullet.values import Instant, Values
-from scm_world.scene.controller import ControlMode
+from scm_world.models.scene import ControlMode
 
 Step = tuple[ControlMode, Sequence[float], int]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from scm_world.scene.controller import ControllerSpec, ControlMode
+from scm_world.models.scene import ControlMode
+from scm_world.scene.controller import ControllerSpec
 
 Law = Callable[[Sequence[Any], Sequence[float]], list[float]]
 """From joint states (position, velocity, …) and a command, nine each, to nine torques [N m]."""

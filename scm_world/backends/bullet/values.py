@@ -10,7 +10,8 @@ from typing import final
 import numpy as np
 
 from scm_world.errors import EngineFailure, UnknownOption
-from scm_world.scene.scene import ParameterKey, Parameters, Structure, parameter_keys
+from scm_world.models.scene import ParameterKey, Parameters
+from scm_world.scene.scene import Structure, parameter_keys
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
 
 Plain = float | list[float]

@@ -33,9 +33,15 @@ from scm_world.backends.mujoco.state import (
     write_state,
 )
 from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.difference import Difference, complete
-from scm_world.scene.scene import ParameterKey, Parameters, Scene, Structure
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    complete,
+)
+from scm_world.scene.scene import Structure
 from scm_world.scene.state import PhysicalState
 from scm_world.scene.trifinger import N_JOINTS
 

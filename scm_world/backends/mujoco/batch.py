@@ -14,7 +14,7 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
 from scm_world.backends.mujoco.state import read_states
 from scm_world.errors import EngineFailure
-from scm_world.scene.controller import ControlMode
+from scm_world.models.scene import ControlMode
 from scm_world.scene.scene import Structure
 from scm_world.scene.trifinger import N_JOINTS
 

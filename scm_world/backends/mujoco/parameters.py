@@ -29,8 +29,9 @@ from scm_world.backends.mujoco.servos import controller_slots
 from scm_world.backends.mujoco.settings import settings
 from scm_world.backends.mujoco.slots import Everywhere, Slot, Vector
 from scm_world.geometry.hulls import Hull
+from scm_world.models.scene import ParameterKey
 from scm_world.scene import trifinger
-from scm_world.scene.scene import WALL_SEGMENTS, ParameterKey, Structure
+from scm_world.scene.scene import WALL_SEGMENTS, Structure
 
 
 @final

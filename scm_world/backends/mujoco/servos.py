@@ -15,8 +15,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.slots import Slot
-from scm_world.scene.controller import ControlMode
-from scm_world.scene.scene import ParameterKey
+from scm_world.models.scene import ControlMode, ParameterKey
 from scm_world.scene.trifinger import FINGERS, N_JOINTS
 
 _POSITION, _VELOCITY = 1, 2  # where gains rest among the parameters of a gain that is fixed

@@ -9,7 +9,8 @@ import numpy as np
 
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.geometry import rotation_matrix
-from scm_world.scene.scene import Goal, Scene, Structure
+from scm_world.models.scene import Goal, Scene
+from scm_world.scene.scene import Structure
 
 GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 

@@ -21,8 +21,9 @@ from scm_world.backends.renderer.kernels import (
     draw,
 )
 from scm_world.backends.renderer.views import camera_view, parallel_view
+from scm_world.models.scene import Light, Scene
 from scm_world.scene.camera import Camera
-from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS, Light, Scene
+from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS
 
 BACKGROUND = (0.86, 0.89, 0.93)
 SHADOW = 0.45 / 0.7  # how much of the light that is not ambient a full shadow takes away

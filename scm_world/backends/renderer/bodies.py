@@ -11,9 +11,10 @@ from numba import njit
 from scm_world._types import Floats, Integers
 from scm_world.geometry.hulls import Hull, solid
 from scm_world.geometry.rotations import rotation_kernel
+from scm_world.models.scene import Goal, Scene
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
-from scm_world.scene.scene import Goal, Scene, Structure
+from scm_world.scene.scene import Structure
 
 BOX, ELLIPSOID, CAPSULE, HULL = range(4)
 GOAL_SHAPES = {"box": BOX, "sphere": ELLIPSOID, "hull": HULL}

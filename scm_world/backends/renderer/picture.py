@@ -22,8 +22,8 @@ from scm_world.backends.renderer.bodies import Bodies, body_names, goal_bodies, 
 from scm_world.backends.renderer.kernels import Canvas, draw
 from scm_world.backends.renderer.views import camera_view
 from scm_world.errors import UnknownOption
+from scm_world.models.scene import Scene
 from scm_world.scene.camera import Camera
-from scm_world.scene.scene import Scene
 
 GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 

@@ -21,8 +21,8 @@ from scm_world.backends.renderer.bodies import Bodies, solid_bodies
 from scm_world.backends.renderer.kernels import Canvas, Colors, draw
 from scm_world.backends.renderer.picture import draw_scene
 from scm_world.backends.renderer.views import camera_view
+from scm_world.models.scene import Scene
 from scm_world.scene.camera import Camera
-from scm_world.scene.scene import Scene
 from scm_world.scene.state import PhysicalState
 from scm_world.scene.trifinger import JOINT_LOW
 

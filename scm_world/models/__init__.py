@@ -1,0 +1,37 @@
+"""An engine-free description of any system: what moves, what can be set, what can be commanded."""
+
+from scm_world.models.model import Input, Model, Parameter, Readout, Row, StateRow
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
+    Goal,
+    Light,
+    ParameterKey,
+    Parameters,
+    Scene,
+    Structure,
+    complete,
+    diff,
+)
+from scm_world.models.state import State, StateLayout
+
+__all__ = [
+    "ControlMode",
+    "Difference",
+    "Goal",
+    "Input",
+    "Light",
+    "Model",
+    "Parameter",
+    "ParameterKey",
+    "Parameters",
+    "Readout",
+    "Row",
+    "Scene",
+    "State",
+    "StateLayout",
+    "StateRow",
+    "Structure",
+    "complete",
+    "diff",
+]

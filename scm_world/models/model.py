@@ -1,0 +1,190 @@
+"""The description of any articulated system: typed tables of what can be set, read and commanded.
+
+Engine-free. A reader (``backends.mujoco.reading``, ``backends.bullet.reading``) makes it from a
+file; an engine realises it. The tables say on which kinematic trees each quantity acts, always or
+while there is contact: the causal graph follows from them and from nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, final
+
+import numpy as np
+
+from scm_world.models.scene import ParameterKey, Scene
+from scm_world.models.state import State, StateLayout
+
+Numbers = float | tuple[float, ...]
+"""One number, or one for each component."""
+
+Change = Literal["live", "constants", "recompile"]
+"""What a write costs: nothing more, derived constants, or another compilation."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A named quantity.
+
+    Attributes:
+        name: ``"<element>.<attribute>"``, unique in the model.
+        unit: SI unit; ``"1"`` where there is none.
+        shape: Of one value.
+        default: In the model as it was given.
+        low: Lower bound, of all components or of each; ``-inf`` where there is none.
+        high: Upper bound.
+        doc: One sentence.
+        always: Numbers of the trees on whose states it acts in every step.
+        contact: Numbers of the trees on which it acts while bodies touch.
+    """
+
+    name: str
+    unit: str
+    shape: tuple[int, ...]
+    default: Numbers
+    low: Numbers
+    high: Numbers
+    doc: str
+    always: frozenset[int] = frozenset()
+    contact: frozenset[int] = frozenset()
+
+
+@final
+@dataclass(frozen=True)
+class Parameter(Row):
+    """A property of an element that holds until it is set again.
+
+    Attributes:
+        key: The element and the property, as engines know it.
+        kind: ``"real"``, ``"rotation"`` (unit quaternion) or ``"inertia"`` (principal moments,
+            which obey the triangle inequality).
+        change: What a write costs.
+        visual: Whether it acts on pictures only.
+    """
+
+    key: ParameterKey = ("", "")
+    kind: Literal["real", "rotation", "inertia"] = "real"
+    change: Change = "live"
+    visual: bool = False
+
+
+@final
+@dataclass(frozen=True)
+class StateRow(Row):
+    """Something that physics moves. ``always`` and ``contact`` contain its own tree.
+
+    Attributes:
+        tree: Number of the kinematic tree it belongs to.
+        kind: ``"rotation"`` for a unit quaternion (x, y, z, w).
+    """
+
+    tree: int = 0
+    kind: Literal["real", "rotation"] = "real"
+
+
+@final
+@dataclass(frozen=True)
+class Input(Row):
+    """A number that a controller decides. Its bounds are the range of the actuator."""
+
+
+@final
+@dataclass(frozen=True)
+class Readout:
+    """Something that follows from states and parameters at once, such as the place of a site.
+
+    Attributes:
+        name: ``"<element>.<attribute>"``.
+        unit: SI unit.
+        shape: Of one value.
+        parents: Names of the states and parameters that it is a function of.
+        function: Takes their values in that order, and gives the value. It can be pickled.
+        doc: One sentence.
+    """
+
+    name: str
+    unit: str
+    shape: tuple[int, ...]
+    parents: tuple[str, ...]
+    function: Callable[..., Any]
+    doc: str
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A system: what an engine compiles, and the tables of what there is.
+
+    Two models are equal if their engines would compile the same from them.
+
+    Attributes:
+        name: Of the system.
+        digest: Hash of everything that decides what is compiled.
+        source: What an engine compiles: only the reader and its engine look into it.
+        timestep: Physics step [s].
+        parameters: What can be set and holds.
+        states: What moves, in the order of the state vector.
+        inputs: The components of a command, in order.
+        readouts: What follows at once from the others; those that were asked for.
+        trees: Names of the kinematic trees (bodies with one root), by number.
+        refused: What cannot be set or exposed, by name, with the reason.
+        notes: What acts without having a variable (plugins, flex), one sentence each.
+    """
+
+    name: str
+    digest: str
+    source: Any = field(repr=False)
+    timestep: float
+    parameters: tuple[Parameter, ...]
+    states: tuple[StateRow, ...]
+    inputs: tuple[Input, ...]
+    readouts: tuple[Readout, ...] = ()
+    trees: tuple[str, ...] = ()
+    refused: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Model) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    @property
+    def n_commands(self) -> int:
+        """How many numbers a command has."""
+        return len(self.inputs)
+
+    @cached_property
+    def layout(self) -> StateLayout:
+        """Where each state stands in the vector."""
+        sizes = tuple(int(np.prod(row.shape)) for row in self.states)
+        start = [np.broadcast_to(row.default, row.shape).ravel() for row in self.states]
+        return StateLayout(
+            tuple(row.name for row in self.states),
+            sizes,
+            tuple(np.concatenate([*start, np.empty(0)]).tolist()),
+        )
+
+    def empty_state(self) -> State:
+        """Give a state to read into."""
+        return State(self.layout)
+
+    def default_scene(self) -> Scene:
+        """Give the scene in which every parameter and every state has its default."""
+        return Scene(self, self.default_parameters(), self.empty_state())
+
+    def default_parameters(self) -> dict[ParameterKey, Any]:
+        """Give the default of every parameter, by key."""
+        return {
+            row.key: np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
+            for row in self.parameters
+        }
+
+    def carried(self, state: State, before: Scene) -> None:
+        """Copy the states that another structure has too, from a scene of it into a state."""
+        there = before.state.layout.slices
+        for name, where in self.layout.slices.items():
+            if name in there:
+                state.vector[where] = before.state.vector[there[name]]

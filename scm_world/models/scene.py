@@ -1,0 +1,181 @@
+"""What an engine is told, and what a picture shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Any, Protocol, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.geometry.hulls import Hull
+from scm_world.models.state import State
+
+ParameterKey = tuple[str, str]
+"""An element and a property of it, for example ``("tool_block", "mass")``."""
+
+Parameters = Mapping[ParameterKey, Floats]
+"""Physical parameters: scalars have shape (), sizes, colors and gravity shape (3,)."""
+
+
+class ControlMode(StrEnum):
+    """What the numbers of a command mean."""
+
+    JOINT_POSITIONS = "joint_positions"
+    JOINT_TORQUES = "joint_torques"
+    CONTROLS = "controls"
+
+
+class Structure(Protocol):
+    """What has to be compiled: it changes only when bodies come or go. Hashable, picklable."""
+
+    @property
+    def timestep(self) -> float:
+        """Physics step [s]."""
+
+    @property
+    def n_commands(self) -> int:
+        """How many numbers a command has."""
+
+    @property
+    def layout(self) -> Any:
+        """Layout of the state; a ``StateLayout``."""
+
+    def empty_state(self) -> Any:
+        """Give a state to read into; a ``State``."""
+
+    def default_scene(self) -> Scene:
+        """Give the scene in which every parameter and every state has its default."""
+
+    def carried(self, state: State, before: Scene) -> None:
+        """Copy the states that another structure has too, from a scene of it into a state."""
+
+
+@final
+@dataclass(frozen=True)
+class Light:
+    """How a picture is lit.
+
+    Attributes:
+        direction: Towards the light, of any length, shape (3,).
+        ambient: How bright surfaces are that the light does not reach, in [0, 1].
+    """
+
+    direction: tuple[float, float, float] = (0.25, -0.5, 0.83)
+    ambient: float = 0.3
+
+
+@final
+@dataclass(frozen=True)
+class Goal:
+    """A place where something should be. Goals are never bodies: nothing can touch them.
+
+    Attributes:
+        name: Of the entity.
+        shape: ``"box"``, ``"sphere"`` or ``"hull"``.
+        size: Full edge lengths, or three times the diameter, shape (3,) [m].
+        position: Center, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w).
+        color: Red, green, blue in [0, 1].
+        hull: The shape where it is a ``"hull"``.
+    """
+
+    name: str
+    shape: str
+    size: Floats
+    position: Floats
+    orientation: Floats
+    color: Floats
+    hull: Hull | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Scene:
+    """Everything an engine needs to know, and everything a picture shows.
+
+    Attributes:
+        structure: The bodies there are.
+        parameters: Their properties, complete.
+        state: Where everything is and how it moves.
+        goals: Silhouettes, for pictures and rewards.
+        light: Of pictures; no engine knows it.
+    """
+
+    structure: Any
+    parameters: Parameters
+    state: Any
+    goals: tuple[Goal, ...] = ()
+    light: Light = field(default_factory=Light)
+
+    def with_(self, **changes: object) -> Scene:
+        """Copy the scene with some fields replaced."""
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+
+@final
+@dataclass(frozen=True)
+class Difference:
+    """What an engine has to change.
+
+    Attributes:
+        structure: The new structure, or None where it stays.
+        parameters: Only the parameters that change.
+        state: The complete new state, or None where nothing is moved.
+    """
+
+    structure: Any = None
+    parameters: Parameters = field(default_factory=dict)
+    state: Any = None
+
+    def __bool__(self) -> bool:
+        return self.structure is not None or bool(self.parameters) or self.state is not None
+
+
+def diff(now: Scene, then: Scene) -> Difference:
+    """Compare two scenes, and give the smallest set of changes from one to the other.
+
+    Goals are not compared: no engine knows them. Neither are states that cannot be set.
+
+    Example:
+        >>> from scm_world.scene import Structure, default_scene, diff
+        >>> scene = default_scene(Structure(blocks=("tool_block",)))
+        >>> heavy = {**scene.parameters, ("tool_block", "mass"): np.array(0.05)}
+        >>> diff(scene, scene.with_(parameters=heavy)).parameters
+        {('tool_block', 'mass'): array(0.05)}
+        >>> bool(diff(scene, scene))
+        False
+    """
+    if now.structure != then.structure:
+        return Difference(then.structure, dict(then.parameters), then.state)
+    changed = {
+        key: value
+        for key, value in then.parameters.items()
+        if value is not now.parameters[key] and not np.array_equal(value, now.parameters[key])
+    }
+    same = now.state.coincides(then.state)
+    return Difference(None, changed, None if same else then.state)
+
+
+def complete(now: Scene, structure: Structure, difference: Difference) -> Difference:
+    """Fill in what a change of structure leaves unsaid.
+
+    Bodies that stay keep their parameters and their state, new ones get the defaults.
+
+    Args:
+        now: The scene before.
+        structure: The structure after.
+        difference: A change to that structure, with only some parameters, or without a state.
+
+    Returns:
+        The same change with all parameters and a state.
+    """
+    default = structure.default_scene()
+    stays = {key: value for key, value in now.parameters.items() if key in default.parameters}
+    state = difference.state
+    if state is None:
+        state = default.state
+        structure.carried(state, now)
+    return Difference(structure, {**default.parameters, **stays, **difference.parameters}, state)
