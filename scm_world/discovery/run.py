@@ -70,7 +70,7 @@ def discover(
         about = {
             "task": world.task.name,
             "backend": world.backend.name,
-            "preset": world.structure.preset.name,
+            "preset": world.options.preset,
             "engine": f"{world.backend.name} {world.backend.version}",
         }
         return _report(world.model, effects, done, probes, seed, about, started)
@@ -105,7 +105,7 @@ def _terms(world: World, seed: int) -> dict[str, Any]:
         "task": world.task.name,
         "arguments": given,
         "action_mode": world.action_mode,
-        "preset": world.structure.preset.name,
+        "preset": world.options.preset,
         "seed": seed,
         "versions": versions(f"{backend.name} {backend.version}"),
     }

@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-from abc import ABC
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
-from scm_world.scene import Goal, Light, ParameterKey
+from scm_world.graph import Moment
+from scm_world.models import (
+    ControlMode,
+    Goal,
+    Light,
+    ParameterKey,
+    Scene,
+    Structure,
+)
+from scm_world.scene import PRESETS, preset
+from scm_world.scene import Structure as SceneStructure
+from scm_world.scene.feasibility import Overlap, overlaps
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.variables import Function, Measured, Parent, Space, Variable
+from scm_world.variables.catalogue import PRESET
 
 Numbers = float | tuple[float, ...]
+
+PRESET_NAMES = tuple(PRESETS)
+"""What the categories of ``timestep_preset`` stand for."""
 
 
 @final
@@ -138,6 +153,10 @@ class Entity(ABC):  # every hook has a sensible empty default
         """Describe the light that this entity is, if it is one."""
         return None
 
+    def commands(self) -> Commands | None:
+        """Give what turns actions into commands, if this entity does."""
+        return None
+
 
 def block_slice(block: int, start: int, stop: int) -> slice:
     """Give the place of some numbers of a block in the state vector."""
@@ -145,34 +164,125 @@ def block_slice(block: int, start: int, stop: int) -> slice:
     return slice(offset + start, offset + stop)
 
 
+class Commands(ABC):
+    """What turns an action into what the engine is told, where they are not the same."""
+
+    @abstractmethod
+    def applies(self, values: Values) -> bool:
+        """Tell whether it is needed, given the values of everything that physics does not move."""
+
+    @abstractmethod
+    def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
+        """Give the command of one control step.
+
+        Args:
+            action: All action variables, shape (n_actions,).
+            values: Of everything that physics does not move.
+            vector: The state.
+            moment: Where in the noise this control step draws.
+
+        Returns:
+            Shape (n_commands,). It holds until the next call.
+        """
+
+
+class Composition(ABC):
+    """What the variables of a world mean to an engine: where causal and physical column meet.
+
+    Attributes:
+        entities: In the order of the observation.
+        blocks: Names of the movable blocks.
+        obstacles: Names of the obstacles.
+        hulls: The blocks that are no boxes.
+        solid: Whether ``overlaps`` tells which bodies are in one place.
+        mode: What a command means.
+        commands: What turns an action into a command; None where they are the same.
+    """
+
+    entities: tuple[Entity, ...] = ()
+    blocks: tuple[str, ...] = ()
+    obstacles: tuple[str, ...] = ()
+    hulls: tuple[tuple[str, Hull], ...] = ()
+    solid: bool = False
+    mode: ControlMode = ControlMode.CONTROLS
+    commands: Commands | None = None
+
+    @abstractmethod
+    def structure(self, values: Values) -> Structure:
+        """Say what the engine has to compile; equal values give the same object."""
+
+    @abstractmethod
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+
+    @abstractmethod
+    def slices(self) -> Mapping[str, slice]:
+        """Say where each state stands in the state vector."""
+
+    def timestep(self, values: Values) -> float:
+        """Give the physics step [s]."""
+        return float(self.structure(values).timestep)
+
+    def overlaps(self, scene: Scene, tolerance: float) -> tuple[Overlap, ...]:
+        """List the bodies that lie deeper in one another than a tolerance [m]."""
+        return ()
+
+    def goals(self, values: Values) -> tuple[Goal, ...]:
+        """Describe all goals."""
+        return ()
+
+    def light(self, values: Values) -> Light:
+        """Describe the light of pictures."""
+        return Light()
+
+
 @final
 @dataclass(frozen=True)
-class Composition:
-    """All entities of a world together: where the causal and the physical column meet.
+class BlockWorld(Composition):
+    """The robot, blocks, obstacles, goals and what they stand in.
 
     Attributes:
         entities: In the order of the observation.
         shared: Variables that belong to no single entity.
         deciding: Variables that decide which entities there are. A body that comes or goes acts
             on the others by contact, so they do.
+        mode: What a command means.
     """
 
     entities: tuple[Entity, ...]
     shared: tuple[Variable, ...] = ()
     deciding: tuple[str, ...] = ()
+    mode: ControlMode = ControlMode.JOINT_POSITIONS
+    solid: bool = field(init=False, default=True)
     blocks: tuple[str, ...] = field(init=False)
     obstacles: tuple[str, ...] = field(init=False)
     hulls: tuple[tuple[str, Hull], ...] = field(init=False)
+    commands: Commands | None = field(init=False)
+    _structures: dict[str, SceneStructure] = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         blocks = [entity for entity in self.entities if entity.is_block]
+        commands = (entity.commands() for entity in self.entities)
         found = {
             "blocks": tuple(entity.name for entity in blocks),
             "obstacles": tuple(entity.name for entity in self.entities if entity.is_obstacle),
             "hulls": tuple((e.name, e.hull) for e in blocks if e.hull is not None),
+            "commands": next((one for one in commands if one is not None), None),
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    def structure(self, values: Values) -> SceneStructure:
+        """Say which bodies the engine has to build, and how finely it cuts time."""
+        name = PRESET_NAMES[int(values[PRESET])]
+        if name not in self._structures:
+            made = SceneStructure(self.blocks, preset(name), self.obstacles, self.hulls)
+            self._structures[name] = made
+        return self._structures[name]
+
+    def overlaps(self, scene: Scene, tolerance: float) -> tuple[Overlap, ...]:
+        """List the bodies that lie deeper in one another than a tolerance [m]."""
+        return overlaps(scene, tolerance=tolerance)
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""

@@ -8,13 +8,15 @@ from typing import Any, final
 import numpy as np
 from numba import njit
 
-from scm_world._types import Floats, Value
-from scm_world.entities.base import Entity, State
+from scm_world._types import Floats, Value, Values
+from scm_world.entities.base import Commands, Entity, State
 from scm_world.entities.blocks import color
 from scm_world.geometry.scalars import scalar
+from scm_world.graph import Moment
 from scm_world.scene import ControllerSpec, ParameterKey, trifinger
-from scm_world.scene.kinematics import forward_kernel
-from scm_world.variables import Action, Box, Exogenous, Measured, Variable
+from scm_world.scene.kinematics import forward_kernel, inverse_kernel
+from scm_world.scene.trifinger import N_JOINTS
+from scm_world.variables import Action, Box, Exogenous, Measured, Normal, Variable
 from scm_world.variables import catalogue as numbers
 
 END_EFFECTORS = Box((-0.5, -0.5, 0.0) * 3, (0.5, 0.5, 0.5) * 3)  # [m] what an action may ask for
@@ -84,6 +86,41 @@ def tips(joint_positions: Floats, robot_height: Value) -> Floats:
 
 _tips: Any = tips
 _tips.into = tips_into  # a loop that keeps the array calls this instead
+
+
+STREAM = "actuators"
+"""The stream of the noise; draws of the variable that scales it have another one."""
+
+
+@final
+class RobotCommands(Commands):
+    """Joint positions for fingertips, and the noise of the actuators.
+
+    Args:
+        action_mode: One of ``ACTIONS``.
+    """
+
+    def __init__(self, action_mode: str) -> None:
+        self._by_tips = action_mode == "end_effector_positions"
+        low, high = ACTIONS[action_mode][1].bounds((N_JOINTS,), {})
+        self._half = (high - low) / 2.0
+        self._joints, self._reached = np.empty(N_JOINTS), np.empty(3, dtype=np.bool_)
+
+    def applies(self, values: Values) -> bool:
+        """Tell whether fingertips are commanded, or the actuators have noise."""
+        return self._by_tips or bool(values[ACTUATOR_NOISE] > 0.0)
+
+    def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
+        """Add the noise, then find the joint positions of fingertips, shape (9,)."""
+        noise = float(values[ACTUATOR_NOISE])
+        if noise > 0.0:
+            drawn = moment.draw(Normal(), STREAM, (N_JOINTS,), {})
+            action = action + noise * self._half * drawn
+        if self._by_tips:
+            height = float(values["robot_height"])
+            inverse_kernel(action, height, vector[:N_JOINTS], self._joints, self._reached)
+            action = self._joints
+        return action
 
 
 @final
@@ -247,6 +284,10 @@ class Robot(Entity):
             "joint_damping": ("robot", "joint_damping"),
         }
         return {**own, **control, **links}
+
+    def commands(self) -> Commands:
+        """Give what turns actions into joint positions or torques."""
+        return RobotCommands(self.action_mode)
 
     def slices(self, block: int) -> Mapping[str, slice]:
         """Say where its states stand in the state vector."""

@@ -8,17 +8,15 @@ from typing import final
 from numba import njit
 
 from scm_world._types import Value
-from scm_world.entities.base import Entity
+from scm_world.entities.base import PRESET_NAMES, Entity
 from scm_world.entities.blocks import color
 from scm_world.geometry.scalars import scalar
-from scm_world.scene import PRESETS, ParameterKey
+from scm_world.scene import ParameterKey
 from scm_world.variables import Box, Categories, Exogenous, Function, Measured, Parent, Variable
 from scm_world.variables import catalogue as numbers
 
 CONTROL_INDEX = "control_index"
 SENSOR_NOISE = "sensor_noise"
-PRESET_NAMES = tuple(PRESETS)
-"""What the categories of ``timestep_preset`` stand for."""
 
 
 @final

@@ -102,7 +102,8 @@ class Delta:
             return measured
         now, state = world.current()
         if world.action_mode == JOINTS and self.is_set():
-            return state.joint_positions
+            found: Floats = state["joint_positions"]
+            return found
         last: Floats = now["action"]
         return last
 

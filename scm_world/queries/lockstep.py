@@ -18,7 +18,6 @@ from scm_world.queries.courses import Course
 from scm_world.queries.policies import Blind
 from scm_world.queries.traces import ALL, Trace, intervene, note_parameters, write
 from scm_world.queries.units import Unit
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.world import World
 from scm_world.world.batch import Batch
 from scm_world.world.columns import Table
@@ -75,7 +74,7 @@ class _Layout:
     def of(cls, table: Table, names: Sequence[str]) -> _Layout:
         """Look it up."""
         declaration = table.declaration
-        size = width = ROBOT_SIZE + BLOCK_SIZE * declaration.n_blocks
+        size = width = table.state_size
         parts, places = [np.arange(size)], {}
         for name in names:
             if name in declaration.model:

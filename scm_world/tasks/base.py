@@ -1,62 +1,78 @@
-"""What a task is: what stands in the world, what is shared, and what counts."""
+"""What a task is: what there is, what is shared, and what counts."""
 
 from __future__ import annotations
 
 import copy
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping
-from typing import Any, ClassVar, Self, Unpack
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.entities import Entity
+from scm_world.entities import Composition
 from scm_world.errors import UnknownOption
-from scm_world.scene import trifinger
-from scm_world.tasks import shaping
-from scm_world.tasks.arguments import numbers_of
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.observed import Observed
-from scm_world.tasks.rewards import Common, further_terms, resolve
 from scm_world.variables import Draw, Integers, Measured, Variable
 from scm_world.variables.kinds import SpaceName
 
 
-class Task(ABC):
-    """A goal family.
+@final
+@dataclass(frozen=True)
+class Timing:
+    """How a world is commanded and how time is cut.
 
-    An instance describes one structure: the entities there are. Where variables decide how many
-    (levels, counts), they are declared in ``shared`` and named in ``decided_by``; ``arrange``
-    turns their values into a ``plan``, and every other method reads ``self.plan``.
+    Attributes:
+        action_mode: One of the task's ``action_modes``.
+        preset: One of the task's ``presets``.
+        control_period: Length of a control step [s].
+        steps: Length of an episode in control steps.
+    """
+
+    action_mode: str
+    preset: str
+    control_period: float
+    steps: int
+
+
+class Task(ABC):
+    """A system, and what counts in it.
+
+    An instance describes one structure. Where variables decide what there is (levels, counts),
+    they are declared in ``shared`` and named in ``decided_by``; ``arrange`` turns their values
+    into a ``plan``, and every other method reads ``self.plan``. ``TriFingerTask`` is the base of
+    goal families of the block-building robot, ``ModelTask`` that of any other model.
 
     Attributes:
         name: Of the task.
-        default_weights: Weight of every dense reward term, in order, and of
-            ``fractional_success``.
-        paper_weights: Where the published training runs differ.
-        ready_terms: Further reward terms, by name in the option ``terms``.
-        decided_by: The shared variables that decide what stands in the world.
-        goal_causes: The variables that a new goal is drawn for.
-        plan: What stands in the world, as ``arrange`` has it; None where that is always the same.
-        absent: Entities that an intervention took away.
-        conventions: Ours or the predecessor's.
+        action_modes: How the system can be commanded; the first is the default.
+        presets: Numerical settings to choose from; the first is the default.
+        time_unit: What ``frame_skip`` counts [s].
+        frame_skip: Length of a control step, if none is asked for.
         weights: Weight of each reward term, by the name of its variable.
         terms: Reward terms that were asked for.
-        start: Where the robot begins, shape (9,) [rad].
+        decided_by: The shared variables that decide what there is.
+        goal_causes: The variables that a new goal is drawn for.
+        plan: What there is, as ``arrange`` has it; None where that is always the same.
+        absent: Entities that an intervention took away.
+        conventions: Ours or the predecessor's.
         given: What it was made with.
     """
 
     given: dict[str, Any]
     is_named: bool
 
-    name: ClassVar[str]
-    default_weights: ClassVar[Mapping[str, float]]
-    paper_weights: ClassVar[Mapping[str, float]] = {}
-    ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    name: str
+    action_modes: tuple[str, ...]
+    presets: tuple[str, ...]
+    time_unit: float
+    frame_skip: int
+    weights: Mapping[str, float] = {}  # a constant
+    terms: tuple[Measured, ...] = ()
     decided_by: ClassVar[tuple[str, ...]] = ()
     goal_causes: ClassVar[tuple[str, ...]] = ()
-    rest: ClassVar[tuple[float, ...]] = trifinger.REST
     plan: Hashable = None
     absent: frozenset[str] = frozenset()
     conventions: Conventions = CONVENTIONS["scm_world"]
@@ -68,33 +84,17 @@ class Task(ABC):
         task.is_named = not args  # every argument has its name
         return task
 
-    def __init__(self, **common: Unpack[Common]) -> None:
-        unknown = sorted(common.keys() - Common.__annotations__.keys())
-        if unknown:
-            raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
-        self.terms = further_terms(common.get("terms", ()), self.default_weights, self.ready_terms)
-        self.weights = resolve(self.default_weights, self.paper_weights, common, self.terms)
-        given = common.get("joint_positions")
-        joints = numbers_of(self.rest if given is None else given)
-        if joints is None or joints.shape != (trifinger.N_JOINTS,):
-            raise UnknownOption("joint_positions", given, ("nine angles [rad]",))
-        self.start = tuple(joints.tolist())
-
-    @classmethod
-    def arguments(cls) -> tuple[str, ...]:
-        """Name the arguments of the constructor, those of this family first."""
-        own = [vars(kind)["__init__"] for kind in cls.__mro__ if "__init__" in vars(kind)]
-        given = [p for init in own[:-1] for p in inspect.signature(init).parameters.values()]
-        names = [parameter.name for parameter in given if parameter.kind is parameter.KEYWORD_ONLY]
-        return tuple(dict.fromkeys((*names, *Common.__annotations__)))
-
     @property
     @abstractmethod
     def seconds(self) -> float:
         """Length of an episode [s]."""
 
+    @abstractmethod
+    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+        """Declare all variables, and say what they mean to an engine."""
+
     def arrange(self, values: Values) -> Hashable:
-        """Say what stands in the world, given the variables of ``decided_by``."""
+        """Say what there is, given the variables of ``decided_by``."""
         return None
 
     def at(
@@ -105,35 +105,26 @@ class Task(ABC):
         other.plan, other.conventions, other.absent = plan, conventions, absent
         return other
 
-    @abstractmethod
-    def entities(self) -> Iterable[Entity]:
-        """List what stands in the world besides the robot and the stage."""
-
     def shared(self) -> Iterable[Variable]:
         """Declare causes that several entities have in common; the same for every plan."""
         return ()
 
-    @abstractmethod
-    def readouts(self) -> Iterable[Variable]:
-        """Declare reward terms, fractional success and success."""
-
-    @abstractmethod
     def observed(self) -> Iterable[Observed]:
-        """List what follows the 28 common numbers of the observation."""
+        """List what is observed, in order."""
+        return ()
 
-    @abstractmethod
     def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Name the variables that say what is achieved, and those that say what is desired."""
+        return (), ()
 
     def goals(self, values: Values) -> tuple[Floats, Floats]:
         """Give what is achieved and what is desired, two vectors of one shape."""
         achieved, desired = (
-            np.concatenate([np.ravel(values[name]) for name in names])
+            np.concatenate([np.empty(0), *(np.ravel(values[name]) for name in names)])
             for names in self.goal_names()
         )
         return achieved, desired
 
-    @abstractmethod
     def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute the fractional success of vectors as ``goals`` gives them.
 
@@ -143,15 +134,19 @@ class Task(ABC):
 
         Returns:
             Shape (...).
-        """
 
-    @abstractmethod
+        Raises:
+            UnknownOption: The task has no goals.
+        """
+        raise UnknownOption("goals of", self.name, ("a task with goals",))
+
     def fulfilled(self, fraction: ArrayLike) -> Any:
         """Tell whether a fractional success counts as success, shape (...)."""
+        return np.asarray(fraction) >= 1.0
 
-    @abstractmethod
     def solution(self, values: Values) -> dict[str, Value]:
-        """Give an intervention after which the goal is fulfilled."""
+        """Give an intervention after which the goal is fulfilled; none where there is no goal."""
+        return {}
 
     def nearby(self, values: Values) -> Iterable[dict[str, Value]]:
         """List interventions that change what stands in the world a little: one more, one fewer.

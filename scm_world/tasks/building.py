@@ -16,9 +16,9 @@ from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.scene import trifinger
 from scm_world.scene.feasibility import fingers_reach
 from scm_world.tasks import kernels
-from scm_world.tasks.base import Task
 from scm_world.tasks.observed import Observed, observe_goal, observe_obstacle, observe_tool
 from scm_world.tasks.rewards import FRACTION, FULFILLED, SUCCESS, UNIT, above, reward
+from scm_world.tasks.trifinger import TriFingerTask
 from scm_world.variables import Function, Integers, Measured, Variable
 from scm_world.variables.mechanisms import Stacked
 
@@ -66,7 +66,7 @@ def aligned(*parents: Floats, tools: float) -> float:
     return aabb_overlap_fraction(*gathered(*parents, tools=tools))
 
 
-class Building(Task):
+class Building(TriFingerTask):
     """A task in which blocks should fill goals.
 
     Attributes:

@@ -16,10 +16,10 @@ from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
 from scm_world.tasks import kernels, shaping
 from scm_world.tasks.arguments import checked
-from scm_world.tasks.base import Task
 from scm_world.tasks.observed import Observed, observe_obstacle, observe_position
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
 from scm_world.tasks.scattered import COUNT, MOST, obstacle_names, scattered, scattering
+from scm_world.tasks.trifinger import TriFingerTask
 from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
 from scm_world.variables import catalogue as numbers
 from scm_world.variables.kinds import SpaceName
@@ -66,7 +66,7 @@ def minus_change(now: Floats, before: Floats) -> float:
 
 
 @final
-class Reaching(Task):
+class Reaching(TriFingerTask):
     """Three points in the air, one for each fingertip.
 
     Reward terms:

@@ -21,6 +21,7 @@ from scm_world.entities import SENSOR_NOISE
 from scm_world.errors import Infeasible
 from scm_world.graph import from_json, to_json
 from scm_world.scene import Scene
+from scm_world.tasks import Timing
 from scm_world.testing.dynamics import SEED, WorldConformance
 from scm_world.testing.values import command, moved, quantities
 from scm_world.variables import Draw, Noise, Variable
@@ -212,9 +213,12 @@ def out_of_bounds(world: World) -> list[str]:
 
 def _declared(world: World) -> list[Variable]:
     """List the declarations as they were written down, duplicates included."""
+    options, task = world.options, world.task
+    timing = Timing(
+        options.action_mode, options.preset, options.control_period, world.max_episode_length
+    )
     return [
-        *world.composition.variables(),
-        *world.task.readouts(),
+        *task.compose(timing)[1],
     ]
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
-from scm_world.scene.kinematics import inverse_kernel
 from scm_world.work.threads import cores
 from scm_world.world.columns import Table
 from scm_world.world.declaration import Declaration
@@ -66,9 +65,9 @@ class Batch:
         self._loaded = np.zeros(len(self._worlds), dtype=np.bool_)  # its row is as it is
         self._all = np.arange(len(self._worlds))
         self._held: set[int] = set()
-        self._noisy: set[int] = set()
-        self._by_tips = self._worlds[0].action_mode == "end_effector_positions"
-        self._told = np.empty((len(self._worlds), 9))
+        self._translating: set[int] = set()
+        commands = self._worlds[0].structure.n_commands
+        self._told = np.zeros((len(self._worlds), commands))
 
     def __len__(self) -> int:
         """Count the worlds."""
@@ -115,7 +114,7 @@ class Batch:
         """Advance worlds one control step; see ``World.advance``.
 
         Args:
-            commands: For each world nine finite numbers in their range, shape (n, 9).
+            commands: For each world finite numbers in their range, shape (n, n_actions).
             which: Who is advanced, shape (n,); all if None.
             evaluate: Whether to compute what the tables have.
 
@@ -151,18 +150,14 @@ class Batch:
             raise
 
     def _tell(self, table: Table, rows: Integers, commands: Floats) -> None:
-        """Write what the engine is told: actions, with noise, fingertips as joint positions."""
+        """Write what the engine is told; mostly these are the actions."""
         told = self._told
-        told[rows] = commands[rows]
-        for row in self._noisy.intersection(rows.tolist()):
-            told[row] = self._worlds[row].disturbed(commands[row], table.clock(row))
-        if not self._by_tips:
+        if not self._translating:
+            told[rows] = commands[rows]
             return
-        heights, reached = table.column("robot_height"), np.empty(3, dtype=np.bool_)
-        joints = table.matrix[:, :9]
         for row in rows.tolist():
-            height = float(heights[row, 0])
-            inverse_kernel(told[row].copy(), height, joints[row], told[row], reached)
+            vector = table.matrix[row, : table.state_size]
+            told[row] = self._worlds[row].translated(commands[row], vector, table.clock(row))
 
     def _paces(self, rows: Integers) -> list[tuple[Any, Integers]]:
         """Tell worlds with different presets apart."""
@@ -179,7 +174,8 @@ class Batch:
         table = self._homes[row] = self._table(world)
         table.load(row, world)
         self._loaded[row] = True
-        for rows, belongs in ((self._held, world.holds_action), (self._noisy, world.is_noisy)):
+        both = ((self._held, world.holds_action), (self._translating, world.translates))
+        for rows, belongs in both:
             if belongs:
                 rows.add(row)
             else:
@@ -193,8 +189,7 @@ class Batch:
             unused = [key for key, table in self._tables.items() if id(table) not in used]
             for key in unused[: max(0, len(self._tables) + 1 - KEPT)]:
                 del self._tables[key]
-            names = [*self._names, *(("robot_height",) if self._by_tips else ())]
-            there = [name for name in names if name in declaration.model]
+            there = [name for name in self._names if name in declaration.model]
             found = self._tables[declaration] = Table(world, there, len(self._worlds))
         return found
 

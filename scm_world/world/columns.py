@@ -15,11 +15,8 @@ from scm_world._types import Floats, Integers, Value
 from scm_world.entities import CONTROL_INDEX
 from scm_world.geometry.gather import places
 from scm_world.geometry.rows import move_columns
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.world.equations import Columns, Equation, equation
 from scm_world.world.world import World
-
-ACTION = "action"
 
 
 @final
@@ -33,7 +30,8 @@ class Table:
 
     Attributes:
         declaration: Of the structure.
-        matrix: Shape (n, w); the first columns are those of ``PhysicalState``.
+        matrix: Shape (n, w); the first columns are those of the state.
+        state_size: How many these are.
         where: The columns of each variable.
         names: What can be asked for.
         computed: What is computed in every step, causes before effects.
@@ -45,7 +43,7 @@ class Table:
         self._given = tuple(names)
         self.names = tuple(dict.fromkeys((*self._given, *self.lagged)))
         self.computed = world.needed(self.names)
-        self._width = ROBOT_SIZE + BLOCK_SIZE * self.declaration.n_blocks
+        self._width = self.state_size = self.declaration.empty_state().vector.size
         self.where: dict[str, slice] = dict(self.declaration.slices)
         self.earlier: dict[str, slice] = {}
         self._place_all()
@@ -69,14 +67,22 @@ class Table:
         model = self.declaration.model
         parents = [p for name in self.computed for p in model.declared(name).all_parents]
         present = [p.name for p in parents if p.lag == 0]
-        for name in (ACTION, CONTROL_INDEX, *self.names, *self.computed, *present):
+        self._action = self._columns(None)
+        for name, part in self.declaration.actions.items():
+            first = self._action.start
+            self.where[name] = slice(first + part.start, first + part.stop)
+        for name in (CONTROL_INDEX, *self.names, *self.computed, *present):
             if name not in self.where:
                 self.where[name] = self._columns(name)
         for name in self.lagged:
             self.earlier[name] = self._columns(name)
 
-    def _columns(self, name: str) -> slice:
-        size = 9 if name == ACTION else int(np.prod(self.declaration.model.declared(name).shape))
+    def _columns(self, name: str | None) -> slice:
+        """Take the next columns, for a variable or for all actions."""
+        if name is None:
+            size = self.declaration.n_actions
+        else:
+            size = int(np.prod(self.declaration.model.declared(name).shape))
         first, self._width = self._width, self._width + size
         return slice(first, self._width)
 
@@ -102,16 +108,20 @@ class Table:
         for name, place in self._still:
             numbers[place] = np.ravel(now[name])
         numbers[self.where[CONTROL_INDEX]] = world.index
-        self.act(row, now[ACTION])
+        self.act(row, np.concatenate([np.ravel(now[n]) for n in self.declaration.actions]))
         for name in self.lagged:
             numbers[self.where[name]] = np.ravel(now[name])
         for bound in self._equations:
             bound.begin(row, now)
         self._fresh[row] = True
 
+    def actions(self) -> Floats:
+        """Give the actions of all rows, shape (n, n_actions), as a view."""
+        return self.matrix[:, self._action]
+
     def act(self, row: int, action: Value) -> None:
         """Write the action of a row."""
-        self.matrix[row, self.where[ACTION]] = action
+        self.matrix[row, self._action] = action
 
     def hand_over(self, row: int, world: World) -> None:
         """Give a world the present of its row."""
@@ -120,8 +130,8 @@ class Table:
             name: numbers[place].reshape(self.declaration.model.declared(name).shape)
             for name, place in self.earlier.items()
         }
-        vector = numbers[: ROBOT_SIZE + BLOCK_SIZE * self.declaration.n_blocks]
-        world.arrive(vector, self.clock(row), numbers[self.where[ACTION]].copy(), earlier)
+        vector = numbers[: self.state_size]
+        world.arrive(vector, self.clock(row), numbers[self._action].copy(), earlier)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -133,8 +143,8 @@ class Table:
         move_columns(self.matrix, rows, *self._remembered)
 
     def advance(self, rows: Integers, actions: Floats) -> None:
-        """Write the actions of some rows, shape (n, 9), and let their clocks go on."""
-        self.matrix[rows, self.where[ACTION]] = actions[rows]
+        """Write the actions of some rows, shape (n, n_actions), and let their clocks go on."""
+        self.matrix[rows, self._action] = actions[rows]
         self.matrix[rows, self.where[CONTROL_INDEX].start] += 1.0
         self._fresh[rows] = False
 

@@ -12,8 +12,8 @@ from scm_world._types import Floats, Value
 from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, Infeasible, InterventionError
 from scm_world.graph import flatten
-from scm_world.scene import Difference, PhysicalState, Structure
-from scm_world.scene.feasibility import TOLERANCE, Overlap, buried_goals, overlaps
+from scm_world.models import Difference, State
+from scm_world.scene.feasibility import TOLERANCE, Overlap, buried_goals
 from scm_world.variables import Draw, Hard
 from scm_world.variables.checks import coerce
 from scm_world.variables.subsets import AnyRegion
@@ -55,11 +55,14 @@ def difference(world: World, proposal: Proposal) -> Difference:
 
 
 def _moves_surfaces(world: World, change: Difference) -> bool:
+    if not world.composition.solid:
+        return False
     if change.structure is not None or any(what in _MOVES for _, what in change.parameters):
         return True
     if change.state is None:
         return False
-    now, then = world.current()[1], change.state
+    now: Any = world.current()[1]
+    then = change.state
     joints = same(now.joint_positions, then.joint_positions)
     return not (joints and same(now.blocks[:, :7], then.blocks[:, :7]))
 
@@ -71,10 +74,11 @@ def _new_overlaps(
     if not _moves_surfaces(world, change):
         return []
     then = proposal.declaration.describe(proposal.static, proposal.state)
-    found = overlaps(then, tolerance=TOLERANCE)
+    found = proposal.declaration.composition.overlaps(then, TOLERANCE)
     if not found:
         return []
-    present = overlaps(instant.declaration.describe(instant.static, instant.state), tolerance=0.0)
+    now = instant.declaration
+    present = now.composition.overlaps(now.describe(instant.static, instant.state), 0.0)
     depth = {overlap.bodies: overlap.depth for overlap in present}
     return [o for o in found if o.depth > depth.get(o.bodies, 0.0) + 1e-6]
 
@@ -240,13 +244,13 @@ def commit(
         moved_before = {name: np.array(before[name]) for name in world.slices}
     declaration, index, state = world.declaration, world.index, world.current()[1].copy()
     model, static = world.graph, {name: before[name] for name in declaration.static_names}
-    structure = world.structure
+    bodies = {*world.composition.blocks, *world.composition.obstacles}
     backwards = _back(world, change, before, state)
     try:
         inertia = _inertia(world, change)
         _apply(world, change, proposal)
         world.adopt(proposal.declaration, proposal.model, proposal.static, proposal.index)
-        audit = _report(world, proposal, request, before, moved_before, inertia, structure)
+        audit = _report(world, proposal, request, before, moved_before, inertia, bodies)
     except BaseException:
         if change:
             world.backend.apply(backwards)
@@ -265,7 +269,7 @@ def _apply(world: World, change: Difference, proposal: Proposal) -> None:
 
 
 def _back(
-    world: World, change: Difference, before: Mapping[str, Value], state: PhysicalState
+    world: World, change: Difference, before: Mapping[str, Value], state: State
 ) -> Difference:
     if change.structure is not None:
         now = world.describe(before, state)
@@ -283,7 +287,7 @@ def _not_taken(world: World, change: Difference, proposal: Proposal) -> list[str
         if not _close(value, reported[key])
     ]
     if change.state is not None:
-        got = PhysicalState(change.state.n_blocks)
+        got = change.state.copy()
         world.backend.read(got)
         if not _close(change.state.settable(), got.settable()):
             wrong.append("the state")
@@ -297,24 +301,24 @@ def _close(given: Floats, reported: Floats) -> bool:
 
 
 def _inertia(world: World, change: Difference) -> dict[str, Value]:
-    if change.structure is not None:
+    if change.structure is not None or not world.composition.solid:
         return {}
     bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-    bodies -= {*world.structure.obstacles}
+    bodies -= {*world.composition.obstacles}
     return {f"{body}.inertia": world.backend.inertia(body) for body in sorted(bodies)}
 
 
 def _outcome(world: World, proposal: Proposal, target: str) -> tuple[Value | None, Value | None]:
     """Give the value that a target has now, and what the engine says it is; None if unknown."""
     now, state = world.current()
-    if target == "action":
+    if target in proposal.declaration.actions:
         act = proposal.requests[target][1]
         return (np.array(act.value) if isinstance(act, Hard) else None), None
     applied = np.array(now[target])
     if target == CONTROL_INDEX:
         return applied, np.asarray(world.index)
     if target in world.slices:
-        return applied, state.vector[world.slices[target]].copy()
+        return applied, np.array(world.declaration.view(target, state))
     key = world.parameter_keys.get(target)
     return applied, None if key is None else world.backend.parameters([key])[key]
 
@@ -326,7 +330,7 @@ def _report(
     before: Mapping[str, Value],
     moved_before: Mapping[str, Value],
     inertia: Mapping[str, Value],
-    structure: Structure,
+    bodies: set[str],
 ) -> Audit:
     flat = flatten(request)
     now = world.current()[0]
@@ -353,8 +357,8 @@ def _report(
         body: (old, world.backend.inertia(body.removesuffix(".inertia")))
         for body, old in inertia.items()
     }
-    bodies = [{*s.blocks, *s.obstacles} for s in (structure, world.structure)]
-    came, went = sorted(bodies[1] - bodies[0]), sorted(bodies[0] - bodies[1])
+    there = {*world.composition.blocks, *world.composition.obstacles}
+    came, went = sorted(there - bodies), sorted(bodies - there)
     return Audit(entries, followed, engine, tuple(came), tuple(went))
 
 

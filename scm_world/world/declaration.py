@@ -1,8 +1,8 @@
-"""A world on paper: its variables, what they mean physically, and its options."""
+"""A compiled task: its variables, what they mean to an engine, and its options."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, final
@@ -10,23 +10,12 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.entities import ACTIONS, PRESET_NAMES, Clock, Entity, Looks, Robot, Stage
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.scene import (
-    TIMESTEP,
-    ControlMode,
-    ParameterKey,
-    PhysicalState,
-    Scene,
-    Structure,
-    default_parameters,
-    preset,
-)
-from scm_world.tasks import Conventions, Task, conventions
-from scm_world.variables import Derived, Exogenous, Measured
-from scm_world.variables import catalogue as numbers
-from scm_world.world.absence import put_together, remaining
+from scm_world.models import ParameterKey, Scene, State, Structure
+from scm_world.tasks import Conventions, Task, Timing, conventions
+from scm_world.variables import Action, Derived, Exogenous, Measured
+from scm_world.world.absence import put_together
 from scm_world.world.readouts import computed_order, static_order
 from scm_world.world.start import whole_number
 
@@ -38,8 +27,9 @@ class Options:
 
     Attributes:
         preset: Numerical settings of the engine at the start of an episode.
-        action_mode: How the robot is commanded.
-        frame_skip: Length of a control step in units of 4 ms.
+        action_mode: How the system is commanded.
+        frame_skip: Length of a control step in units of the task.
+        time_unit: The unit [s].
         given_length: Length of an episode in control steps, if one was given.
         conventions: Ours or the predecessor's.
     """
@@ -47,42 +37,43 @@ class Options:
     preset: str
     action_mode: str
     frame_skip: int
+    time_unit: float
     given_length: int | None
     conventions: Conventions
 
     @classmethod
     def checked(
         cls,
+        task: Task,
         *,
-        preset_name: str,
-        action_mode: str,
-        frame_skip: int,
+        preset: str | None,
+        action_mode: str | None,
+        frame_skip: int | None,
         max_episode_length: int | None,
         conventions_name: str,
     ) -> Options:
-        """Check what a user gave.
+        """Check what a user gave; None stands for the default of the task.
 
         Raises:
             UnknownOption: One of the names does not exist, or a number is none.
         """
-        skip = whole_number("frame_skip", frame_skip, least=1)
+        given = task.frame_skip if frame_skip is None else frame_skip
+        skip = whole_number("frame_skip", given, least=1)
         if max_episode_length is not None:
             whole_number("max_episode_length", max_episode_length, least=1)
-        if action_mode not in ACTIONS:
-            raise UnknownOption("action_mode", action_mode, ACTIONS)
-        name = preset(preset_name).name
-        return cls(name, action_mode, skip, max_episode_length, conventions(conventions_name))
+        mode = task.action_modes[0] if action_mode is None else action_mode
+        if mode not in task.action_modes:
+            raise UnknownOption("action_mode", mode, task.action_modes)
+        name = task.presets[0] if preset is None else preset
+        if name not in task.presets:
+            raise UnknownOption("preset", name, task.presets)
+        kept = conventions(conventions_name)
+        return cls(name, mode, skip, task.time_unit, max_episode_length, kept)
 
     @property
     def control_period(self) -> float:
         """Length of a control step [s]."""
-        return TIMESTEP * self.frame_skip
-
-    @property
-    def mode(self) -> ControlMode:
-        """What the engine is told."""
-        torques = self.action_mode == "joint_torques"
-        return ControlMode.JOINT_TORQUES if torques else ControlMode.JOINT_POSITIONS
+        return self.time_unit * self.frame_skip
 
 
 class Declaration:
@@ -96,8 +87,9 @@ class Declaration:
     Attributes:
         task: As it was given.
         model: The causal model, without interventions.
-        composition: The entities.
+        composition: What the variables mean to an engine.
         slices: Where each state stands in the state vector.
+        actions: Where each action stands in the vector of all actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
         computed: Variables that are computed from what moves, causes before effects.
@@ -107,17 +99,18 @@ class Declaration:
 
     def __init__(self, task: Task, options: Options, steps: int) -> None:
         self.task = task
-        entities: tuple[Entity, ...] = (
-            Robot(options.action_mode, task.start),
-            Stage(options.preset),
-            Looks(),
-            Clock(steps, options.control_period),
-            *task.entities(),
-        )
-        self.composition, variables = remaining(entities, task)
+        timing = Timing(options.action_mode, options.preset, options.control_period, steps)
+        self.composition, variables = task.compose(timing)
         self.model = SCM(options.conventions.adapt(variables))
         self.slices = self.composition.slices()
         self.parameter_keys = self.composition.parameters()
+        self._places = [
+            (name, where, self.model.declared(name).shape) for name, where in self.slices.items()
+        ]
+        self.actions: dict[str, slice] = {}
+        for action in (v for v in self.model.variables if isinstance(v, Action)):
+            first = self.n_actions
+            self.actions[action.name] = slice(first, first + int(np.prod(action.shape)))
         ordered = map(self.model.declared, self.model.structure.order)
         self.carried = tuple(v for v in ordered if isinstance(v, Measured) and v.set_parents())
         self.computed = computed_order(self.model)
@@ -129,8 +122,7 @@ class Declaration:
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
-        self._structures: dict[str, Structure] = {}
-        self._constants: dict[str, dict[ParameterKey, Floats]] = {}
+        self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
 
     @property
     def plan(self) -> Hashable:
@@ -143,27 +135,41 @@ class Declaration:
         return frozenset(entity.name for entity in self.composition.entities)
 
     @property
-    def n_blocks(self) -> int:
-        """How many movable blocks there are."""
-        return len(self.composition.blocks)
+    def n_actions(self) -> int:
+        """How many numbers all actions have together."""
+        return max((where.stop for where in self.actions.values()), default=0)
 
     @cached_property
     def action_bounds(self) -> tuple[Floats, Floats]:
-        """Lower and upper end of an action, shape (9,) each."""
-        bounds: Any = self.model.declared("action").bounds
-        low, high = bounds.bounds((9,), {})
-        return np.array(low), np.array(high)
+        """Lower and upper end of all actions, shape (n_actions,) each."""
+        low, high = np.full(self.n_actions, -np.inf), np.full(self.n_actions, np.inf)
+        for name, where in self.actions.items():
+            variable: Any = self.model.declared(name)
+            if variable.bounds is not None:
+                ends = variable.bounds.bounds(variable.shape, {})
+                low[where], high[where] = (np.ravel(end) for end in ends)
+        return low, high
+
+    @cached_property
+    def action_unit(self) -> str:
+        """Unit of the actions, if they have one in common."""
+        units = {self.model.declared(name).unit for name in self.actions}
+        return units.pop() if len(units) == 1 else "1"
+
+    def split(self, action: Floats) -> dict[str, Value]:
+        """Give every action variable its part of a vector of all, as views."""
+        if len(self.actions) == 1:
+            (name,) = self.actions
+            shape = self.model.declared(name).shape
+            return {name: action if shape else action.reshape(shape)}
+        return {
+            name: action[where].reshape(self.model.declared(name).shape)
+            for name, where in self.actions.items()
+        }
 
     def structure(self, values: Values) -> Structure:
-        """Say which bodies the engine has to build, and how finely it cuts time."""
-        name = PRESET_NAMES[int(values[numbers.PRESET])]
-        if name not in self._structures:
-            made = self.composition
-            self._structures[name] = structure = Structure(
-                made.blocks, preset(name), made.obstacles, made.hulls
-            )
-            self._constants[name] = default_parameters(structure)
-        return self._structures[name]
+        """Say what the engine has to compile."""
+        return self.composition.structure(values)
 
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
         """Name some variables and what follows them at once, without physics, causes first."""
@@ -173,9 +179,24 @@ class Declaration:
             self._follow[key] = tuple(name for name in self.static_names if name in follow)
         return self._follow[key]
 
-    def states(self, state: PhysicalState) -> dict[str, Value]:
+    @cached_property
+    def _start(self) -> State:
+        roots = self.model.solve(only=self.static_names)
+        found: State = self.structure(roots).empty_state()
+        return found
+
+    def empty_state(self, vector: Floats | None = None) -> State:
+        """Give a state to read into, or one with some numbers."""
+        return self._start.copy() if vector is None else self._start.with_vector(vector)
+
+    def states(self, state: State) -> dict[str, Value]:
         """Give the states by name, as views of a vector."""
-        return {name: state.vector[where] for name, where in self.slices.items()}
+        vector = state.vector
+        return {name: vector[where].reshape(shape) for name, where, shape in self._places}
+
+    def view(self, name: str, state: State) -> Value:
+        """Give one state, as a view of a vector."""
+        return state.vector[self.slices[name]].reshape(self.model.declared(name).shape)
 
     def in_coordinates(self, name: str, value: Value) -> Value:
         """Give a value of a quantity in other coordinates of it."""
@@ -185,11 +206,13 @@ class Declaration:
             function = self._coordinates[name] = variable.mechanism.bind()
         return np.asarray(function(value))
 
-    def describe(self, values: Values, state: PhysicalState) -> Scene:
+    def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
         structure = self.structure(values)
-        parameters = dict(self._constants[structure.preset.name])
+        if structure not in self._constants:
+            self._constants[structure] = structure.default_scene().parameters
+        parameters = dict(self._constants[structure])
         for name, key in self.parameter_keys.items():
             parameters[key] = values[name]
-        goals = self.composition.goals(values)
-        return Scene(structure, parameters, state, goals, self.composition.light(values))
+        made = self.composition
+        return Scene(structure, parameters, state, made.goals(values), made.light(values))

@@ -9,7 +9,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.entities import Composition
 from scm_world.errors import NotReset
 from scm_world.graph import SCM
-from scm_world.scene import ParameterKey, PhysicalState, Scene
+from scm_world.models import ParameterKey, Scene, State
 from scm_world.tasks import Conventions, Task
 from scm_world.world.declaration import Declaration, Options
 from scm_world.world.family import Family
@@ -101,12 +101,12 @@ class Declared:
 
     @property
     def action_mode(self) -> str:
-        """How the robot is commanded."""
+        """How the system is commanded."""
         return self.options.action_mode
 
     @property
     def frame_skip(self) -> int:
-        """Length of a control step in units of 4 ms."""
+        """Length of a control step in units of the task; 4 ms for the robot."""
         return self.options.frame_skip
 
     @property
@@ -126,12 +126,12 @@ class Declared:
 
     @property
     def action_low(self) -> Floats:
-        """Lower end of an action, shape (9,)."""
+        """Lower end of all actions, shape (n_actions,)."""
         return self.declaration.action_bounds[0]
 
     @property
     def action_high(self) -> Floats:
-        """Upper end of an action, shape (9,)."""
+        """Upper end of all actions, shape (n_actions,)."""
         return self.declaration.action_bounds[1]
 
     @property
@@ -141,7 +141,7 @@ class Declared:
         options = (self.options.preset, self.action_mode, self.conventions.name)
         return (self.task.name, *options, *numbers)
 
-    def describe(self, values: Values, state: PhysicalState) -> Scene:
+    def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
         return self.declaration.describe(values, state)
 

@@ -85,7 +85,7 @@ class Draft:
         targets = tuple(target for target in acts if target in self.static)
         draws = [t for t in targets if isinstance(acts[t][1], Draw)]
         if self._earlier is None:
-            refuse_continuous(acts, self.static)
+            refuse_continuous(acts, self.static, self._world.actions)
             self.model = self.instant.model.with_interventions(dict(acts.values()))
             self._order = tuple(what_follows(self._world, self.model, self.static, targets))
             if any(self._follows_others(*acts[target]) for target in draws):
@@ -172,8 +172,9 @@ class Draft:
     def _value(self, target: str) -> Value:
         if target == CONTROL_INDEX:
             return np.asarray(self.index)
-        where = self._world.slices.get(target)
-        return self.static[target] if where is None else self.state.vector[where]
+        if target in self._world.slices:
+            return self._world.view(target, self.state)
+        return self.static[target]
 
     def set_states(self) -> list[InterventionError]:
         """Set states, and carry along those whose parents were set.
@@ -199,8 +200,8 @@ class Draft:
     def _set(self, target: str) -> list[InterventionError]:
         value = self._wish(target, *self._requests[target])
         where = self._world.slices.get(target)
-        if where is not None and same(value, self.instant.state.vector[where]):
-            self.state.vector[where] = value
+        if where is not None and same(value, self._world.view(target, self.instant.state)):
+            self.state.vector[where] = np.ravel(value)
             return []
         try:
             check_bounds(self._world.model.declared(target), value, self.static)
@@ -209,7 +210,7 @@ class Draft:
         if where is None:
             self.index = int(value)
         else:
-            self.state.vector[where] = self._exact(target, value)
+            self.state.vector[where] = np.ravel(self._exact(target, value))
         return []
 
     def _exact(self, target: str, value: Value) -> Value:
@@ -243,27 +244,28 @@ class Draft:
         where = self._world.slices[variable.name]
         if variable.name in self.instant.fresh:
             if variable.start is not None:
-                self.state.vector[where] = variable.start.bind()(*new)
+                self.state.vector[where] = np.ravel(variable.start.bind()(*new))
             return
         old = [self._before(parent) for parent in parents]
         moved = {p for p, a, b in zip(parents, old, new, strict=True) if not same(a, b)}
         if moved:
             again = self.instant.at_start or not moved.isdisjoint(variable.restart)
-            self.state.vector[where] = self._moved(variable, where, old, new, again=again)
+            self.state.vector[where] = np.ravel(self._moved(variable, old, new, again=again))
 
     def _moved(
-        self, variable: Measured, where: slice, old: list[Value], new: list[Value], *, again: bool
+        self, variable: Measured, old: list[Value], new: list[Value], *, again: bool
     ) -> Value:
         if again and variable.start is not None:
             return np.asarray(variable.start.bind()(*new))
+        present = self._world.view(variable.name, self.instant.state)
         if variable.carry is None:
-            return self.instant.state.vector[where]
-        present = self.instant.state.vector[where]
+            return present
         return np.asarray(variable.carry.bind()(present, *old, *new))
 
     def _before(self, name: str) -> Value:
-        where = self._world.slices.get(name)
-        return self.instant.static[name] if where is None else self.instant.state.vector[where]
+        if name in self._world.slices:
+            return self._world.view(name, self.instant.state)
+        return self.instant.static[name]
 
     def check(self, accepted: Requests, space: AnyRegion | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
@@ -274,7 +276,11 @@ class Draft:
         for target, (name, act) in accepted.items():
             requested = self._world.model.declared(name)
             try:
-                value = self._held(act) if target == "action" else self._coordinates(target, name)
+                value = (
+                    self._held(target, act)
+                    if target in self._world.actions
+                    else self._coordinates(target, name)
+                )
                 check_space(requested, value, space, context)
             except InterventionError as problem:
                 problems.append(problem)
@@ -283,19 +289,19 @@ class Draft:
     def _context(self) -> Values:
         return {**self.static, **self._world.states(self.state)}
 
-    def _held(self, act: Intervention) -> Value:
+    def _held(self, target: str, act: Intervention) -> Value:
         if isinstance(act, Hard):
             return np.array(act.value)
         raise InterventionError(
-            f"do(action): {act!r} is another action at every step, so it cannot be held against a "
-            "space; leave out `space`, or give one action as nine numbers",
-            variable="action",
+            f"do({target}): {act!r} is another action at every step, so it cannot be compared "
+            "with a space; leave out `space`, or give one action as numbers",
+            variable=target,
         )
 
     def frozen(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:
         """Replace a draw, or a change of a state, by the value that came out."""
         keeps = isinstance(act, (*SOFT, Mechanism, Natural)) and not self._is_state(target)
-        if isinstance(act, Hard) or target == "action" or keeps:
+        if isinstance(act, Hard) or target in self._world.actions or keeps:
             return name, act
         if target in self._fixed:
             return target, self._fixed[target]

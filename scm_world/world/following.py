@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 def refuse_continuous(
-    acts: Mapping[str, tuple[str, Intervention]], static: Mapping[str, Value]
+    acts: Mapping[str, tuple[str, Intervention]],
+    static: Mapping[str, Value],
+    actions: Iterable[str],
 ) -> None:
     """Refuse parameters that should follow what moves: they change at interventions only.
 
@@ -30,7 +32,7 @@ def refuse_continuous(
             continue
         moving = [p.name for p in act.parents if p.lag or p.name not in static]
         who, what = "a parameter", "parameters of the same instant"
-        if target == "action":
+        if target in actions:
             moving, who, what = [p.name for p in act.parents if p.lag], "an action", "the present"
         if moving:
             raise InterventionError(
@@ -41,10 +43,10 @@ def refuse_continuous(
             )
 
 
-def policy_inputs(model: SCM) -> tuple[str, ...]:
-    """Name what a mechanism of the action looks at."""
-    act = model.interventions.get("action")
-    return tuple(p.name for p in act.parents) if isinstance(act, Mechanism) else ()
+def policy_inputs(model: SCM, held: Iterable[str]) -> tuple[str, ...]:
+    """Name what the mechanisms of held actions look at."""
+    acts = (model.interventions[name] for name in held)
+    return tuple(p.name for act in acts if isinstance(act, Mechanism) for p in act.parents)
 
 
 def what_follows(
@@ -52,7 +54,7 @@ def what_follows(
 ) -> tuple[str, ...]:
     """Name what has to be computed anew, causes first; mechanisms may have added edges."""
     held = model.interventions.items()
-    if not any(isinstance(act, Mechanism) and name != "action" for name, act in held):
+    if not any(isinstance(act, Mechanism) and name not in world.actions for name, act in held):
         return world.static_order(targets)
     structure = model.structure
     follow = {*targets, *structure.instant_descendants(targets)}

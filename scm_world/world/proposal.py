@@ -11,7 +11,7 @@ import numpy as np
 from scm_world._types import Value
 from scm_world.errors import ConflictingTargets, InterventionError, OutOfBounds, raise_all
 from scm_world.graph import SCM, flatten
-from scm_world.scene import PhysicalState
+from scm_world.models import State
 from scm_world.variables import Draw, Hard, Intervention, Natural, Null
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.draft import Draft, Requests
@@ -46,7 +46,7 @@ class Instant:
     declaration: Declaration
     model: SCM
     static: Mapping[str, Value]
-    state: PhysicalState
+    state: State
     index: int
     requests: Requests = field(default_factory=dict)
     at_start: bool = False
@@ -72,7 +72,7 @@ class Proposal:
     declaration: Declaration
     model: SCM
     static: dict[str, Value]
-    state: PhysicalState
+    state: State
     index: int
     requests: Requests
     asked: tuple[str, ...]
@@ -109,7 +109,7 @@ def _accept(instant: Instant, name: str, value: Any) -> Intervention:
     except OutOfBounds as problem:
         # What physics did is possible: a state can always be put back to where it is.
         if name in declaration.slices and np.array_equal(
-            problem.value, instant.state.vector[declaration.slices[name]]
+            problem.value, declaration.view(name, instant.state)
         ):
             return Hard(problem.value)
         raise

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from scm_world._types import Value
 from scm_world.errors import InterventionError
 from scm_world.graph import SCM, Moment, flatten
-from scm_world.scene import PhysicalState
-from scm_world.scene.state import ROBOT_SIZE
+from scm_world.models import State
 from scm_world.variables import Exogenous, Intervention, Measured
 from scm_world.world.absence import put_together, taken_away
 from scm_world.world.declaration import Declaration
@@ -91,14 +92,13 @@ def _static(
     return {name: solved[name] for name in declaration.static_names}
 
 
-def _state(instant: Instant, declaration: Declaration) -> PhysicalState:
+def _state(instant: Instant, declaration: Declaration) -> State:
     """Keep the states that both have; the others get what they are without causes."""
-    before, state = instant.declaration.slices, PhysicalState(declaration.n_blocks)
-    state.vector[:ROBOT_SIZE] = instant.state.vector[:ROBOT_SIZE]
+    before, state = instant.declaration.slices, declaration.empty_state()
     for name, where in declaration.slices.items():
         variable = declaration.model.declared(name)
         if name in before:
             state.vector[where] = instant.state.vector[before[name]]
         elif isinstance(variable, Measured) and variable.default is not None:
-            state.vector[where] = variable.array(variable.default)
+            state.vector[where] = np.ravel(variable.array(variable.default))
     return state

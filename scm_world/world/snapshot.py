@@ -10,7 +10,6 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.backends.base import EngineSnapshot
-from scm_world.scene import PhysicalState
 from scm_world.variables import Intervention
 from scm_world.world.family import Family
 from scm_world.world.proposal import Instant, Requests
@@ -45,7 +44,7 @@ class SavedInstant:
     def instant(self, family: Family) -> Instant:
         """Give the instant back."""
         declaration = family.declaration(self.plan)
-        state = PhysicalState(declaration.n_blocks, self.vector.copy())
+        state = declaration.empty_state(self.vector.copy())
         held = declaration.model.with_interventions(self.interventions)
         return Instant(
             declaration,
@@ -82,7 +81,7 @@ class WorldSnapshot:
     static: Mapping[str, Value]
     interventions: Mapping[str, Intervention] = field(default_factory=dict)
     previous: Mapping[str, Value] = field(default_factory=dict)
-    action: Floats = field(default_factory=lambda: np.zeros(9))
+    action: Floats = field(default_factory=lambda: np.zeros(0))
     index: int = 0
     seed: int = 0
     episode: int = 0

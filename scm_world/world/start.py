@@ -10,8 +10,8 @@ from scm_world._types import Value, Values
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import Moment
-from scm_world.scene import PhysicalState
-from scm_world.scene.feasibility import TOLERANCE, overlaps
+from scm_world.models import State
+from scm_world.scene.feasibility import TOLERANCE
 from scm_world.tasks import Task, make_task, tasks
 from scm_world.variables import Measured, Subset
 from scm_world.variables.checks import check_bounds, check_subset
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from scm_world.world.family import Family
 
 
-def beginning(
-    declaration: Declaration, moment: Moment | None
-) -> tuple[dict[str, Value], PhysicalState]:
+def beginning(declaration: Declaration, moment: Moment | None) -> tuple[dict[str, Value], State]:
     """Compute where an episode begins when nobody intervenes.
 
     Args:
@@ -35,11 +33,11 @@ def beginning(
         The values of everything that physics does not move, and the state of the rest.
     """
     static = declaration.model.solve(only=declaration.static_names, moment=moment)
-    state = PhysicalState(declaration.n_blocks)
+    state = declaration.empty_state()
     for variable in declaration.model.variables:
         where = declaration.slices.get(variable.name)
         if where is not None and isinstance(variable, Measured):
-            state.vector[where] = _first(declaration, variable, static)
+            state.vector[where] = np.ravel(_first(declaration, variable, static))
     return static, state
 
 
@@ -70,7 +68,7 @@ def refuse_impossible(declaration: Declaration) -> None:
                 check_bounds(variable, values[variable.name], values)
             except InterventionError as problem:
                 problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = overlaps(declaration.describe(static, state), tolerance=TOLERANCE)
+    found = declaration.composition.overlaps(declaration.describe(static, state), TOLERANCE)
     problems += map(str, found)
     if problems:
         advice = f"choose other arguments of the task {declaration.task.name!r}"

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
-from scm_world.entities import ACTUATOR_NOISE
 from scm_world.graph import SCM, Moment
-from scm_world.models.scene import ControlMode
-from scm_world.scene import PhysicalState
-from scm_world.scene.kinematics import inverse_kernel
-from scm_world.world.commands import clipped, disturbed
+from scm_world.models import ControlMode, State
+from scm_world.world.commands import clipped
 from scm_world.world.declared import Declared
 from scm_world.world.proposal import Instant
 from scm_world.world.readouts import Readouts
@@ -35,30 +33,26 @@ class Stepped(Declared):
     _require_episode: Callable[[], None]
     _now: dict[str, Value]
     _before: dict[str, Value]
-    _state: PhysicalState
+    _state: State
     _held: SCM
     _readouts: Readouts
     _instant: Instant | None
-    _mode: ControlMode
     _started: bool
     _substeps: int
     _index: int
     _clock: NDArray[Any]
-    _action_is_held: bool
-    _noisy: bool
-    _by_tips: bool
+    _action: Floats
+    _held_actions: tuple[str, ...]
+    _translates: bool
     _inputs: tuple[str, ...]
-    _action_unit: str
-    _command: Floats
-    _reached: NDArray[Any]
 
     def advance(self, command: Floats) -> None:
-        """Advance one control step with nine finite numbers in their range; see ``step``."""
+        """Advance one control step with finite numbers in their range; see ``step``."""
         self._require_episode()
         command = self.decided(command)
         self._readouts.remember()
-        self._now["action"] = command
-        self.backend.step(self._mode, self.told(command), self._substeps)
+        self._act(command)
+        self.backend.step(self.composition.mode, self.told(command), self._substeps)
         self.backend.read(self._state)
         self._goes_on(self._index + 1)
 
@@ -79,42 +73,46 @@ class Stepped(Declared):
     @property
     def pace(self) -> tuple[ControlMode, int]:
         """What the engine is told besides: what a command means, and physics steps for it."""
-        return self._mode, self._substeps
+        return self.composition.mode, self._substeps
 
     @property
     def holds_action(self) -> bool:
-        """Whether the action has a mechanism."""
-        return self._action_is_held
+        """Whether an action has a mechanism, or a value of its own."""
+        return bool(self._held_actions)
 
     @property
-    def is_noisy(self) -> bool:
-        """Whether the actuators have noise."""
-        return self._noisy
+    def translates(self) -> bool:
+        """Whether the engine is told something else than the action; see ``told``."""
+        return self._translates
+
+    def _act(self, command: Floats) -> None:
+        """Remember the action."""
+        self._action = command
+        self._now.update(self.declaration.split(command))
 
     def decided(self, command: Floats) -> Floats:
-        """Give the action that is taken: the command, unless the action has a mechanism."""
-        if not self._action_is_held:
+        """Give the action that is taken: the command, where no action has a mechanism."""
+        held = self._held_actions
+        if not held:
             return command
-        known = {**self._now, **self.evaluate(self._inputs), "action": command}
-        where = self.moment(self._index)
-        command = self._held.solve(known, moment=where, only=("action",))["action"]
-        return clipped(command, *self.declaration.action_bounds, self._action_unit)
+        given = self.declaration.split(command)
+        known = {**self._now, **self.evaluate(self._inputs), **given}
+        solved = self._held.solve(known, moment=self.moment(self._index), only=held)
+        command = command.copy()
+        for name in held:
+            command[self.declaration.actions[name]] = np.ravel(solved[name])
+        return clipped(command, *self.declaration.action_bounds, self.declaration.action_unit)
 
-    def told(self, command: Floats) -> Floats:
+    def told(self, action: Floats) -> Floats:
         """Give what the engine is told in a step; it holds until the next call."""
-        if self._noisy:
-            command = self.disturbed(command, self._index)
-        if self._by_tips:
-            height = float(self._now["robot_height"])
-            joints = self._state.joint_positions
-            inverse_kernel(command, height, joints, self._command, self._reached)
-            command = self._command
-        return command
+        return self.translated(action, self._state.vector, self._index)
 
-    def disturbed(self, command: Floats, index: int) -> Floats:
-        """Add the noise that the actuators have in a control step of this episode."""
-        noise = float(self._now[ACTUATOR_NOISE])
-        return disturbed(command, *self.declaration.action_bounds, noise, self.moment(index))
+    def translated(self, action: Floats, vector: Floats, index: int) -> Floats:
+        """Turn an action into a command, at a state and a control step of this episode."""
+        commands = self.composition.commands
+        if commands is None or not self._translates:
+            return action
+        return commands.told(action, self._now, vector, self.moment(index))
 
     def _goes_on(self, index: int) -> None:
         """Be at another control step; where everything is has been written already."""
@@ -133,7 +131,7 @@ class Stepped(Declared):
             earlier: Values of one control step ago.
         """
         self._state.vector[:] = vector
-        self._now["action"] = action
+        self._act(action)
         for name, value in earlier.items():
             self._before[name][...] = value
         self._goes_on(index)

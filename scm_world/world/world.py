@@ -11,14 +11,13 @@ import numpy as np
 from scm_world._types import ArrayLike, Value, Values
 from scm_world.backends import Backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.entities import ACTIONS, ACTUATOR_NOISE, CONTROL_INDEX, cameras
+from scm_world.entities import CONTROL_INDEX, cameras
 from scm_world.errors import NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
-from scm_world.scene import PhysicalState, Scene
+from scm_world.models import Scene, State
 from scm_world.scene.camera import Camera
 from scm_world.tasks import Task
 from scm_world.variables import Noise
-from scm_world.variables.catalogue import PRESET
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit
 from scm_world.world.commands import clipped
@@ -29,7 +28,7 @@ from scm_world.world.following import policy_inputs
 from scm_world.world.proposal import Instant, Proposal
 from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
-from scm_world.world.start import beginning, check_held, the_backend, whole_number
+from scm_world.world.start import beginning, check_held, the_backend, the_task, whole_number
 from scm_world.world.stepping import Stepped
 
 
@@ -40,9 +39,11 @@ class World(Stepped):
         task: A registered name, a task, or the ``family`` of a world that was made with the same
             options: then they share what is declared.
         backend: ``"mujoco"``, ``"bullet"``, ``"fake"``, or an engine that is not used elsewhere.
-        preset: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
-        action_mode: ``"joint_positions"``, ``"joint_torques"`` or ``"end_effector_positions"``.
-        frame_skip: Length of a control step in units of 4 ms, whatever the preset.
+        preset: Of the robot's tasks: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
+        action_mode: Of the robot's tasks: ``"joint_positions"``, ``"joint_torques"`` or
+            ``"end_effector_positions"``.
+        frame_skip: Length of a control step: of the robot's tasks in units of 4 ms, whatever the
+            preset; of a model in its physics steps. The default of the task if None.
         max_episode_length: In control steps; the task's own length if None.
         conventions: ``"scm_world"``, or ``"causal_world"`` for the predecessor's.
         variables_space: The space that every target of an intervention must lie in, unless ``do``
@@ -68,41 +69,40 @@ class World(Stepped):
         task: Task | Family | str = "pushing",
         *,
         backend: Backend | str = "mujoco",
-        preset: str = "fast",
-        action_mode: str = "joint_positions",
-        frame_skip: int = 10,
+        preset: str | None = None,
+        action_mode: str | None = None,
+        frame_skip: int | None = None,
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
         variables_space: AnyRegion | None = None,
     ) -> None:
         self.variables_space = as_region("variables_space", variables_space)
+        kind = task.task if isinstance(task, Family) else the_task(task)
         self.options = Options.checked(
-            preset_name=preset,
+            kind,
+            preset=preset,
             action_mode=action_mode,
             frame_skip=frame_skip,
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        self.family = as_family(task, self.options)
-        self._mode = self.options.mode
-        self._by_tips = action_mode == "end_effector_positions"
-        self._action_unit = ACTIONS[action_mode][0]
+        self.family = as_family(task if isinstance(task, Family) else kind, self.options)
         self.backend = the_backend(backend)
         self._started = False
         self.noise, self.episode = Noise(0), 0
         self.version = 0  # counts changes of anything but what physics moves
         self._static: Values = {}
-        self._action_is_held = self._noisy = False
+        self._held_actions: tuple[str, ...] = ()
+        self._translates = False
         self._inputs: tuple[str, ...] = ()
         self._index = 0
         self._clock = np.zeros((), dtype=np.int64)
         self._instant: Instant | None = None
-        self._command = np.zeros(9)
-        self._reached = np.zeros(3, dtype=np.bool_)
+        self._action = np.zeros(0)
         self._enter(self.family.natural(None))
         self._held = self.model
         check_held(self.variables_space, self.family)
-        self.structure = self.declaration.structure(self.model.solve(only=(PRESET,)))
+        self.structure = self.declaration.structure(self.model.solve(only=self.static_names))
 
     @property
     def graph(self) -> SCM:
@@ -193,7 +193,7 @@ class World(Stepped):
             self.backend.restore(self._origin.engine)
         else:
             self._build(origin)
-        self._now["action"] = np.zeros(9)
+        self._act(np.zeros(self.declaration.n_actions))
         self.adopt(origin, origin.model, self._origin.static, 0)
         self._draw_nature()
         self._readouts.forget()
@@ -228,15 +228,15 @@ class World(Stepped):
         """Advance one control step.
 
         Args:
-            action: What the action mode asks for, shape (9,) in SI units. Numbers outside the
-                action's range are clipped to it.
+            action: All actions in their order, shape (n_actions,) in SI units. Numbers outside
+                the action's range are clipped to it.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
             NotReset: There is no episode yet.
             EngineFailure: The engine lost the state.
         """
-        self.advance(clipped(action, *self.declaration.action_bounds, self._action_unit))
+        self.advance(clipped(action, *self.declaration.action_bounds, self.declaration.action_unit))
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.
@@ -277,7 +277,7 @@ class World(Stepped):
         model: SCM,
         static: Values,
         index: int,
-        state: PhysicalState | None = None,
+        state: State | None = None,
     ) -> None:
         """Take over what an intervention decided; the engine has taken over its part.
 
@@ -293,11 +293,14 @@ class World(Stepped):
         if changed:
             self._enter(declaration)
         self._held, self._static = model, static
-        self._action_is_held = "action" in model.interventions
-        self._inputs = policy_inputs(model)
-        self._noisy = bool(static[ACTUATOR_NOISE] > 0.0)
+        held = model.interventions
+        self._held_actions = tuple(name for name in declaration.actions if name in held)
+        self._inputs = policy_inputs(model, self._held_actions)
+        commands = declaration.composition.commands
+        self._translates = commands is not None and commands.applies(static)
         self.structure = declaration.structure(static)
-        self._substeps = round(self.control_period / self.structure.preset.timestep)
+        timestep = declaration.composition.timestep(static)
+        self._substeps = max(1, round(self.control_period / timestep))
         self._now.update(static)
         self.version += 1
         self._readouts.stale()
@@ -312,15 +315,17 @@ class World(Stepped):
 
     def _enter(self, declaration: Declaration) -> None:
         """Make room for the values of a structure."""
-        action = self._now["action"] if hasattr(self, "_now") else np.zeros(9)
         self.declaration = declaration
-        self._now: dict[str, Value] = {"action": action, CONTROL_INDEX: self._clock}
+        if self._action.shape != (declaration.n_actions,):
+            self._action = np.zeros(declaration.n_actions)
+        self._now: dict[str, Value] = {CONTROL_INDEX: self._clock}
+        self._act(self._action)
         self._before: dict[str, Value] = {}
-        self._state = PhysicalState(declaration.n_blocks)
+        self._state = declaration.empty_state()
         self._now.update(declaration.states(self._state))
         self._readouts = Readouts(declaration.model, self._now, self._before, declaration.computed)
 
-    def current(self) -> tuple[Values, PhysicalState]:
+    def current(self) -> tuple[Values, State]:
         """Give the live values and the live state, for the parts of a ``do``."""
         return self._now, self._state
 
@@ -332,7 +337,7 @@ class World(Stepped):
             static=self._static,
             interventions=self._held.interventions,
             previous=self.previous(),
-            action=np.array(self._now["action"]),
+            action=np.array(self._action),
             index=self._index,
             seed=self.noise.seed,
             episode=self.episode,
@@ -356,7 +361,7 @@ class World(Stepped):
         self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
         declaration = self.family.declaration(snapshot.plan)
         held = declaration.model.with_interventions(snapshot.interventions)
-        self._now["action"] = np.array(snapshot.action)
+        self._act(np.array(snapshot.action))
         self.adopt(declaration, held, snapshot.static, snapshot.index)
         for name, value in snapshot.previous.items():
             self._before[name][...] = value

@@ -109,7 +109,7 @@ def test_scenes_have_the_blocks_that_they_name() -> None:
     assert [case.blocks for case in GROWING] == [1, 2, 5, 10, 35]
     for case in CASES:
         env = case.env("fake")
-        assert env.world.declaration.n_blocks == case.blocks
+        assert len(env.world.composition.blocks) == case.blocks
         env.close()
 
 

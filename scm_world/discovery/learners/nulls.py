@@ -201,7 +201,7 @@ def _apart(mine: Floats, its: Floats) -> tuple[float, float]:
 def _bodies_at(episode: Episode, step: int) -> dict[str, Floats]:
     """Give the state of each body at an instant; the first three numbers are its place [m]."""
     declaration = _declaration_at(episode, step)
-    state = PhysicalState(declaration.n_blocks, episode.trace.vectors[step])
+    state = PhysicalState(len(declaration.composition.blocks), episode.trace.vectors[step])
     tips = forward(state.joint_positions, trifinger.NOMINAL_HEIGHT)
     of_robot = (tips, state.joint_positions, state.joint_velocities)
     fingers = np.hstack([numbers.reshape(len(FINGERS), 3) for numbers in of_robot])

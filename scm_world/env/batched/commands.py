@@ -14,7 +14,7 @@ from scm_world.env.delta import JOINTS
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import ActionError
 from scm_world.world.batch import Batch
-from scm_world.world.columns import ACTION, Table
+from scm_world.world.columns import Table
 
 
 @final
@@ -39,18 +39,18 @@ class Commands:
         self.names = () if self._reads is None else (self._reads,)
         # Where the joints were put since the last command: it is relative to them.
         self._are_set = np.zeros(num_envs, dtype=np.bool_)
-        self._found = np.empty((num_envs, 9))
+        self._found = np.empty((num_envs, env.world.declaration.n_actions))
 
     def read(self, rows: Integers, actions: NDArray[Any], batch: Batch) -> Floats:
         """Give the commands of some environments.
 
         Args:
             rows: Their numbers, shape (m,).
-            actions: Shape (n, 9).
+            actions: Shape (n, n_actions).
             batch: Their worlds.
 
         Returns:
-            Shape (n, 9); rows of others mean nothing. It holds until the next call.
+            Shape (n, n_actions); rows of others mean nothing. It holds until the next call.
 
         Raises:
             ActionError: A number is not finite.
@@ -59,7 +59,7 @@ class Commands:
         bad = rows[~np.isfinite(given).all(axis=1)]
         if len(bad):
             row = int(bad[0])
-            said = f"an action is nine finite numbers, got {actions[row]!r}"
+            said = f"an action is finite numbers, got {actions[row]!r}"
             raise located(ActionError(said, actions[row]), row)
         if self._delta is not None:
             batch.fill(rows)
@@ -73,10 +73,10 @@ class Commands:
         return self._found
 
     def _offset(self, table: Table, rows: Integers) -> Floats:
-        """Give what actions are relative to, shape (m, 9)."""
+        """Give what actions are relative to, shape (m, n_actions)."""
         if self._reads is not None:
             return table.column(self._reads)[rows]
-        last = table.column(ACTION)[rows]
+        last = table.actions()[rows]
         if self._mode != JOINTS:
             return last
         return np.where(self._are_set[rows, None], table.column(JOINTS)[rows], last)

@@ -15,7 +15,6 @@ from scm_world._types import Floats, Integers
 from scm_world.env.observer import Observation
 from scm_world.evaluation.policies.cards import RELATIVE, USUAL
 from scm_world.queries.plans import Plan
-from scm_world.scene import PhysicalState
 
 Bools = NDArray[np.bool_]
 ONLY = ""
@@ -137,7 +136,7 @@ def whole(arrays: Mapping[str, NDArray[Any]]) -> Observation:
     return arrays[ONLY] if ONLY in arrays else dict(arrays)
 
 
-def summed(state: PhysicalState) -> int:
+def summed(vector: Floats) -> int:
     """Sum up a true state, as a whole number of 64 bits."""
-    digest = hashlib.blake2b(state.vector.tobytes(), digest_size=8).digest()
+    digest = hashlib.blake2b(vector.tobytes(), digest_size=8).digest()
     return int.from_bytes(digest, "little", signed=True)

@@ -19,13 +19,11 @@ from scm_world.errors import NotReset, UnknownOption
 from scm_world.evaluation.policies import as_player
 from scm_world.evaluation.policies.players import inner
 from scm_world.evaluation.recording.environments import environment
-from scm_world.evaluation.recording.episodes import Recorded, summed
+from scm_world.evaluation.recording.episodes import Recorded
 from scm_world.evaluation.recording.recording import Recording
 from scm_world.output.locations import Location
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
-from scm_world.scene import PhysicalState
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.world.start import whole_number
 
 INFOS = ("success", "fractional_success")
@@ -297,8 +295,3 @@ def _copied(observation: Any) -> Observation:
     if isinstance(observation, dict):
         return {name: np.array(part) for name, part in observation.items()}
     return np.array(observation)
-
-
-def _sum(vector: Floats) -> int:
-    """Sum up a state, which costs less after the episode than between two steps."""
-    return summed(PhysicalState((vector.size - ROBOT_SIZE) // BLOCK_SIZE, vector))

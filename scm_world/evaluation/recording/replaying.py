@@ -44,7 +44,7 @@ def _at_instant(env: ScmWorldEnv, episode: Recorded, step: int) -> Iterator[str]
             env.do(plan.at_start())
         except InterventionError as error:
             yield f"control step {step}: an intervention is refused ({error})"
-    if summed(env.world.current()[1]) != episode.states[step]:
+    if summed(env.world.current()[1].vector) != episode.states[step]:
         yield f"control step {step}: the true state"
     for name in _changed(env.observe(), episode.observations[step]):
         yield f"control step {step}: the observation{f' {name!r}' if name else ''}"

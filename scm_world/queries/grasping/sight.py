@@ -62,7 +62,7 @@ class Sight:
     def _learn(self, world: World) -> None:
         """See what moves only when someone intervenes."""
         self.hand = Hand(self._values, world.control_period)
-        self._solid = (*world.structure.blocks, *world.structure.obstacles)
+        self._solid = (*world.composition.blocks, *world.composition.obstacles)
         task = world.declaration.task
         targets = task.targets() if isinstance(task, Building) else {}
         self.pairs = tuple(

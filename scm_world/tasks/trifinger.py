@@ -1,0 +1,125 @@
+"""What the goal families of the block-building robot have in common."""
+
+from __future__ import annotations
+
+import inspect
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Unpack
+
+from scm_world.entities import ACTIONS, BlockWorld, Clock, Composition, Entity, Looks, Robot, Stage
+from scm_world.errors import UnknownOption
+from scm_world.models import ControlMode
+from scm_world.scene import PRESETS, TIMESTEP, trifinger
+from scm_world.tasks import shaping
+from scm_world.tasks.arguments import numbers_of
+from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.rewards import Common, further_terms, resolve
+from scm_world.variables import Linear, Measured, Variable
+
+REWARD = "reward"
+
+
+class TriFingerTask(Task):
+    """A goal family of the robot.
+
+    Attributes:
+        default_weights: Weight of every dense reward term, in order, and of
+            ``fractional_success``.
+        paper_weights: Where the published training runs differ.
+        ready_terms: Further reward terms, by name in the option ``terms``.
+        start: Where the robot begins, shape (9,) [rad].
+    """
+
+    action_modes = tuple(ACTIONS)
+    presets = tuple(PRESETS)
+    time_unit = TIMESTEP
+    frame_skip = 10
+
+    default_weights: ClassVar[Mapping[str, float]]
+    paper_weights: ClassVar[Mapping[str, float]] = {}
+    ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    rest: ClassVar[tuple[float, ...]] = trifinger.REST
+
+    def __init__(self, **common: Unpack[Common]) -> None:
+        unknown = sorted(common.keys() - Common.__annotations__.keys())
+        if unknown:
+            raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
+        self.terms = further_terms(common.get("terms", ()), self.default_weights, self.ready_terms)
+        self.weights = resolve(self.default_weights, self.paper_weights, common, self.terms)
+        given = common.get("joint_positions")
+        joints = numbers_of(self.rest if given is None else given)
+        if joints is None or joints.shape != (trifinger.N_JOINTS,):
+            raise UnknownOption("joint_positions", given, ("nine angles [rad]",))
+        self.start = tuple(joints.tolist())
+
+    @classmethod
+    def arguments(cls) -> tuple[str, ...]:
+        """Name the arguments of the constructor, those of this family first."""
+        own = [vars(kind)["__init__"] for kind in cls.__mro__ if "__init__" in vars(kind)]
+        given = [p for init in own[:-1] for p in inspect.signature(init).parameters.values()]
+        names = [parameter.name for parameter in given if parameter.kind is parameter.KEYWORD_ONLY]
+        return tuple(dict.fromkeys((*names, *Common.__annotations__)))
+
+    @abstractmethod
+    def entities(self) -> Iterable[Entity]:
+        """List what stands in the world besides the robot and the stage."""
+
+    @abstractmethod
+    def readouts(self) -> Iterable[Variable]:
+        """Declare reward terms, fractional success and success."""
+
+    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+        """Leave out what is absent, and what is computed from something that is not there.
+
+        An entity of which something cannot be computed any more goes as well, such as the places
+        of a pile of which a block is missing. The reward sums up the terms that are left.
+        """
+        torques = timing.action_mode == "joint_torques"
+        mode = ControlMode.JOINT_TORQUES if torques else ControlMode.JOINT_POSITIONS
+        entities: tuple[Entity, ...] = (
+            Robot(timing.action_mode, self.start),
+            Stage(timing.preset),
+            Looks(),
+            Clock(timing.steps, timing.control_period),
+            *self.entities(),
+        )
+        there = tuple(entity for entity in entities if entity.name not in self.absent)
+        while True:
+            made = BlockWorld(there, tuple(self.shared()), self.decided_by, mode)
+            variables: list[Variable] = [*made.variables(), *self.readouts()]
+            if not self.absent:
+                return made, variables
+            variables = _computable(variables)
+            names = {variable.name for variable in variables}
+            whole = tuple(e for e in there if all(v.name in names for v in e.variables()))
+            if len(whole) == len(there):
+                return made, variables
+            there = whole
+
+
+def _computable(variables: list[Variable]) -> list[Variable]:
+    while True:
+        names = {variable.name for variable in variables}
+        kept = [_kept(variable, names) for variable in variables]
+        left = [variable for variable in kept if variable is not None]
+        if len(left) == len(variables):
+            return left
+        variables = left
+
+
+def _kept(variable: Variable, names: set[str]) -> Variable | None:
+    parents = variable.all_parents
+    there = [index for index, parent in enumerate(parents) if parent.name in names]
+    if len(there) == len(parents):
+        return variable
+    mechanism: Any = getattr(variable, "mechanism", None)
+    if variable.name == REWARD and isinstance(variable, Measured) and isinstance(mechanism, Linear):
+        weights = tuple(mechanism.weights[index] for index in there)
+        return variable.model_copy(
+            update={
+                "parents": tuple(parents[index] for index in there),
+                "mechanism": mechanism.model_copy(update={"weights": weights}),
+            }
+        )
+    return None
