@@ -10,12 +10,13 @@ from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapsh
 from scm_world.backends.wrapper import BackendWrapper
 from scm_world.errors import MissingEngine, ModelError, UnknownOption
 
-BACKENDS = ("mujoco", "bullet", "fake")
+BACKENDS = ("mujoco", "bullet", "step", "fake")
 """Names of the engines of this package."""
 
 _CLASSES = {
     "mujoco": ("scm_world.backends.mujoco", "MujocoBackend", "mujoco>=3.17,<5"),
     "bullet": ("scm_world.backends.bullet", "BulletBackend", "pybullet==3.2.7"),
+    "step": ("scm_world.backends.step", "StepFunction", "scm-world"),
     "fake": ("scm_world.backends.fake", "FakeBackend", "scm-world"),
 }
 

@@ -1,0 +1,523 @@
+"""A backend that is a function: the new state follows from parameters, state, action and noise."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Literal, final
+
+import numpy as np
+
+from scm_world._types import Floats, Integers, Value
+from scm_world.backends.base import Backend, Capabilities, Contact, EngineBatch, EngineSnapshot
+from scm_world.errors import EngineFailure, ModelError, SnapshotMismatch, UnknownOption, WrongShape
+from scm_world.models.model import Numbers
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    complete,
+)
+from scm_world.models.state import State, StateLayout
+
+
+@final
+@dataclass(frozen=True)
+class Quantity:
+    """Something that a step function is given, or that it gives.
+
+    Attributes:
+        name: Of the variable.
+        shape: Of one value.
+        default: One number, or one for each component.
+        integer: Whether the function is given whole numbers (int64), and has to give such.
+    """
+
+    name: str
+    shape: tuple[int, ...] = ()
+    default: Numbers = 0.0
+    integer: bool = False
+
+    @property
+    def key(self) -> ParameterKey:
+        """How it is named among the parameters of a scene."""
+        element, _, attribute = self.name.rpartition(".")
+        return element, attribute
+
+    @property
+    def value(self) -> Floats:
+        """The default, of the declared shape."""
+        if np.ndim(self.default):
+            return np.array(self.default, dtype=np.float64).reshape(self.shape)
+        return np.full(self.shape, self.default, dtype=np.float64)
+
+
+_Pieces = tuple[tuple[Quantity, slice], ...]
+
+
+def _pieces(quantities: Iterable[Quantity]) -> tuple[_Pieces, int]:
+    """Lay quantities out in a row: the place of each, and how many numbers there are."""
+    found, end = [], 0
+    for quantity in quantities:
+        start, end = end, end + int(np.prod(quantity.shape, dtype=int))
+        found.append((quantity, slice(start, end)))
+    return tuple(found), end
+
+
+@final
+@dataclass(frozen=True)
+class StepModel:
+    """A system whose physics is one function, ``step(parameters, state, action, noise)``.
+
+    With the signature ``"dicts"`` the function is given four dicts of read-only values by name
+    (NumPy scalars where the shape is ``()``), and gives a dict with the new value of every state.
+    With ``"arrays"`` it is given four flat arrays of floats, in the order of declaration, and
+    gives the new state as one: compiled functions take that. In both cases it must not change
+    what it is given, must keep no memory from one call to the next, and must draw no random
+    numbers of its own.
+
+    A command is the action followed by the noise. Two models are equal if they have the same
+    function and tables; it can be pickled if the function can.
+
+    Attributes:
+        name: Of the system.
+        function: The step.
+        timestep: What one call of the function advances [s].
+        parameters: What holds until it is set again.
+        states: What the function moves, in the order of the state vector.
+        actions: What a policy decides, in the order of the command.
+        noise: What is random in every step; it follows the actions in a command.
+        vectorized: Whether the function takes many systems at once: every value has a leading
+            axis, and no row may depend on another one, to the last bit.
+        signature: How the function is called.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    timestep: float
+    parameters: tuple[Quantity, ...]
+    states: tuple[Quantity, ...]
+    actions: tuple[Quantity, ...] = ()
+    noise: tuple[Quantity, ...] = ()
+    vectorized: bool = False
+    signature: Literal["dicts", "arrays"] = "dicts"
+
+    @property
+    def n_commands(self) -> int:
+        """How many numbers a command has: those of the actions and those of the noise."""
+        return self._actions[1] + self._noise[1]
+
+    @cached_property
+    def layout(self) -> StateLayout:
+        """Where each state stands in the vector."""
+        pieces, _ = self._states
+        start = [number for quantity, _ in pieces for number in quantity.value.ravel().tolist()]
+        sizes = tuple(where.stop - where.start for _, where in pieces)
+        return StateLayout(tuple(quantity.name for quantity, _ in pieces), sizes, tuple(start))
+
+    def empty_state(self) -> State:
+        """Give a state to read into."""
+        return State(self.layout)
+
+    def default_scene(self) -> Scene:
+        """Give the scene in which every parameter and every state has its default."""
+        parameters = {quantity.key: quantity.value for quantity in self.parameters}
+        return Scene(self, parameters, self.empty_state())
+
+    def carried(self, state: State, before: Scene) -> None:
+        """Copy the states that another structure has too, from a scene of it into a state."""
+        there = before.state.layout.slices
+        for name, where in self.layout.slices.items():
+            if name in there and there[name].stop - there[name].start == where.stop - where.start:
+                state.vector[where] = before.state.vector[there[name]]
+
+    def advance(self, parameters: Floats, states: Floats, commands: Floats) -> Floats:
+        """Take one step in several systems.
+
+        Args:
+            parameters: Flat, in the order of declaration, shape (m, p).
+            states: Shape (m, s).
+            commands: Shape (m, n_commands).
+
+        Returns:
+            The new states, shape (m, s), in an array of its own.
+
+        Raises:
+            EngineFailure: The function raised an error, changed what it was given, or gave
+                something else than finite numbers of the declared names, shapes and kinds.
+        """
+        if self.vectorized:
+            return self._checked(self._call(parameters, states, commands), (len(states),))
+        new = np.empty_like(states)
+        for row in range(len(states)):
+            given = parameters[row], states[row], commands[row]
+            new[row] = self._checked(self._call(*given), ())
+        return new
+
+    def _call(self, parameters: Floats, states: Floats, commands: Floats) -> Any:
+        split = self._actions[1]
+        arrays = [parameters, states, commands[..., :split], commands[..., split:]]
+        given: list[Any] = [np.array(array) for array in arrays]  # it may keep them
+        if self.signature == "dicts":
+            for array in given:
+                array.flags.writeable = False
+            tables = (self._parameters, self._states, self._actions, self._noise)
+            given = [
+                _named(pieces, array) for (pieces, _), array in zip(tables, given, strict=True)
+            ]
+        try:
+            result = self.function(*given)
+        except Exception as error:
+            raise EngineFailure(self._raised(error), StepFunction.name) from error
+        if self.signature == "arrays":
+            kinds = ("parameters", "state", "action", "noise")
+            for kind, array, copy in zip(kinds, arrays, given, strict=True):
+                if array.tobytes() != copy.tobytes():
+                    raise EngineFailure(
+                        f"the step function of {self.name!r} changed the {kind} it was given; "
+                        "let it work on a copy",
+                        StepFunction.name,
+                    )
+        return result
+
+    def _raised(self, error: Exception) -> str:
+        """Say what went wrong in the function, and what may help."""
+        advice = ""
+        if isinstance(error, KeyError):
+            kinds = ("parameters", "states", "actions", "noise")
+            given = (
+                f"{kind} {', '.join(q.name for q in getattr(self, kind))}"
+                for kind in kinds
+                if getattr(self, kind)
+            )
+            advice = f"; it is given {'; '.join(given)}"
+        elif "read-only" in str(error):
+            advice = "; what it is given must not be changed: let it work on a copy"
+        what = f"{type(error).__name__}: {error}"
+        return f"the step function of {self.name!r} raised {what}{advice}"
+
+    def _checked(self, result: Any, lead: tuple[int, ...]) -> Floats:
+        """Put what the function gave into an array, shape (*lead, s), or refuse it."""
+        pieces, size = self._states
+        new, problems = np.empty((*lead, size)), []
+        if self.signature == "arrays":
+            given = np.asarray(result)
+            if given.shape != new.shape or given.dtype.kind not in "biuf":
+                problems.append(f"it must be an array of numbers of shape {new.shape}: {result!r}")
+            else:
+                new[...] = given
+        elif not isinstance(result, Mapping):
+            problems.append(f"it must be a dict of the states by name: {result!r}")
+        else:
+            names = self.layout.slices
+            problems += [f"{name!r} is missing" for name in names if name not in result]
+            problems += [f"{name!r} is no state" for name in result if name not in names]
+            for quantity, where in pieces if not problems else ():
+                value, shape = np.asarray(result[quantity.name]), (*lead, *quantity.shape)
+                if value.dtype.kind not in "biuf":
+                    problems.append(f"{quantity.name!r} must be numbers, not {value.dtype}")
+                elif value.shape != shape:
+                    problems.append(f"{quantity.name!r} must have shape {shape}, not {value.shape}")
+                else:
+                    new[..., where] = value.reshape(*lead, -1)
+        if not problems and not np.isfinite(new).all():
+            broken = [q.name for q, where in pieces if not np.isfinite(new[..., where]).all()]
+            problems = [f"{name!r} has a number that is not finite" for name in broken]
+        if not problems:
+            whole = [(q.name, new[..., where]) for q, where in pieces if q.integer]
+            problems = [
+                f"{name!r} must be whole numbers of at most 2**53, not {part.tolist()}"
+                for name, part in whole
+                if (np.rint(part) != part).any() or (np.abs(part) > 2.0**53).any()
+            ]
+        if problems:
+            raise EngineFailure(
+                f"what the step function of {self.name!r} gave is no new state: "
+                f"{'; '.join(problems)}",
+                StepFunction.name,
+            )
+        return new
+
+    @cached_property
+    def _parameters(self) -> tuple[_Pieces, int]:
+        return _pieces(self.parameters)
+
+    @cached_property
+    def _states(self) -> tuple[_Pieces, int]:
+        return _pieces(self.states)
+
+    @cached_property
+    def _actions(self) -> tuple[_Pieces, int]:
+        return _pieces(self.actions)
+
+    @cached_property
+    def _noise(self) -> tuple[_Pieces, int]:
+        return _pieces(self.noise)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f: getattr(self, f) for f in self.__dataclass_fields__}
+
+
+def _named(pieces: _Pieces, numbers: Floats) -> dict[str, Any]:
+    """Name the parts of flat numbers, shape (..., size); they cannot be written."""
+    lead, found = numbers.shape[:-1], dict[str, Any]()
+    for quantity, where in pieces:
+        if not lead and not quantity.shape:
+            number = numbers[where.start]
+            found[quantity.name] = np.int64(number) if quantity.integer else number
+            continue
+        part: Value = numbers[..., where].reshape(*lead, *quantity.shape)
+        if quantity.integer:
+            part = part.astype(np.int64)
+            part.flags.writeable = False
+        found[quantity.name] = part
+    return found
+
+
+class InMemory(Backend, ABC):
+    """What keeps a scene in memory: parameters in a dict, the state in a vector.
+
+    Only ``step`` and ``inertia`` are left to a class that derives from it.
+    """
+
+    @property
+    def version(self) -> str:
+        """Version of the backend."""
+        return "1"
+
+    @property
+    def structure(self) -> Any:
+        """The structure of the scene."""
+        return self._structure
+
+    @property
+    def n_blocks(self) -> int:
+        """How many movable blocks the scene has."""
+        return len(getattr(self._structure, "blocks", ()))
+
+    def build(self, scene: Scene) -> None:
+        """Remember the scene."""
+        self._structure, self._state = scene.structure, scene.structure.empty_state()
+        self._parameters: dict[ParameterKey, Floats] = {}
+        self._keep(scene.parameters)
+        self._place(scene.state)
+
+    def apply(self, difference: Difference) -> None:
+        """Change structure, parameters and state without advancing time.
+
+        Raises:
+            UnknownOption: There is no such parameter. Nothing has changed.
+            WrongShape: A parameter has another shape. Nothing has changed.
+        """
+        structure = difference.structure
+        if structure is not None:
+            now = Scene(self._structure, self._parameters, self._state)
+            difference = complete(now, structure, difference)
+            self._structure, self._state = structure, structure.empty_state()
+            structure.carried(self._state, now)  # what is reported stays
+            self._parameters = {}
+        else:
+            self._check(difference.parameters)
+            for key, value in difference.parameters.items():
+                if np.shape(value) != self._parameters[key].shape:
+                    name, shape = ".".join(key).strip("."), self._parameters[key].shape
+                    raise WrongShape(name, value, shape, np.shape(value))
+        self._keep(difference.parameters)
+        if difference.state is not None:
+            self._place(difference.state)
+
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Give the parameters that were set.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+        """
+        keys = tuple(keys)
+        self._check(keys)
+        return {key: self._parameters[key].copy() for key in keys}
+
+    def read(self, into: State) -> None:
+        """Write the present state into an existing vector."""
+        into.vector[:] = self._state.vector
+
+    def state(self) -> Any:
+        """Copy the present state."""
+        return self._state.copy()
+
+    def contacts(self) -> tuple[Contact, ...]:
+        """Nothing ever touches anything."""
+        return ()
+
+    def snapshot(self) -> EngineSnapshot:
+        """Save everything."""
+        scene = Scene(self._structure, dict(self._parameters), self._state.copy())
+        return EngineSnapshot(f"{self.name} {self.version}", scene)
+
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Go back to a snapshot.
+
+        Raises:
+            SnapshotMismatch: It was taken by another engine.
+        """
+        here = f"{self.name} {self.version}"
+        if snapshot.engine != here:
+            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
+        scene: Scene = snapshot.payload
+        self._structure, self._state = scene.structure, scene.state.copy()
+        self._parameters = {}
+        self._keep(scene.parameters)
+
+    def _keep(self, parameters: Parameters) -> None:
+        for key, value in parameters.items():
+            self._parameters[key] = np.array(value, dtype=np.float64)
+
+    def _place(self, state: State) -> None:
+        """Put everything where a state says; what is only reported stays."""
+        np.copyto(self._state.vector, state.vector, where=self._state.layout.can_be_set)
+
+    def _check(self, keys: Iterable[ParameterKey]) -> None:
+        for key in keys:
+            if key not in self._parameters:
+                known = (".".join(known).strip(".") for known in self._parameters)
+                raise UnknownOption("parameter", ".".join(key).strip("."), known)
+
+
+@final
+class StepFunction(InMemory):
+    """Realises a ``StepModel``."""
+
+    name: ClassVar[str] = "step"
+    capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
+    _asked: StepModel | None = None
+
+    def build(self, scene: Scene) -> None:
+        """Remember the scene.
+
+        Raises:
+            ModelError: It is not that of a step function.
+        """
+        if not isinstance(scene.structure, StepModel):
+            raise ModelError(
+                [
+                    "the backend 'step' realises step functions only (World.from_step), not a "
+                    f"{type(scene.structure).__name__}; choose 'mujoco' or 'bullet'"
+                ]
+            )
+        super().build(scene)
+
+    def inertia(self, body: str) -> Floats:
+        """Refuse: a step function has no bodies.
+
+        Raises:
+            UnknownOption: Always.
+        """
+        raise UnknownOption("body", body, ("nothing: a step function has no bodies",))
+
+    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+        """Hold a command, which is the action and the noise, for some steps.
+
+        Raises:
+            UnknownOption: The mode is not ``controls``.
+            EngineFailure: See ``StepModel.advance``; or the function gives two answers to one
+                question, which is tried in the first step. The state is as before.
+        """
+        _require_controls(mode)
+        now = self.numbers[None], self._state.vector[None], np.atleast_2d(command)
+        if self._asked is not self._structure:
+            _refuse_memory(self._structure, *now)
+            self._asked = self._structure
+        parameters, states, commands = now
+        for _ in range(substeps):
+            states = self._structure.advance(parameters, states, commands)
+        self._state.vector[:] = states[0]
+
+    @property
+    def numbers(self) -> Floats:
+        """The parameters in the order of declaration, flat, shape (p,)."""
+        parts = [self._parameters[quantity.key].ravel() for quantity in self._structure.parameters]
+        return np.concatenate([*parts, np.empty(0)])
+
+    @classmethod
+    def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
+        """Give what steps several systems, with one call of a vectorised function."""
+        return StepBatch(backends)
+
+
+@final
+class StepBatch(EngineBatch):
+    """Systems of step functions; a vectorised function is called once for all of them.
+
+    Args:
+        backends: All of them ``StepFunction``.
+    """
+
+    def __init__(self, backends: Sequence[Backend]) -> None:
+        self._backends: tuple[Any, ...] = tuple(backends)
+        self._compared: set[tuple[StepModel, int]] = set()
+
+    def step(
+        self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
+    ) -> None:
+        """Hold commands for some steps.
+
+        Raises:
+            EngineFailure: As in ``StepFunction.step``; or a row of a vectorised function depends
+                on how many there are, which is asked once for every number of rows.
+        """
+        _require_controls(mode)
+        together: dict[StepModel, list[int]] = {}
+        for index in which.tolist():
+            together.setdefault(self._backends[index].structure, []).append(index)
+        for model, rows in together.items():
+            members = [self._backends[row] for row in rows]
+            size, count = model.layout.size, model.n_commands
+            if not model.vectorized:
+                for row, member in zip(rows, members, strict=True):
+                    member.step(mode, commands[row, :count], substeps)
+            else:
+                states = np.array([member.state().vector for member in members])
+                given = np.array([member.numbers for member in members]), commands[rows, :count]
+                if (model, len(rows)) not in self._compared:
+                    _refuse_company(model, given[0], states, given[1])
+                    self._compared.add((model, len(rows)))
+                for _ in range(substeps):
+                    states = model.advance(given[0], states, given[1])
+                for member, vector in zip(members, states, strict=True):
+                    member.apply(Difference(state=State(model.layout, vector)))
+            for row, member in zip(rows, members, strict=True):
+                member.read(State(model.layout, into[row, :size]))
+
+
+def _require_controls(mode: ControlMode) -> None:
+    if mode is not ControlMode.CONTROLS:
+        raise UnknownOption("mode of a step function", str(mode), (str(ControlMode.CONTROLS),))
+
+
+def _refuse_memory(model: StepModel, parameters: Floats, states: Floats, commands: Floats) -> None:
+    """Refuse a function that gives two answers to one question."""
+    answers = [model.advance(parameters, states, commands).tobytes() for _ in range(2)]
+    if answers[0] != answers[1]:
+        raise EngineFailure(
+            f"the step function of {model.name!r} gave two answers to one question; let it keep "
+            "no memory between calls, and declare what is random in noise=",
+            StepFunction.name,
+        )
+
+
+def _refuse_company(model: StepModel, parameters: Floats, states: Floats, commands: Floats) -> None:
+    """Refuse a vectorised function that gives a row alone other numbers than among others."""
+    among = model.advance(parameters, states, commands)
+    for row in range(len(states)):
+        one = slice(row, row + 1)
+        alone = model.advance(parameters[one], states[one], commands[one])
+        if alone.tobytes() != among[one].tobytes():
+            raise EngineFailure(
+                f"the vectorised step function of {model.name!r} gives a row other numbers among "
+                f"{len(states)} rows than alone; write it without matrix products over the rows "
+                "(np.einsum adds up each row by itself), or set vectorized=False",
+                StepFunction.name,
+            )
