@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from numba import njit
 from scm_world._types import Floats
 from scm_world.backends.renderer.bodies import FLOOR, NOTHING, STAGE, Bodies
 from scm_world.backends.renderer.kernels import (
+    SHADOW,
     Canvas,
     Colors,
     Depths,
@@ -19,14 +21,15 @@ from scm_world.backends.renderer.kernels import (
     brightness,
     byte,
     draw,
+    shade_at,
 )
+from scm_world.backends.renderer.meshes import Triangles, draw_mesh
 from scm_world.backends.renderer.views import camera_view, parallel_view
 from scm_world.models.scene import Light, Scene
 from scm_world.scene.camera import Camera
 from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS
 
 BACKGROUND = (0.86, 0.89, 0.93)
-SHADOW = 0.45 / 0.7  # how much of the light that is not ambient a full shadow takes away
 SHADOW_TEXELS = 96
 SHADOW_BLUR = 2  # passes of a box filter three texels wide
 LOWEST = 1e-3  # [1] the height of a light below which nothing throws a shadow on the floor
@@ -91,22 +94,6 @@ def _trace_arena(view: View, depth: Depths, owners: Owners) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _shade_at(shadow: Floats, x: float, y: float) -> float:
-    """Read the shadow map between its texels."""
-    size = shadow.shape[0]
-    if size == 0:
-        return 0.0
-    scale = 0.5 / WALL_RADIUS * (size - 1.001)  # the last texel has none beyond
-    u, v = max(x + WALL_RADIUS, 0.0) * scale, max(y + WALL_RADIUS, 0.0) * scale
-    i, j = min(int(v), size - 2), min(int(u), size - 2)
-    u, v = u - j, v - i
-    upper = shadow[i, j] * (1.0 - u) + shadow[i, j + 1] * u
-    lower = shadow[i + 1, j] * (1.0 - u) + shadow[i + 1, j + 1] * u
-    shade: float = upper * (1.0 - v) + lower * v
-    return shade
-
-
-@njit(cache=True, error_model="numpy")
 def _paint_arena(view: View, light: Floats, colors: Floats, shadow: Floats, canvas: Canvas) -> None:
     """Color the pixels that show floor, wall or nothing.
 
@@ -128,7 +115,7 @@ def _paint_arena(view: View, light: Floats, colors: Floats, shadow: Floats, canv
             x, y = ox + depth[v, u] * (cx + u * ax), oy + depth[v, u] * (cy + u * ay)
             shade, row = 1.0, 2
             if owners[v, u] == FLOOR:
-                shade, row = top * (1.0 - dark * _shade_at(shadow, x, y)), 0
+                shade, row = top * (1.0 - dark * shade_at(shadow, WALL_RADIUS, x, y)), 0
             elif owners[v, u] == STAGE:
                 cosine = -(x * light[0] + y * light[1]) / WALL_RADIUS
                 shade, row = brightness(cosine, ambient), 1
@@ -166,21 +153,36 @@ def lit_arena(camera: Camera, light: Light, colors: Palette) -> Colors:
     return paint_arena(empty_arena(camera), camera_view(camera, 1), light, colors)
 
 
-def shadow_map(bodies: Bodies, light: Light) -> Floats:
+def shadow_map(
+    bodies: Bodies,
+    light: Light,
+    meshes: Iterable[Triangles] = (),
+    half: float = WALL_RADIUS,
+    n: int = SHADOW_TEXELS,
+) -> Floats:
     """Look from the floor towards the light, and soften what stands in the way.
 
+    Args:
+        bodies: What throws shadows, z from the floor.
+        light: That they stand in the way of.
+        meshes: What else throws shadows.
+        half: Half the edge of the square around the origin that is looked at [m].
+        n: Texels along an edge.
+
     Returns:
-        How dark the floor is in the square around the ring, shape (m, m) in [0, 1]; of shape
-        (0, 0) where the light comes from the side or from below.
+        How dark the floor is in the square, shape (n, n) in [0, 1]; of shape (0, 0) where the
+        light comes from the side or from below.
     """
     towards = lamp(light)
     if towards[2] < LOWEST:
         return NO_SHADOW
-    n = SHADOW_TEXELS
-    view = parallel_view(towards[:3] / towards[2], WALL_RADIUS, n)
+    view = parallel_view(towards[:3] / towards[2], half, n)
     depth, owners = np.full((n, n), np.inf, dtype=np.float32), np.full((n, n), NOTHING, np.int32)
-    draw(bodies, view, towards, 1.0, Canvas(depth, owners, NO_COLORS))
-    shadow = np.where(owners == NOTHING, 0.0, 1.0)
+    canvas = Canvas(depth, owners, NO_COLORS)
+    draw(bodies, view, towards, 1.0, canvas)
+    for mesh in meshes:
+        draw_mesh(mesh, view, towards, 1.0, canvas)
+    shadow = np.where(np.isfinite(depth), 1.0, 0.0)
     for _ in range(SHADOW_BLUR):
         shadow[1:-1] = (shadow[:-2] + shadow[1:-1] + shadow[2:]) / 3.0
         shadow[:, 1:-1] = (shadow[:, :-2] + shadow[:, 1:-1] + shadow[:, 2:]) / 3.0

@@ -16,7 +16,7 @@ from scm_world.scene import trifinger
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
 from scm_world.scene.scene import Structure
 
-BOX, ELLIPSOID, CAPSULE, HULL = range(4)
+BOX, ELLIPSOID, CAPSULE, HULL, CYLINDER = range(5)
 GOAL_SHAPES = {"box": BOX, "sphere": ELLIPSOID, "hull": HULL}
 
 NOTHING, FLOOR, STAGE, ROBOT = range(-1, 3)
@@ -31,10 +31,10 @@ MOUNT = trifinger.Capsule((0.012, 0.0, 0.0), (-0.004, 0.0, 0.0), 0.0235)
 class Bodies(NamedTuple):
     """Solids: one row each, in the order in which they are drawn.
 
-    A capsule lies along the third axis of its own frame.
+    Capsules and cylinders lie along the third axis of their own frame.
 
     Attributes:
-        shapes: ``BOX``, ``ELLIPSOID``, ``CAPSULE`` or ``HULL``, shape (n,).
+        shapes: ``BOX``, ``ELLIPSOID``, ``CAPSULE``, ``HULL`` or ``CYLINDER``, shape (n,).
         centers: Origin of the frame of the body, shape (n, 3) [m].
         rotations: From the frame of the body to the world, shape (n, 3, 3).
         halves: Half the edges of a box around its origin that holds it, in its own frame; it is

@@ -14,8 +14,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.renderer.bodies import BOX, CAPSULE, ELLIPSOID, HULL, Bodies
-from scm_world.backends.renderer.rays import Hit, Triple, hit_ball, hit_box, hit_capsule, hit_hull
+from scm_world.backends.renderer.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, HULL, Bodies
+from scm_world.backends.renderer.rays import (
+    Hit,
+    Triple,
+    hit_ball,
+    hit_box,
+    hit_capsule,
+    hit_cylinder,
+    hit_hull,
+)
 
 Depths = NDArray[np.float32]
 Owners = NDArray[np.int32]
@@ -23,6 +31,7 @@ Colors = NDArray[np.uint8]
 
 EDGE = 0.06  # how wide the edge of a silhouette is, in halves of its size
 SHARP = 0.9  # the cosine between the normals of two sides below which they meet in an edge
+SHADOW = 0.45 / 0.7  # how much of the light that is not ambient a full shadow takes away
 TIE = 1e-5  # [m] what lies this close to a silhouette is drawn over it
 
 
@@ -150,7 +159,7 @@ def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tu
 @njit(cache=True, error_model="numpy")
 def _span(shape: int, rays: Floats, v: int, left: int, right: int) -> tuple[int, int]:
     """Bound the columns of a row that a body can cover, within those of its rectangle."""
-    if shape == CAPSULE:
+    if shape in (CAPSULE, CYLINDER):
         return _round_span(rays, v, 0.0, left, right)
     if shape == ELLIPSOID:
         return _round_span(rays, v, 1.0, left, right)
@@ -167,6 +176,22 @@ def byte(color: float) -> int:
 def brightness(cosine: float, ambient: float) -> float:
     """Shade a surface by the cosine to the light; softer than Lambert on the far side."""
     return ambient + (1.0 - ambient) * (0.5 + 0.5 * cosine)
+
+
+@njit(cache=True, error_model="numpy")
+def shade_at(shadow: Floats, half: float, x: float, y: float) -> float:
+    """Read a shadow map between its texels, x and y from the middle of its square."""
+    size = shadow.shape[0]
+    if size == 0:
+        return 0.0
+    scale = 0.5 / half * (size - 1.001)  # the last texel has none beyond
+    u, v = max(x + half, 0.0) * scale, max(y + half, 0.0) * scale
+    i, j = min(int(v), size - 2), min(int(u), size - 2)
+    u, v = u - j, v - i
+    upper = shadow[i, j] * (1.0 - u) + shadow[i, j + 1] * u
+    lower = shadow[i + 1, j] * (1.0 - u) + shadow[i + 1, j + 1] * u
+    shade: float = upper * (1.0 - v) + lower * v
+    return shade
 
 
 @njit(cache=True, error_model="numpy")
@@ -190,13 +215,15 @@ def _opacity(shape: int, facets: Floats, point: Triple, n: Triple) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _scale(bodies: Bodies, n: int) -> tuple[Floats, float]:
-    """Give the unit of length in the frame of a body, and half the segment of a capsule in it."""
+    """Give the unit of length in the frame of a body, and half the length of what is round."""
     scale = bodies.halves[n].copy()
     if bodies.shapes[n] == HULL:
         scale[:] = 1.0
-    if bodies.shapes[n] != CAPSULE:
+    if bodies.shapes[n] not in (CAPSULE, CYLINDER):
         return scale, 0.0
-    segment = scale[2] / scale[0] - 1.0
+    segment = scale[2] / scale[0]
+    if bodies.shapes[n] == CAPSULE:
+        segment -= 1.0
     scale[2] = scale[0]
     return scale, segment
 
@@ -254,6 +281,9 @@ def _meet_row(
     elif shape == CAPSULE:
         for u in range(span[0], span[1]):
             _write(hits, u, hit_capsule(_at(o, step_o, u), _at(d, step_d, u), segment, near))
+    elif shape == CYLINDER:
+        for u in range(span[0], span[1]):
+            _write(hits, u, hit_cylinder(_at(o, step_o, u), _at(d, step_d, u), segment, near))
     else:
         for u in range(span[0], span[1]):
             _write(hits, u, hit_hull(facets, _at(o, step_o, u), _at(d, step_d, u), near))
@@ -266,7 +296,7 @@ def _write(hits: Floats, u: int, hit: Hit) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _paint(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float) -> None:
+def blend(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float) -> None:
     """Blend a color, 255 where it is full, with what a pixel shows."""
     if paint == 1.0:
         rgb[0, v, u] = byte(light * color[0])
@@ -308,8 +338,8 @@ def _draw_body(
                 paint = alpha
                 if not solid:
                     point = _at(_ray(rays, 0, u, v), _ray(rays, 3, u, v), t)
-                    paint *= _opacity(shape, facets, point, normal)
-                _paint(rgb, v, u, color, brightness(cosine, light[3]), paint)
+                    paint = min(paint * _opacity(shape, facets, point, normal), 1.0)
+                blend(rgb, v, u, color, brightness(cosine, light[3]), paint)
             if solid:
                 depth[v, u] = t
             if owned:

@@ -105,6 +105,29 @@ def hit_capsule(o: Triple, d: Triple, half: float, near: float) -> Hit:
 
 
 @njit(cache=True, error_model="numpy")
+def hit_cylinder(o: Triple, d: Triple, half: float, near: float) -> Hit:
+    """Meet the cylinder of radius 1 from -half to half along z."""
+    a = d[0] * d[0] + d[1] * d[1]
+    b = o[0] * d[0] + o[1] * d[1]
+    c = o[0] * o[0] + o[1] * o[1] - 1.0
+    discriminant = b * b - a * c
+    if discriminant < 0.0 or (a == 0.0 and c > 0.0) or (d[2] == 0.0 and abs(o[2]) > half):
+        return math.inf, 0.0, 0.0, 0.0
+    root = math.sqrt(discriminant)
+    enter = (-b - root) / a if a > 0.0 else -math.inf
+    leave = (-b + root) / a if a > 0.0 else math.inf
+    middle = -o[2] / d[2] if d[2] != 0.0 else 0.0
+    reach = half / abs(d[2]) if d[2] != 0.0 else math.inf
+    first, last = max(enter, middle - reach), min(leave, middle + reach)
+    if first > last or last < near:
+        return math.inf, 0.0, 0.0, 0.0
+    t, side = (first, 1.0) if first >= near else (last, -1.0)
+    if t == (enter if side > 0.0 else leave):
+        return t, side * (o[0] + t * d[0]), side * (o[1] + t * d[1]), 0.0
+    return t, 0.0, 0.0, -math.copysign(1.0, d[2])
+
+
+@njit(cache=True, error_model="numpy")
 def hit_hull(
     facets: Floats,
     o: Triple,
