@@ -28,8 +28,9 @@ if TYPE_CHECKING:
         Reaches,
         World,
         do,
+        verify,
     )
-    from scm_world.tasks import Task, make_task
+    from scm_world.tasks import ModelTask, Task, TriFingerTask, make_task
     from scm_world.variables import (
         Action,
         Box,
@@ -56,7 +57,9 @@ _HOMES = {
     "SCM": "graph",
     "ScmWorldEnv": "env",
     "ScmWorldError": "errors",
+    "ModelTask": "tasks",
     "Task": "tasks",
+    "TriFingerTask": "tasks",
     "discover": "discovery",
     "load_hull": "geometry",
     "make_task": "tasks",
@@ -91,6 +94,7 @@ _HOMES = {
             "Reaches",
             "World",
             "do",
+            "verify",
         ),
         "queries",
     ),
@@ -112,6 +116,7 @@ __all__ = [
     "Linear",
     "Measured",
     "Mechanism",
+    "ModelTask",
     "MovingAverageAction",
     "Natural",
     "Null",
@@ -126,11 +131,13 @@ __all__ = [
     "ScmWorldError",
     "Shift",
     "Task",
+    "TriFingerTask",
     "World",
     "discover",
     "do",
     "load_hull",
     "make_task",
+    "verify",
 ]
 
 

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any, Self, final
 
 from scm_world._types import Floats
+from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.queries import estimates, samples
 from scm_world.queries.courses import Course, Key
@@ -18,6 +19,8 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Samples, Setting
 from scm_world.queries.stages import stage_of
+from scm_world.tasks import ModelTask
+from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, WorldSnapshot
 from scm_world.world import World as Simulated
 from scm_world.world.requests import merged
@@ -40,6 +43,61 @@ class World(Simulated):
         >>> episode.counterfactual({}) == episode
         True
     """
+
+    @classmethod
+    def from_mjcf(
+        cls,
+        source: Any,
+        *,
+        backend: Backend | str = "mujoco",
+        frame_skip: int | None = None,
+        max_episode_length: int | None = None,
+        variables_space: AnyRegion | None = None,
+        **options: Any,
+    ) -> Self:
+        """Make a world of any MJCF or URDF model; its variables and graph are generated.
+
+        Args:
+            source: A path, XML text, a ``mujoco.MjSpec`` or a ``mujoco.MjModel``.
+            backend: ``"mujoco"``, or ``"bullet"`` for the portable subset.
+            frame_skip: Length of a control step in physics steps.
+            max_episode_length: In control steps.
+            variables_space: See ``scm_world.world.World``.
+            options: Of ``ModelTask``: ``control_dt``, ``expose``, ``spaces``, ``ties``,
+                ``outcomes``, ``reward``, ``success``, ``start``, ``seconds``, ….
+
+        Raises:
+            ModelError: It cannot be read as a model, or the backend cannot realise it.
+            UnknownOption: An option does not exist.
+
+        Example:
+            >>> world = World.from_mjcf(
+            ...     "<mujoco><worldbody><body name='pole'><joint name='hinge' axis='0 1 0'/>"
+            ...     "<geom type='capsule' size='0.02' fromto='0 0 0 0 0 1'/></body></worldbody>"
+            ...     "</mujoco>"
+            ... )
+            >>> world.reset(seed=0)
+            >>> print(world.do({"pole.mass": 2.0}))
+            pole.mass = 2, engine reports 2
+        """
+        return cls(
+            ModelTask(source, **options),
+            backend=backend,
+            frame_skip=frame_skip,
+            max_episode_length=max_episode_length,
+            variables_space=variables_space,
+        )
+
+    @classmethod
+    def from_urdf(cls, source: Any, *, fixed_base: bool = True, **options: Any) -> Self:
+        """Make a world of a URDF model; see ``from_mjcf``.
+
+        Args:
+            source: A path or URDF text.
+            fixed_base: Whether the root link is fixed to the world.
+            options: Of ``from_mjcf``.
+        """
+        return cls.from_mjcf(source, fixed_base=fixed_base, **options)
 
     _standing: Plan = Plan()
     _course: Course = Course(())

@@ -11,6 +11,7 @@ from scm_world.tasks.building import Building
 from scm_world.tasks.conventions import CONVENTIONS, Conventions, conventions
 from scm_world.tasks.creative_stacked_blocks import CreativeStackedBlocks
 from scm_world.tasks.general import General
+from scm_world.tasks.model import ModelTask, model_task
 from scm_world.tasks.observed import HEAD, TIME, Observed
 from scm_world.tasks.pick_and_place import PickAndPlace
 from scm_world.tasks.picking import Picking
@@ -94,19 +95,19 @@ def tasks() -> dict[str, type[Task]]:
 
 
 def make_task(name: str, **options: Any) -> Task:
-    """Create a registered task.
+    """Create a registered task, or that of a model.
 
     Args:
-        name: One of ``tasks()``.
+        name: One of ``tasks()``, a path to an MJCF or URDF file, or ``"module:function"`` for a
+            function that gives a task.
         options: Arguments of its constructor.
 
     Raises:
         UnknownOption: There is no such task.
     """
-    try:
-        task = tasks()[name]
-    except KeyError:
-        raise UnknownOption("task", name, tasks()) from None
+    task = tasks().get(name)
+    if task is None:
+        return model_task(name, options, tasks)
     return task(**options)
 
 
@@ -120,6 +121,7 @@ __all__ = [
     "Conventions",
     "CreativeStackedBlocks",
     "General",
+    "ModelTask",
     "Observed",
     "PickAndPlace",
     "Picking",

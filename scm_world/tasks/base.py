@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world.backends import Backend
 from scm_world.entities import Composition
 from scm_world.errors import UnknownOption
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
@@ -92,6 +93,14 @@ class Task(ABC):
     @abstractmethod
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
         """Declare all variables, and say what they mean to an engine."""
+
+    def on(self, backend: Backend) -> Self:
+        """Give the same task as far as a backend can realise it."""
+        return self
+
+    def refusal(self, name: str) -> str | None:
+        """Say why something of this name is no variable, where there is a reason."""
+        return None
 
     def arrange(self, values: Values) -> Hashable:
         """Say what there is, given the variables of ``decided_by``."""

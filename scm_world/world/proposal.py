@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world._types import Value
-from scm_world.errors import ConflictingTargets, InterventionError, OutOfBounds, raise_all
+from scm_world.errors import (
+    ConflictingTargets,
+    InterventionError,
+    NotIntervenable,
+    OutOfBounds,
+    UnknownVariable,
+    raise_all,
+)
 from scm_world.graph import SCM, flatten
 from scm_world.models import State
 from scm_world.variables import Draw, Hard, Intervention, Natural, Null
@@ -98,7 +105,9 @@ def accept(
                 raise ConflictingTargets((accepted[target][0], name), target)
             accepted[target] = (name, act)
         except InterventionError as problem:
-            problems.append(problem)
+            reason = instant.declaration.task.refusal(name)
+            known = reason is None or not isinstance(problem, UnknownVariable)
+            problems.append(problem if known else NotIntervenable(name, reason))
     return accepted, problems
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +11,9 @@ from scm_world._types import Value, Values
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import Moment
-from scm_world.models import State
+from scm_world.models import Model, State
 from scm_world.scene.feasibility import TOLERANCE
-from scm_world.tasks import Task, make_task, tasks
+from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Measured, Subset
 from scm_world.variables.checks import check_bounds, check_subset
 from scm_world.variables.subsets import AnyRegion
@@ -85,6 +86,8 @@ def the_task(task: Any) -> Task:
         return task
     if isinstance(task, str):
         return make_task(task)
+    if isinstance(task, Model | PathLike) or type(task).__name__ in ("MjSpec", "MjModel"):
+        return ModelTask(task)
     made = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
     raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {made}"))
 

@@ -77,7 +77,8 @@ class World(Stepped):
         variables_space: AnyRegion | None = None,
     ) -> None:
         self.variables_space = as_region("variables_space", variables_space)
-        kind = task.task if isinstance(task, Family) else the_task(task)
+        self.backend = the_backend(backend)
+        kind = task.task if isinstance(task, Family) else the_task(task).on(self.backend)
         self.options = Options.checked(
             kind,
             preset=preset,
@@ -87,7 +88,6 @@ class World(Stepped):
             conventions_name=conventions,
         )
         self.family = as_family(task if isinstance(task, Family) else kind, self.options)
-        self.backend = the_backend(backend)
         self._started = False
         self.noise, self.episode = Noise(0), 0
         self.version = 0  # counts changes of anything but what physics moves

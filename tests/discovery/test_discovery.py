@@ -13,7 +13,7 @@ import pytest
 from scm_world.discovery import discover, score
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.tasks import Pushing, Task
+from scm_world.tasks import Pushing, TriFingerTask
 from scm_world.tasks.base import Observed
 from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Variable
 from scm_world.world import World
@@ -173,7 +173,7 @@ def test_empty_graphs_agree() -> None:
 def test_custom_tasks_can_be_discovered() -> None:
     """A user's own task is a world like any other."""
 
-    class Heavy(Task):
+    class Heavy(TriFingerTask):
         name = "heavy"
         seconds = 1.0
 

@@ -1,0 +1,378 @@
+"""Any model as a task: variables and their graph follow from its tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Self, final
+
+import numpy as np
+
+from scm_world.backends import Backend, read_model
+from scm_world.entities import Clock, Composition
+from scm_world.errors import ModelError, UnknownOption, nearest
+from scm_world.models import Model, ParameterKey, Readout, Row
+from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.observed import Observed
+from scm_world.tasks.rewards import SUCCESS
+from scm_world.variables import (
+    Action,
+    Box,
+    Derived,
+    Exogenous,
+    Function,
+    Integers,
+    Linear,
+    Measured,
+    Parent,
+    Rotations,
+    Variable,
+)
+
+CONTROL_DT = 0.02
+"""Length of a control step where none is asked for [s], to the next whole physics step."""
+
+REWARD, TERMINATED = "reward", "terminated"
+START = "start"
+"""What is drawn for the beginning of an episode is ``"<state>.start"``."""
+
+_OVERRIDES = ("a", "b", "bounds", "default", "distribution", "doc")
+
+
+def same_value(value: Any) -> Any:
+    """Give the value itself."""
+    return value
+
+
+@final
+class ModelComposition(Composition):
+    """What the variables of a model mean to an engine: rows of its tables.
+
+    Args:
+        model: The system.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+
+    def structure(self, values: Mapping[str, Any]) -> Model:
+        """Give the model: it is compiled once."""
+        return self._model
+
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        return {row.name: row.key for row in self._model.parameters}
+
+    def slices(self) -> Mapping[str, slice]:
+        """Say where each state stands in the state vector."""
+        return self._model.layout.slices
+
+    def timestep(self, values: Mapping[str, Any]) -> float:
+        """Give the physics step [s], which is a parameter where it is exposed."""
+        return float(values.get("timestep", self._model.timestep))
+
+
+class ModelTask(Task):
+    """A model from a file, and what counts in it.
+
+    Every argument can also be an attribute of a class of your own, so that a task is a short
+    declaration::
+
+        class SwingUp(ModelTask):
+            model = "cartpole.xml"
+            seconds = 10.0
+            control_dt = 0.02
+            spaces = {"pole.mass": {"a": Box(0.05, 0.1), "b": Box(0.1, 0.3)}}
+            reward = (upright, "hinge.position")
+
+    Variables and edges are generated from the tables of the model: parameters, states and inputs
+    of a kinematic tree act on the states of that tree one control step later, those of another
+    one where the two are coupled, or while they touch.
+
+    Args:
+        model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel``, or a
+            ``Model`` that was read before.
+        name: Of the task; that of the model if None.
+        expose: Patterns of the parameters that become variables (``"*.mass"``); all that are safe
+            to change if None.
+        spaces: For each variable a dictionary with ``a``, ``b``, ``bounds`` (spaces, or a pair of
+            ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
+        ties: Derived variables that decide parameters, such as a density that decides masses, and
+            the variables that they follow. One with the name of a parameter takes its place.
+        outcomes: Names of readouts (``"tip.position"`` of a site, ``"torso.orientation"`` of a
+            body, ``"gyro.value"`` of a sensor), or ``Measured`` variables with a mechanism.
+        reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
+            parents: ``(upright, "hinge.position")``. A parent may be a ``Parent`` with lag 1.
+        success: The same for ``"success"``, 0 or 1.
+        terminated: The same for ``"terminated"``: whether the episode ends here.
+        start: Where episodes begin: for states a value, or a space or distribution to draw from.
+        observe: Names of what a policy observes; all states if None.
+        seconds: Length of an episode [s].
+        control_dt: Length of a control step [s], a multiple of the physics step.
+        frame_skip: The same in physics steps.
+        fixed_base: Whether the root link of a URDF is fixed to the world.
+
+    Raises:
+        ModelError: The file cannot be read as a model, or a variable is declared wrongly.
+        UnknownOption: An argument or a name does not exist.
+    """
+
+    action_modes = ("controls",)
+    presets = ("model",)
+
+    model: Any = None
+    expose: Iterable[str] | str | None = None
+    spaces: Mapping[str, Mapping[str, Any]] = {}  # a constant
+    ties: Iterable[Variable] = ()
+    outcomes: Iterable[str | Measured] = ()
+    reward: Any = None
+    success: Any = None
+    terminated: Any = None
+    start: Mapping[str, Any] = {}  # a constant
+    observe: Iterable[str] | None = None
+    seconds: float = 10.0  # type: ignore[assignment] # a property of the base
+    control_dt: float | None = None
+    frame_skip: int | None = None  # type: ignore[assignment] # filled in below
+    fixed_base: bool = True
+
+    def __init__(self, model: Any = None, **settings: Any) -> None:
+        allowed = [n for n in ModelTask.__annotations__ if n != "model"] + ["name"]
+        for option, value in settings.items():
+            if option not in allowed:
+                raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
+            if value is not None:
+                setattr(self, option, value)
+        source = self.model if model is None else model
+        if source is None:
+            raise UnknownOption("model", None, ("a path, XML text, an MjSpec or an MjModel",))
+        self.system = self._read(source)
+        self.name = getattr(self, "name", self.system.name)
+        self.time_unit = self.system.timestep
+        self.frame_skip = self._steps()
+        self._check_names()
+        self.weights = {REWARD: 1.0} if self.reward is not None else {}
+
+    def _read(self, source: Any) -> Model:
+        if isinstance(source, Model):
+            return source
+        readouts = tuple(name for name in self.outcomes if isinstance(name, str))
+        return read_model(source, expose=self.expose, readouts=readouts, fixed_base=self.fixed_base)
+
+    def _steps(self) -> int:
+        """Give the length of a control step in physics steps."""
+        if self.frame_skip is not None:
+            return self.frame_skip
+        wanted = CONTROL_DT if self.control_dt is None else self.control_dt
+        steps = wanted / self.time_unit if wanted > 0.0 else 0.0
+        if self.control_dt is None:
+            return max(1, math.ceil(steps - 1e-9))
+        if steps < 1.0 - 1e-9 or abs(steps - round(steps)) > 1e-6:
+            allowed = f"a multiple of the physics step, {self.time_unit:g} s"
+            raise UnknownOption("control_dt", self.control_dt, (allowed,))
+        return round(steps)
+
+    def _check_names(self) -> None:
+        rows = (*self.system.parameters, *self.system.states, *self.system.inputs)
+        known = [row.name for row in rows] + [variable.name for variable in self.ties]
+        for option, names in (("spaces", self.spaces), ("start", self.start)):
+            for name in names:
+                allowed = known if option == "spaces" else self.system.layout.slices
+                if name not in allowed:
+                    raise UnknownOption(option, name, allowed)
+        for name, given in self.spaces.items():
+            for what in given:
+                if what not in _OVERRIDES:
+                    raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
+
+    def on(self, backend: Backend) -> Self:
+        """Give the same task with the parameters that a backend has."""
+        kept = tuple(
+            row for row in self.system.parameters if backend.supports(self.system, row.key)
+        )
+        if len(kept) == len(self.system.parameters):
+            return self
+        gone = {row.name for row in self.system.parameters} - {row.name for row in kept}
+        reasons = tuple((name, f"is no parameter of {backend.name}") for name in sorted(gone))
+        other = self.at(self.plan, self.conventions, self.absent)
+        refused = (*self.system.refused, *reasons)
+        other.system = dataclasses.replace(self.system, parameters=kept, refused=refused)
+        other.spaces = {name: given for name, given in self.spaces.items() if name not in gone}
+        return other
+
+    def refusal(self, name: str) -> str | None:
+        """Say why something of this name cannot be set, if the model has it."""
+        return dict(self.system.refused).get(name)
+
+    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+        """Declare what the tables have, and what counts."""
+        system, ties = self.system, {variable.name: variable for variable in self.ties}
+        parameters: list[Variable] = [
+            ties.pop(row.name, None) or self._parameter(row) for row in system.parameters
+        ]
+        actions = [self._action(row) for row in system.inputs]
+        causes = _Causes(system)
+        states: list[Variable] = []
+        for row in system.states:
+            states += self._state(row, causes.of(row.tree))
+        clock = next(iter(Clock(timing.steps, timing.control_period).variables()))
+        readouts = [_readout(row) for row in system.readouts]
+        own = [one for one in self.outcomes if not isinstance(one, str)]
+        counted = [
+            _declared(name, getattr(self, name))
+            for name in (REWARD, SUCCESS, TERMINATED)
+            if getattr(self, name) is not None
+        ]
+        rest = list(ties.values())
+        return ModelComposition(system), [
+            *rest, *parameters, *actions, *states, clock, *readouts, *own, *counted,
+        ]  # fmt: skip
+
+    def _fields(self, row: Row, kind: str = "real") -> dict[str, Any]:
+        """Give what all kinds of declarations have in common, with what was asked for."""
+        given = dict(self.spaces.get(row.name, {}))
+        low, high = (np.broadcast_to(end, row.shape) for end in (row.low, row.high))
+        bounded = bool(np.isfinite(low).any() or np.isfinite(high).any())
+        bounds = Rotations() if kind == "rotation" else Box(row.low, row.high) if bounded else None
+        fields: dict[str, Any] = {
+            "name": row.name,
+            "unit": row.unit,
+            "shape": row.shape,
+            "doc": given.get("doc", row.doc),
+            "bounds": _space(given.get("bounds", bounds)),
+            "a": _space(given.get("a")),
+            "b": _space(given.get("b")),
+        }
+        return fields
+
+    def _parameter(self, row: Any) -> Exogenous:
+        given = self.spaces.get(row.name, {})
+        return Exogenous(
+            **self._fields(row, row.kind),
+            default=_spread(given.get("default", row.default), row.shape),
+            distribution=_space(given.get("distribution")),
+        )
+
+    def _action(self, row: Row) -> Action:
+        fields = self._fields(row)
+        if fields["bounds"] is None:  # an actuator without a range
+            fields["bounds"] = Box(-1.0, 1.0)
+        return Action(**fields)
+
+    def _state(self, row: Any, causes: tuple[Parent, ...]) -> Iterable[Variable]:
+        """Declare a state, and the variable that its beginning is drawn as, if it is."""
+        given, begin = self.spaces.get(row.name, {}), self.start.get(row.name)
+        default = given.get("default", row.default)
+        fields = self._fields(row, row.kind)
+        drawn = begin is not None and not isinstance(begin, int | float | list | tuple | np.ndarray)
+        if begin is not None and not drawn:
+            default = begin
+        default, extra = _spread(default, row.shape), {}
+        if drawn:
+            name = f"{row.name}.{START}"
+            about = f"Where {row.name} is at the beginning of an episode."
+            beginning = {**fields, "name": name, "doc": about}
+            yield Exogenous(**beginning, default=default, distribution=begin)
+            causes = (*causes, Parent(name, 0, "set"))
+            extra = {"start": Function(same_value)}
+        yield Measured(**fields, default=default, parents=causes, settable_state=True, **extra)
+
+    def observed(self) -> Iterable[Observed]:
+        """List what a policy observes."""
+        names = self.system.layout.names if self.observe is None else tuple(self.observe)
+        for name in names:
+            yield Observed(name, (-np.inf, np.inf))
+
+
+class _Causes:
+    """What acts on the states of each tree, as edges of lag 1.
+
+    Args:
+        model: With the tables.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._rows = [
+            *(row for row in model.parameters if not row.visual),
+            *model.states,
+            *model.inputs,
+        ]
+        self._found: dict[int, tuple[Parent, ...]] = {}
+
+    def of(self, tree: int) -> tuple[Parent, ...]:
+        """Give the causes of the states of a tree."""
+        if tree not in self._found:
+            self._found[tree] = tuple(
+                Parent(row.name, 1, None if tree in row.always else "contact")
+                for row in self._rows
+                if tree in row.always or tree in row.contact
+            )
+        return self._found[tree]
+
+
+def _spread(value: Any, shape: tuple[int, ...]) -> Any:
+    """Give a number, or the numbers of all components."""
+    numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
+    return tuple(numbers.ravel().tolist()) if shape else float(numbers)
+
+
+def _space(given: Any) -> Any:
+    """Read a space: a pair of ends stands for a box."""
+    if isinstance(given, tuple | list) and len(given) == 2:
+        return Box(*(tuple(end) if isinstance(end, list) else end for end in given))
+    return given
+
+
+def _readout(row: Readout) -> Measured:
+    return Measured(
+        name=row.name,
+        unit=row.unit,
+        shape=row.shape,
+        parents=row.parents,
+        mechanism=Function(row.function),
+        doc=row.doc,
+    )
+
+
+def _declared(name: str, given: Any) -> Variable:
+    """Declare the reward, success or the end from a variable, or a function and its parents.
+
+    Raises:
+        ModelError: It is neither.
+    """
+    if isinstance(given, Measured | Derived) and given.name == name:
+        return given
+    function, *parents = given if isinstance(given, tuple | list) else (given,)
+    if not (callable(function) or isinstance(function, Function | Linear)) or not parents:
+        raise ModelError(
+            [
+                f"{name}={given!r} is no declaration: give a function and the names of its "
+                f"parents, ({name}_of, 'hinge.position'), or sw.Measured(name={name!r}, …)"
+            ]
+        )
+    whole: dict[str, Any] = {} if name == REWARD else {"dtype": "integer", "bounds": Integers(0, 1)}
+    return Measured(name=name, parents=tuple(parents), mechanism=function, **whole)
+
+
+def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iterable[str]]) -> Task:
+    """Make the task of a file or of ``"module:factory"``.
+
+    Args:
+        source: A path that ends in .xml, .mjcf or .urdf, or a module (or Python file) and a
+            function in it that gives a task or a model.
+        options: Of ``ModelTask``, or arguments of the function.
+        known: Names the registered tasks, for the message.
+
+    Raises:
+        UnknownOption: It is none of these.
+    """
+    from scm_world.tasks.factories import load_factory
+
+    if str(source).endswith((".xml", ".mjcf", ".urdf")):
+        return ModelTask(source, **options)
+    if ":" in source:
+        made = load_factory(source)(**options)
+        return made if isinstance(made, Task) else ModelTask(made)
+    hint = nearest(str(source), known())
+    choices = (*known(), "a file.xml or file.urdf", "module:function")
+    raise UnknownOption("task", source, choices if hint is None else (hint, *choices))
