@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -57,16 +58,17 @@ class Commands(TyperGroup):
 app = typer.Typer(
     cls=Commands,
     name="scm-world",
-    help="A block-building robot, written down as a structural causal model.",
+    help="Structural causal models of physical systems: any MJCF or URDF model, or nine tasks "
+    "of a block-building robot.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
 
 
-def is_model(subject: str) -> bool:
-    """Tell a family with a size, or a file, from the name of a task."""
-    return ":" in subject or subject.endswith(".json")
+def is_scm(subject: str) -> bool:
+    """Tell a family with a size (er2:20), or the file of an SCM, from a world."""
+    return re.search(r":\d+$", subject) is not None or subject.endswith(".json")
 
 
 def _version(wanted: bool) -> None:
@@ -84,7 +86,7 @@ def root(
         typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
     ] = False,
 ) -> None:
-    """A block-building robot, written down as a structural causal model."""
+    """Structural causal models of physical systems."""
 
 
 @app.command()
@@ -93,14 +95,15 @@ def discover(
         str,
         typer.Argument(
             metavar="SUBJECT",
-            help="A task; with --learner also a family with a size (er2:20, sf2:50, tanh4:100), "
+            help="A task, a model.xml or model.urdf, or module:function; with --learner also a "
+            "family with a size (er2:20, sf2:50, tanh4:100), "
             "the JSON file of a model, or several with commas between them.",
         ),
     ],
     backend: Backend = "mujoco",
     probes: Annotated[int, typer.Option(min=1, help="How many states to experiment in.")] = 32,
     seed: Seed = 0,
-    preset: Preset = "fast",
+    preset: Preset = None,
     out: Out = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if the SHD is not 0.")] = False,
     option: Arguments = None,
@@ -148,7 +151,7 @@ def discover(
     written, on any --engine. After an interruption the same command goes on. Ctrl-C gives the
     result so far (exit code 130).
     """
-    if learner is None and not is_model(task):
+    if learner is None and not is_scm(task):
         from scm_world.cli.discovery import Options, run
 
         Work(engine, workers, address).refuse_others("discover without --learner")
@@ -177,12 +180,14 @@ for _command in (evaluate, explain, collect, sweep, plan, reproduce, train, clon
 
 @app.command()
 def verify(
-    task: Annotated[str, typer.Argument(help="Name of a task, or 'all'.")],
+    task: Annotated[
+        str, typer.Argument(help="A task, a model.xml or .urdf, module:function, or 'all'.")
+    ],
     backend: Backend = "mujoco",
     both: Annotated[bool, typer.Option("--both", help="On MuJoCo and Bullet; compare.")] = False,
     probes: Annotated[int, typer.Option(min=1, help="How many states to try at most.")] = 200,
     seed: Seed = 0,
-    preset: Preset = "fast",
+    preset: Preset = None,
     out: Out = None,
     option: Arguments = None,
 ) -> None:
@@ -203,9 +208,12 @@ def graph(
     format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.TABLE,
     out: Annotated[Path | None, typer.Option(help="File to write to.")] = None,
     action_mode: Annotated[
-        str,
-        typer.Option(help="joint_positions, joint_torques or end_effector_positions."),
-    ] = "joint_positions",
+        str | None,
+        typer.Option(
+            help="Of the robot: joint_positions, joint_torques or end_effector_positions.",
+            show_default="joint_positions",
+        ),
+    ] = None,
     option: Arguments = None,
 ) -> None:
     """Show the declared causal graph of a task."""
@@ -221,7 +229,7 @@ def do(
     backend: Backend = "mujoco",
     steps: Annotated[int, typer.Option(min=0, help="Control steps to run afterwards.")] = 25,
     seed: Seed = 0,
-    preset: Preset = "fast",
+    preset: Preset = None,
     space: Annotated[
         str | None, typer.Option(help="Refuse values outside this space: A, B or 'A|B'.")
     ] = None,
@@ -260,7 +268,7 @@ def effect(
     policy: Policy = "random",
     backend: Backend = "mujoco",
     seed: Seed = 0,
-    preset: Preset = "fast",
+    preset: Preset = None,
     out: Out = None,
     option: Arguments = None,
 ) -> None:
@@ -290,7 +298,7 @@ def counterfactual(
     policy: Policy = "random",
     backend: Backend = "mujoco",
     seed: Seed = 0,
-    preset: Preset = "fast",
+    preset: Preset = None,
     out: Out = None,
     option: Arguments = None,
 ) -> None:
@@ -303,7 +311,9 @@ def counterfactual(
 
 @app.command()
 def variables(
-    task: Annotated[str, typer.Argument(help="Name of a task, or 'all'.")],
+    task: Annotated[
+        str, typer.Argument(help="A task, a model.xml or .urdf, module:function, or 'all'.")
+    ],
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Write the tables of all tasks as Markdown.")
     ] = False,

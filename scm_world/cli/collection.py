@@ -12,6 +12,7 @@ import numpy as np
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import console, table, written
 from scm_world.cli.questions import Circumstances, read_outcome, shown_episodes
+from scm_world.cli.tasks import tag
 from scm_world.cli.working import Work
 from scm_world.discovery.data import Dataset, Design, collect, default_causes
 from scm_world.discovery.data.folders import SIDECAR
@@ -81,7 +82,9 @@ def run(options: Options, *, out: Location | None) -> int:
         return INTERRUPTED
     finally:
         world.close()
-    terminal.print(_summary(found, f"{where.task} on {found.about['engine']}, seed {where.seed}"))
+    terminal.print(
+        _summary(found, f"{tag(where.task)} on {found.about['engine']}, seed {where.seed}")
+    )
     shards = list[Location](folder.glob("shard-*.*"))
     written(terminal, folder / SIDECAR, *sorted(shards, key=str)[:1])
     return 0

@@ -18,7 +18,7 @@ from scm_world.cli.console import (
     table,
     written,
 )
-from scm_world.cli.tasks import build, suffix
+from scm_world.cli.tasks import build, suffix, tag
 from scm_world.discovery import DiscoveryReport, discover
 from scm_world.discovery.names import by_entity
 from scm_world.discovery.plots import draw_graphs
@@ -51,7 +51,7 @@ class Options:
 
     task: str
     backend: str
-    preset: str
+    preset: str | None
     probes: int
     seed: int
     arguments: tuple[str, ...] = ()
@@ -60,7 +60,7 @@ class Options:
 def run(options: Options, *, out: Location | None, strict: bool) -> int:
     """Discover, print, write; return the exit code."""
     about = f"{options.backend}-seed{options.seed}{suffix(options.arguments)}"
-    folder = out or RESULTS / f"discover-{options.task}-{about}"
+    folder = out or RESULTS / f"discover-{tag(options.task)}-{about}"
     check_writable(folder, folder=True)
     task = build(options.task, options.arguments)
     world = World(task, backend=options.backend, preset=options.preset)

@@ -166,7 +166,7 @@ def view(
     steps: int,
     sensor_noise: float,
     backend: str,
-    preset: str,
+    preset: str | None,
 ) -> TaskView:
     """Put together how tasks are looked at.
 
@@ -184,5 +184,5 @@ def view(
         policy=None if policy == "still" else policy,
         steps=steps,
         sensor_noise=sensor_noise,
-        options={"backend": backend, "preset": preset},
+        options={"backend": backend, **({"preset": preset} if preset else {})},
     )

@@ -11,7 +11,7 @@ import typer
 from rich.text import Text
 
 from scm_world.cli.console import PAGE, check_writable, console, keep_whole, show, table, written
-from scm_world.cli.tasks import build, suffix
+from scm_world.cli.tasks import build, suffix, tag
 from scm_world.discovery.names import braces, by_entity
 from scm_world.graph import SCM, to_json
 from scm_world.graph.exchange import causal_graph, space_lines, to_html, write_graph
@@ -30,12 +30,12 @@ def run(
     task: str,
     format_: str,
     out: Path | None,
-    action_mode: str,
+    action_mode: str | None,
     arguments: Sequence[str] = (),
 ) -> None:
     """Write the declared graph of a task."""
     if format_ == "png" and out is None:
-        out = Path(f"{task}{suffix(arguments)}-graph.png")
+        out = Path(f"{tag(task)}{suffix(arguments)}-graph.png")
     if out is not None:
         check_writable(out, folder=False)
     world = World(build(task, arguments), backend="fake", action_mode=action_mode)
@@ -46,7 +46,7 @@ def run(
     if format_ == "png":
         from scm_world.discovery.plots import draw_model
 
-        draw_model(world.model, out, title=f"{task}, as it is declared")
+        draw_model(world.model, out, title=f"{tag(task)}, as it is declared")
     else:
         out.write_text(_text(world, format_), encoding="utf-8")
     written(console(stderr=True), out)

@@ -9,11 +9,12 @@ from typing import Any, final
 from scm_world._types import Floats, Value, Values
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import PAGE, RESULTS, check_writable, console
-from scm_world.cli.tasks import build, suffix
+from scm_world.cli.tasks import build, suffix, tag
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import gap
+from scm_world.queries.stillness import still
 from scm_world.scene import Scene
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Audit, World
@@ -36,7 +37,7 @@ class Options:
 
     task: str
     backend: str
-    preset: str
+    preset: str | None
     seed: int
     steps: int
     space: str | None
@@ -114,7 +115,7 @@ def run(
         raise UnknownOption("space", options.space, SPACES)
     request = parse_assignments(assignments)
     about = f"{options.backend}-seed{options.seed}{suffix(options.arguments)}"
-    folder = out or RESULTS / f"do-{options.task}-{about}"
+    folder = out or RESULTS / f"do-{tag(options.task)}-{about}"
     check_writable(folder, folder=True)
     outcome = paired(request, options)
     save(outcome, folder)
@@ -134,7 +135,7 @@ def paired(request: dict[str, Any], options: Options) -> Outcome:
     try:
         world.reset(seed=options.seed)
         start, before, scene = world.snapshot(), world.values(), world.scene()
-        hold = before["joint_positions"]
+        hold = still(world)
         space: Any = options.space
         audit = world.do(request, space=space)
         at_once, models = world.values(), (world.model,)

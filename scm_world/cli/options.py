@@ -26,16 +26,25 @@ class Format(StrEnum):
     CSV = "csv"
 
 
-Task = Annotated[str, typer.Argument(help="Name of a task; see 'scm-world list'.")]
+Task = Annotated[
+    str,
+    typer.Argument(
+        help="A task (see 'scm-world list'), a model.xml or model.urdf, or module:function."
+    ),
+]
 Backend = Annotated[str, typer.Option(help="Physics engine: mujoco, bullet or fake.")]
-Preset = Annotated[str, typer.Option(help="Numerical settings: fast or precise.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(help="Numerical settings of the robot: fast or precise.", show_default="fast"),
+]
 Seed = Annotated[int, typer.Option(min=0, help="Of every random choice.")]
 Arguments = Annotated[
     list[str] | None,
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="Argument of the task, such as num_of_levels=2; give it once for each argument.",
+        help="Argument of the task, such as num_of_levels=2 or, of a model, control_dt=0.01; "
+        "give it once for each argument.",
     ),
 ]
 
@@ -72,7 +81,10 @@ Acts = Annotated[
 ]
 Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
 Policy = Annotated[
-    str, typer.Option(help="random, grasp, still, or sweep: the fingertips go to the middle.")
+    str,
+    typer.Option(
+        help="random, still; of the robot also grasp, or sweep: the fingertips go to the middle."
+    ),
 ]
 Observations = Annotated[
     str | None,

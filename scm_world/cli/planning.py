@@ -51,7 +51,7 @@ def plan(
         str | None, typer.Option(help="Engine to plan with; that of the world by default.")
     ] = None,
     seed: Seed = 0,
-    preset: Preset = "fast",
+    preset: Preset = None,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Of the engine; as many as there are cores.")
     ] = None,
@@ -65,10 +65,10 @@ def plan(
     """
     from scm_world.cli.assignments import parse_assignments
     from scm_world.cli.console import RESULTS, check_writable
-    from scm_world.cli.tasks import suffix
+    from scm_world.cli.tasks import suffix, tag
 
     arguments = tuple(option or ())
-    folder = out or RESULTS / f"plan-{task}-{backend}-seed{seed}{suffix(arguments)}"
+    folder = out or RESULTS / f"plan-{tag(task)}-{backend}-seed{seed}{suffix(arguments)}"
     check_writable(folder, folder=True)
     believed, happens = (parse_assignments(texts or ()) for texts in (do, given))
     numbers = {"samples": samples, "horizon": horizon, "iterations": iterations, "every": every}
@@ -97,7 +97,7 @@ class Run:
 
     task: str
     backend: str
-    preset: str
+    preset: str | None
     seed: int
     steps: int | None
     planner: dict[str, Any]

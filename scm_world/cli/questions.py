@@ -14,7 +14,7 @@ import numpy as np
 
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import RESULTS, check_writable, console, show, staged, table, written
-from scm_world.cli.tasks import build, suffix
+from scm_world.cli.tasks import build, suffix, tag
 from scm_world.errors import UnknownOption
 from scm_world.output.locations import Location
 from scm_world.queries import (
@@ -49,7 +49,7 @@ class Circumstances:
 
     task: str
     backend: str
-    preset: str
+    preset: str | None
     seed: int
     steps: int
     policy: str
@@ -72,7 +72,7 @@ class Circumstances:
     def folder(self, question: str) -> Path:
         """Name the folder of the results."""
         about = f"{self.backend}-seed{self.seed}{suffix(self.arguments)}"
-        return RESULTS / f"{question}-{self.task}-{about}"
+        return RESULTS / f"{question}-{tag(self.task)}-{about}"
 
 
 def read_outcome(text: str, how: str) -> Outcome:
@@ -122,7 +122,7 @@ def ask_effect(
     finally:
         world.close()
     terminal = console()
-    terminal.print(_effect_table(effect, f"{where.task} on {engine}, seed {where.seed}"))
+    terminal.print(_effect_table(effect, f"{tag(where.task)} on {engine}, seed {where.seed}"))
     with staged(folder) as draft:
         (draft / "effect.json").write_text(effect.to_json() + "\n")
     written(terminal, folder / "effect.json")
@@ -191,7 +191,7 @@ def ask_counterfactual(
 
 
 def _difference_table(apart: Difference, where: Circumstances, at: int, engine: str) -> Any:
-    title = f"{where.task} on {engine}, seed {where.seed}: otherwise from control step {at} on"
+    title = f"{tag(where.task)} on {engine}, seed {where.seed}: otherwise from control step {at} on"
     made = table("variable", "differs from", "most, and when", "at the end", title=title)
     for name, found in apart.variables.items():
         most = f"{show(found.largest)} at {found.at}"

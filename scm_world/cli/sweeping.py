@@ -13,6 +13,7 @@ from scm_world.cli.assignments import parse_assignments, parse_value
 from scm_world.cli.collection import check_files, kept, read_measure
 from scm_world.cli.console import console, show, table, written
 from scm_world.cli.questions import Circumstances, shown_episodes
+from scm_world.cli.tasks import tag
 from scm_world.cli.working import Work
 from scm_world.discovery.data import Levels, Swept, sweep
 from scm_world.discovery.data.levels import check_points, points_of
@@ -73,7 +74,7 @@ def run(options: Options, *, out: Location | None) -> int:
     finally:
         world.close()
         plain.close()
-    about = f"{where.task} on {found.data.about['engine']}, seed {where.seed}"
+    about = f"{tag(where.task)} on {found.data.about['engine']}, seed {where.seed}"
     terminal.print(_table(found, about))
     written(terminal, folder / TABLE, folder / SUMMARY)
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import typer
@@ -12,6 +13,7 @@ import typer
 from scm_world.cli.assignments import parse_assignments
 from scm_world.errors import UnknownOption
 from scm_world.tasks import TASKS, Task, make_task
+from scm_world.tasks.model import FILES
 
 _HINT = "'--option'"
 _WORDS = {"true": True, "false": False}
@@ -34,7 +36,8 @@ def build(name: str, arguments: Sequence[str] = ()) -> Task:
         >>> build("towers", ["number_of_blocks_in_tower=1,1,2"]).tools()
         ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
     """
-    given = {key: _value(key, value) for key, value in parse_assignments(arguments, _HINT).items()}
+    read = parse_assignments(arguments, _HINT)
+    given = {key: _value(key, value) if name in TASKS else value for key, value in read.items()}
     known = tuple(_arguments(TASKS[name])) if name in TASKS else ()
     for key in given if known else ():
         if key not in known:
@@ -45,6 +48,19 @@ def build(name: str, arguments: Sequence[str] = ()) -> Task:
         if isinstance(error, UnknownOption):
             raise
         raise typer.BadParameter(f"{', '.join(arguments)}: {error}", param_hint=_HINT) from None
+
+
+def tag(name: str) -> str:
+    """Shorten the name of a task for titles and folders: of a file, its stem.
+
+    Example:
+        >>> tag("pushing"), tag("models/cartpole.xml"), tag("my.worlds:cartpole")
+        ('pushing', 'cartpole', 'my.worlds-cartpole')
+    """
+    home, colon, function = name.rpartition(":")
+    if colon:
+        return f"{Path(home).stem if home.endswith('.py') else home}-{function}"
+    return Path(name).stem if name.endswith(FILES) else name
 
 
 def suffix(arguments: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from scm_world.cli.console import RESULTS, check_writable, console, staged, table, written
 from scm_world.cli.discovery import INTERRUPTED, shown_progress
-from scm_world.cli.tasks import build, suffix
+from scm_world.cli.tasks import build, suffix, tag
 from scm_world.discovery.coverage import draw_verification
 from scm_world.output.locations import Location
 from scm_world.queries.agreement import Agreement
@@ -54,7 +54,7 @@ class Options:
     task: str
     backend: str
     both: bool
-    preset: str
+    preset: str | None
     probes: int
     seed: int
     arguments: tuple[str, ...] = ()
@@ -68,7 +68,7 @@ class Options:
 def run(options: Options, *, out: Location | None) -> int:
     """Verify, print, write; return the exit code."""
     about = f"{options.where}-seed{options.seed}{suffix(options.arguments)}"
-    folder = out or RESULTS / f"verify-{options.task}-{about}"
+    folder = out or RESULTS / f"verify-{tag(options.task)}-{about}"
     check_writable(folder, folder=True)
     every = options.task == ALL
     terminal, found = console(), list[Found]()
@@ -101,7 +101,7 @@ def _verified(task: str, arguments: tuple[str, ...], options: Options) -> Found:
                 made,
                 backend=options.backend,
                 preset=options.preset,
-                progress=bar(f"{task} on {options.backend}"),
+                progress=bar(f"{tag(task)} on {options.backend}"),
                 **common,
             )
             return found.model_copy(update=about)
@@ -109,7 +109,7 @@ def _verified(task: str, arguments: tuple[str, ...], options: Options) -> Found:
             made,
             backends=BOTH,
             preset=options.preset,
-            progress=lambda name: bar(f"{task}: {name}"),
+            progress=lambda name: bar(f"{tag(task)}: {name}"),
             **common,
         )
     reports = tuple(one.model_copy(update=about) for one in both.verifications)

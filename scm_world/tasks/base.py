@@ -52,6 +52,7 @@ class Task(ABC):
         presets: Numerical settings to choose from; the first is the default.
         time_unit: What ``frame_skip`` counts [s].
         frame_skip: Length of a control step, if none is asked for.
+        seconds: Length of an episode [s].
         weights: Weight of each reward term, by the name of its variable.
         terms: Reward terms that were asked for.
         decided_by: The shared variables that decide what there is.
@@ -70,6 +71,7 @@ class Task(ABC):
     presets: tuple[str, ...]
     time_unit: float
     frame_skip: int
+    seconds: Any
     weights: Mapping[str, float] = {}  # a constant
     terms: tuple[Measured, ...] = ()
     decided_by: ClassVar[tuple[str, ...]] = ()
@@ -84,11 +86,6 @@ class Task(ABC):
         task.given = dict(given)
         task.is_named = not args  # every argument has its name
         return task
-
-    @property
-    @abstractmethod
-    def seconds(self) -> float:
-        """Length of an episode [s]."""
 
     @abstractmethod
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:

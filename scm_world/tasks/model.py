@@ -34,6 +34,8 @@ CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
 
 REWARD, TERMINATED = "reward", "terminated"
+FILES = (".xml", ".mjcf", ".urdf")
+"""How the names of files end that are models."""
 START = "start"
 """What is drawn for the beginning of an episode is ``"<state>.start"``."""
 
@@ -131,7 +133,7 @@ class ModelTask(Task):
     terminated: Any = None
     start: Mapping[str, Any] = {}  # a constant
     observe: Iterable[str] | None = None
-    seconds: float = 10.0  # type: ignore[assignment] # a property of the base
+    seconds: float = 10.0
     control_dt: float | None = None
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
     fixed_base: bool = True
@@ -208,7 +210,8 @@ class ModelTask(Task):
         """Declare what the tables have, and what counts."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
         parameters: list[Variable] = [
-            ties.pop(row.name, None) or self._parameter(row) for row in system.parameters
+            ties.pop(row.name) if row.name in ties else self._parameter(row)
+            for row in system.parameters
         ]
         actions = [self._action(row) for row in system.inputs]
         causes = _Causes(system)
@@ -219,7 +222,7 @@ class ModelTask(Task):
         readouts = [_readout(row) for row in system.readouts]
         own = [one for one in self.outcomes if not isinstance(one, str)]
         counted = [
-            _declared(name, getattr(self, name))
+            declared(name, getattr(self, name))
             for name in (REWARD, SUCCESS, TERMINATED)
             if getattr(self, name) is not None
         ]
@@ -261,21 +264,14 @@ class ModelTask(Task):
 
     def _state(self, row: Any, causes: tuple[Parent, ...]) -> Iterable[Variable]:
         """Declare a state, and the variable that its beginning is drawn as, if it is."""
-        given, begin = self.spaces.get(row.name, {}), self.start.get(row.name)
-        default = given.get("default", row.default)
-        fields = self._fields(row, row.kind)
-        drawn = begin is not None and not isinstance(begin, int | float | list | tuple | np.ndarray)
-        if begin is not None and not drawn:
-            default = begin
-        default, extra = _spread(default, row.shape), {}
-        if drawn:
-            name = f"{row.name}.{START}"
-            about = f"Where {row.name} is at the beginning of an episode."
-            beginning = {**fields, "name": name, "doc": about}
-            yield Exogenous(**beginning, default=default, distribution=begin)
-            causes = (*causes, Parent(name, 0, "set"))
-            extra = {"start": Function(same_value)}
-        yield Measured(**fields, default=default, parents=causes, settable_state=True, **extra)
+        default = self.spaces.get(row.name, {}).get("default", row.default)
+        state = Measured(
+            **self._fields(row, row.kind),
+            default=_spread(default, row.shape),
+            parents=causes,
+            settable_state=True,
+        )
+        return beginning(state, self.start.get(row.name))
 
     def observed(self) -> Iterable[Observed]:
         """List what a policy observes."""
@@ -310,6 +306,36 @@ class _Causes:
         return self._found[tree]
 
 
+def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
+    """Say where a state is when an episode begins.
+
+    Args:
+        state: Its declaration.
+        begin: A value, or a space or distribution to draw from; the default stays if None.
+
+    Returns:
+        The state, and before it the variable that is drawn, if one is.
+    """
+    if begin is None:
+        return (state,)
+    if isinstance(begin, int | float | list | tuple | np.ndarray):
+        return (state.model_copy(update={"default": _spread(begin, state.shape)}),)
+    name = f"{state.name}.{START}"
+    drawn = Exogenous(
+        name=name,
+        unit=state.unit,
+        shape=state.shape,
+        dtype=state.dtype,
+        bounds=state.bounds,
+        default=0.0 if state.default is None else state.default,
+        distribution=begin,
+        doc=f"Where {state.name} is at the beginning of an episode.",
+    )
+    parents = (*state.parents, Parent(name, 0, "set"))
+    function = Function(same_value)
+    return drawn, state.model_copy(update={"parents": parents, "start": function})
+
+
 def _spread(value: Any, shape: tuple[int, ...]) -> Any:
     """Give a number, or the numbers of all components."""
     numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
@@ -334,7 +360,7 @@ def _readout(row: Readout) -> Measured:
     )
 
 
-def _declared(name: str, given: Any) -> Variable:
+def declared(name: str, given: Any) -> Variable:
     """Declare the reward, success or the end from a variable, or a function and its parents.
 
     Raises:
@@ -368,7 +394,7 @@ def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iter
     """
     from scm_world.tasks.factories import load_factory
 
-    if str(source).endswith((".xml", ".mjcf", ".urdf")):
+    if str(source).endswith(FILES):
         return ModelTask(source, **options)
     if ":" in source:
         made = load_factory(source)(**options)
