@@ -12,8 +12,15 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
 from scm_world._types import Floats, Integers
-from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    Structure,
+)
+from scm_world.models.state import State
 
 
 @final
@@ -22,8 +29,9 @@ class Contact:
     """One point where two bodies touch.
 
     Attributes:
-        bodies: Names of the two bodies: blocks, obstacles, ``"floor"``, ``"stage"`` or links of
-            the robot (the fingertip counts as link 3).
+        bodies: Names of the two bodies. Of a ``Model`` as in its file, ``"world"`` for what is
+            fixed to it. Of the TriFinger: blocks, obstacles, ``"floor"``, ``"stage"`` or links
+            of the robot (the fingertip counts as link 3).
         position: Of the point, shape (3,) [m].
         normal: Unit vector from the first body to the second, shape (3,).
         depth: How deep they intersect [m]; negative while they are apart.
@@ -85,6 +93,11 @@ class Backend(ABC):
     def version(self) -> str:
         """Version of the engine."""
 
+    @property
+    @abstractmethod
+    def structure(self) -> Structure:
+        """What was compiled: it says how large states and commands are."""
+
     @abstractmethod
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing. Equal scenes continue bit-identically, in any process."""
@@ -102,10 +115,14 @@ class Backend(ABC):
 
     @abstractmethod
     def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a block or link, shape (3,) [kg m²]."""
+        """Read the principal moments of inertia of a body, shape (3,) [kg m²].
+
+        Raises:
+            UnknownOption: There is no such body.
+        """
 
     @abstractmethod
-    def read(self, into: PhysicalState) -> None:
+    def read(self, into: State) -> None:
         """Write the present state into an existing vector, without allocating."""
 
     @abstractmethod
@@ -114,8 +131,8 @@ class Backend(ABC):
 
         Args:
             mode: What the command means.
-            command: Shape (9,) [rad] or [N m].
-            substeps: How many steps of ``preset.timestep``.
+            command: Shape (structure.n_commands,).
+            substeps: How many steps of ``structure.timestep``.
         """
 
     @abstractmethod
@@ -134,19 +151,18 @@ class Backend(ABC):
             SnapshotMismatch: It was taken by another engine.
         """
 
+    def supports(self, structure: Structure, key: ParameterKey) -> bool:
+        """Tell whether it realises a parameter of a structure."""
+        return True
+
     def close(self) -> None:  # noqa: B027 # most engines have nothing to free
         """Free what the engine holds. Closing twice is harmless."""
 
-    def state(self) -> PhysicalState:
-        """Read the present state into a new vector."""
-        state = PhysicalState(self.n_blocks)
+    def state(self) -> Any:
+        """Read the present state into a new vector; the kind of state that the structure has."""
+        state = self.structure.empty_state()
         self.read(state)
         return state
-
-    @property
-    @abstractmethod
-    def n_blocks(self) -> int:
-        """How many movable blocks the scene has."""
 
     @classmethod
     def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
@@ -174,10 +190,11 @@ class EngineBatch(ABC):
         Args:
             which: Numbers of the scenes that are stepped, ascending, shape (m,).
             mode: What a command means.
-            commands: One for each scene, shape (n, 9) [rad] or [N m].
-            substeps: How many steps of ``preset.timestep``.
+            commands: One for each scene, in the first columns of its row, shape (n, at least
+                n_commands).
+            substeps: How many steps of ``structure.timestep``.
             into: Where their states are written afterwards: the vector of scene i into the first
-                columns of row i, shape (n, at least 27 + 13 k).
+                columns of row i, shape (n, at least layout.size).
         """
 
 
@@ -198,6 +215,7 @@ class OneByOne(EngineBatch):
         """Step the scenes one after another."""
         for index in which.tolist():
             backend = self._backends[index]
-            backend.step(mode, commands[index], substeps)
-            size = ROBOT_SIZE + BLOCK_SIZE * backend.n_blocks
-            backend.read(PhysicalState(backend.n_blocks, into[index, :size]))
+            structure = backend.structure
+            backend.step(mode, commands[index, : structure.n_commands], substeps)
+            layout = structure.layout
+            backend.read(State(layout, into[index, : layout.size]))

@@ -9,8 +9,15 @@ from typing import ClassVar
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
 from scm_world.errors import SnapshotMismatch
-from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene
-from scm_world.scene.state import PhysicalState
+from scm_world.models.scene import (
+    ControlMode,
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    Structure,
+)
+from scm_world.models.state import State
 
 
 class BackendWrapper(Backend, ABC):
@@ -37,9 +44,9 @@ class BackendWrapper(Backend, ABC):
         return f"{self.engine.name} {self.engine.version}"
 
     @property
-    def n_blocks(self) -> int:
-        """How many movable blocks the scene has."""
-        return self.engine.n_blocks
+    def structure(self) -> Structure:
+        """What was compiled."""
+        return self.engine.structure
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing."""
@@ -54,10 +61,10 @@ class BackendWrapper(Backend, ABC):
         return self.engine.parameters(keys)
 
     def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a block or link, shape (3,) [kg m²]."""
+        """Read the principal moments of inertia of a body, shape (3,) [kg m²]."""
         return self.engine.inertia(body)
 
-    def read(self, into: PhysicalState) -> None:
+    def read(self, into: State) -> None:
         """Write the present state into an existing vector."""
         self.engine.read(into)
 

@@ -27,6 +27,7 @@ from scm_world.scene.state import PhysicalState
 from scm_world.testing.effects import EffectConformance
 from scm_world.testing.parameters import ParameterConformance
 from scm_world.testing.scenes import (
+    MODES,
     SEED,
     SUBSTEPS,
     apart_scene,
@@ -112,7 +113,7 @@ class BackendConformance(
             assert same(np.array(turns[0]), alone[0])
             assert same(np.array(turns[1]), alone[1])
 
-    @pytest.mark.parametrize("mode", list(ControlMode))
+    @pytest.mark.parametrize("mode", MODES)
     def test_the_control_law(self, backend: Backend, scene: Scene, mode: ControlMode) -> None:
         """The torque of one physics step is the specified function of the state before it."""
         if not backend.capabilities.physics:

@@ -20,6 +20,7 @@ from scm_world.scene.scene import CONTROLLER, Structure, default_scene
 from scm_world.scene.state import PhysicalState
 
 SUBSTEPS = 10
+MODES = (ControlMode.JOINT_POSITIONS, ControlMode.JOINT_TORQUES)
 LONG = 250  # control steps
 
 SEED = 20_26
@@ -99,11 +100,12 @@ def play(
     """
     generator = np.random.default_rng(seed)
     center = np.array(trifinger.REST) if mode is ControlMode.JOINT_POSITIONS else np.zeros(9)
-    states = np.empty((steps, backend.state().vector.size))
+    state = backend.state()
+    states = np.empty((steps, state.vector.size))
     for row in states:
         command = center + generator.uniform(-0.3, 0.3, 9)
         backend.step(mode, command, SUBSTEPS)
-        backend.read(PhysicalState(backend.n_blocks, row))
+        backend.read(state.with_vector(row))
     return states
 
 

@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.backends.base import Backend, EngineBatch, EngineSnapshot
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode, Difference, Scene
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
+from scm_world.scene.state import BLOCK_SIZE, PhysicalState
 from scm_world.scene.trifinger import REST
 from scm_world.testing.scenes import SUBSTEPS, other_value
 from scm_world.testing.suite import Suite
@@ -128,8 +128,8 @@ def _commands(steps: int) -> Iterator[Floats]:
 
 
 def _table(backends: list[Backend], extra: int = 0) -> Floats:
-    n_blocks = max(backend.n_blocks for backend in backends) + extra
-    return np.full((len(backends), ROBOT_SIZE + BLOCK_SIZE * n_blocks), np.nan)
+    width = max(backend.structure.layout.size for backend in backends) + extra * BLOCK_SIZE
+    return np.full((len(backends), width), np.nan)
 
 
 def _meddle(backend: Backend, step: int, start: EngineSnapshot) -> None:

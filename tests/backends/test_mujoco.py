@@ -10,7 +10,7 @@ import pytest
 from scm_world.backends import BACKENDS, EngineSnapshot, make_backend
 from scm_world.backends.mujoco import MujocoBackend
 from scm_world.backends.mujoco.installation import judge
-from scm_world.backends.mujoco.model import compiled
+from scm_world.backends.mujoco.trifinger.model import compiled
 from scm_world.errors import MissingEngine, MixedInstallation, SnapshotMismatch, UnknownOption
 from scm_world.geometry.hulls import hull_of
 from scm_world.scene import ControlMode, Difference, Structure, default_scene, trifinger
@@ -101,7 +101,7 @@ def test_any_path_ends_in_the_same_model(backend: MujocoBackend) -> None:
         backend.apply(Difference(parameters={key: final[key]}))
     fresh = MujocoBackend()
     fresh.build(scene.with_(parameters=final))
-    edited, built = fields(backend._model), fields(fresh._model)
+    edited, built = fields(backend.realization.model), fields(fresh.realization.model)
     assert [name for name in edited if edited[name] != built[name]] == []
 
 
@@ -117,11 +117,11 @@ def test_the_cached_model_is_never_changed(backend: MujocoBackend) -> None:
 
 def test_unknown_parameters_change_nothing(backend: MujocoBackend) -> None:
     """An unknown parameter is named, and the known ones beside it are not applied."""
-    before = fields(backend._model)
+    before = fields(backend.realization.model)
     changes = {("near", "mass"): np.array(0.05), ("nobody", "mass"): np.array(0.05)}
     with pytest.raises(UnknownOption, match=r"nobody\.mass"):
         backend.apply(Difference(parameters=changes))
-    assert fields(backend._model) == before
+    assert fields(backend.realization.model) == before
 
 
 def test_corners_of_a_hull_are_where_the_hull_says() -> None:
@@ -131,7 +131,7 @@ def test_corners_of_a_hull_are_where_the_hull_says() -> None:
     hull = hull_of(points)
     backend = MujocoBackend()
     backend.build(default_scene(Structure(("stone",), hulls=(("stone", hull),))))
-    model = backend._model
+    model = backend.realization.model
     shape = model.geom("stone").id
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[shape])
@@ -151,17 +151,19 @@ def test_obstacles_cost_few_pairs() -> None:
 def test_an_obstacle_that_grew_is_found(backend: MujocoBackend) -> None:
     """The radius within which MuJoCo looks for contacts follows the size of an obstacle."""
     backend.apply(Difference(parameters={("ledge", "size"): np.array([0.6, 0.02, 0.1])}))
-    shape = backend._model.geom("ledge").id
-    assert backend._model.geom_rbound[shape] == pytest.approx(np.linalg.norm([0.3, 0.01, 0.05]))
+    model = backend.realization.model
+    assert model.geom_rbound[model.geom("ledge").id] == pytest.approx(
+        np.linalg.norm([0.3, 0.01, 0.05])
+    )
 
 
 def test_restitution_of_zero_is_critical_damping(backend: MujocoBackend) -> None:
     """Without restitution all pairs have the numbers they were compiled with, bit for bit."""
-    before = backend._model.pair_solref.copy()
+    before = backend.realization.model.pair_solref.copy()
     for restitution in (0.5, 0.0):
         value = np.array(restitution)
         backend.apply(Difference(parameters={("world", "restitution"): value}))
-    assert np.array_equal(backend._model.pair_solref, before)
+    assert np.array_equal(backend.realization.model.pair_solref, before)
     assert np.array_equal(before, compiled(busy_scene().structure).pair_solref)
 
 
@@ -169,9 +171,10 @@ def test_restitution_of_zero_is_critical_damping(backend: MujocoBackend) -> None
 def test_restitution_keeps_the_frequency(backend: MujocoBackend, restitution: float) -> None:
     """Time constant times damping ratio stays, and the value is read back."""
     key = ("world", "restitution")
-    before = backend._model.pair_solref.prod(axis=1)
+    model = backend.realization.model
+    before = model.pair_solref.prod(axis=1)
     backend.apply(Difference(parameters={key: np.array(restitution)}))
-    np.testing.assert_allclose(backend._model.pair_solref.prod(axis=1), before, rtol=1e-14)
+    np.testing.assert_allclose(model.pair_solref.prod(axis=1), before, rtol=1e-14)
     np.testing.assert_allclose(backend.parameters([key])[key], restitution, rtol=0, atol=1e-13)
 
 
@@ -190,8 +193,9 @@ def test_fingertips_are_where_kinematics_says(backend: MujocoBackend) -> None:
         state = backend.state()
         state.joint_positions[:] = generator.uniform(trifinger.JOINT_LOW, trifinger.JOINT_HIGH)
         backend.apply(Difference(state=state))
-        mujoco.mj_kinematics(backend._model, backend._data)
-        tips = [backend._data.body(f"robot_finger_{f}_tip").xpos for f in trifinger.FINGERS]
+        data = backend.realization.data
+        mujoco.mj_kinematics(backend.realization.model, data)
+        tips = [data.body(f"robot_finger_{f}_tip").xpos for f in trifinger.FINGERS]
         expected = forward(state.joint_positions, height)
         np.testing.assert_allclose(np.ravel(tips), np.ravel(expected), rtol=0, atol=1e-12)
 

@@ -42,7 +42,7 @@ def test_worlds_go_on_where_another_one_is_lost(
     asked = _commands(alone[0], 3)
     backend: Any = batch.world(1).backend
     assert isinstance(backend, MujocoBackend)
-    backend._velocities[:] = 1e200
+    backend.realization.data.qvel[:] = 1e200
     with pytest.raises(EngineFailure, match="scene 1"):
         batch.advance(asked[0])
     assert [batch.world(index).index for index in (0, 2)] == [1, 1]

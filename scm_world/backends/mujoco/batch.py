@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, Protocol, final
 
 import mujoco
@@ -12,14 +12,12 @@ from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
-from scm_world.backends.mujoco.state import read_states
+from scm_world.backends.mujoco.realization import STATE, Realization
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode
-from scm_world.scene.scene import Structure
-from scm_world.scene.trifinger import N_JOINTS
 
 KEPT = 4
-"""Structures whose simulations are kept although no scene is in them at the moment."""
+"""Kinds of models whose simulations are kept although no scene is in them at the moment."""
 
 _STRANDED: list[_Room] = []
 """Simulations whose threads were left behind by a fork."""
@@ -29,11 +27,7 @@ class Guest(Protocol):
     """A scene that can be stepped elsewhere; see ``MujocoBackend``."""
 
     @property
-    def structure(self) -> Structure:
-        """Of the compiled model."""
-
-    @property
-    def model(self) -> mujoco.MjModel:
+    def realization(self) -> Realization:
         """The compiled model with the present parameters."""
 
     def depart(self, seat: Seat, mode: ControlMode) -> bool:
@@ -54,14 +48,9 @@ class Seat:
     def __init__(self, room: _Room, index: int) -> None:
         self.room, self.index = room, index
 
-    def take(self, data: mujoco.MjData) -> None:
-        """Take over the state of a scene; nothing else of ``mjSTATE_INTEGRATION`` is in use."""
-        room, index = self.room, self.index
-        room.time[index] = data.time
-        room.positions[index] = data.qpos
-        room.velocities[index] = data.qvel
-        room.warm[index] = data.qacc_warmstart
-        room.commands[index] = data.ctrl
+    def take(self, scene: Realization) -> None:
+        """Take over the state of a scene."""
+        mujoco.mj_getState(scene.model, scene.data, self.room.batch.state[self.index], STATE)
 
     def give_back(self, data: mujoco.MjData) -> None:
         """Copy everything that the last step left."""
@@ -70,34 +59,33 @@ class Seat:
 
 @final
 class _Room:
-    """The simulations of all scenes of one structure.
+    """The simulations of all scenes whose compiled models have equal sizes.
 
     Args:
-        structure: Of the scenes.
-        model: Of any of them.
+        scene: Any of them.
         n: How many scenes there could be.
         threads: That step them.
     """
 
-    def __init__(self, structure: Structure, model: mujoco.MjModel, n: int, threads: int) -> None:
-        self.structure = structure
+    def __init__(self, scene: Realization, n: int, threads: int) -> None:
+        self.key = scene.key
         # An MjData for each scene: contacts of the last step can be asked for.
-        self.batch: Any = Batch(model, n, threads, persistent=True)
+        self.batch: Any = Batch(scene.model, n, threads, persistent=True)
+        self.batch.warning[..., 1] = 1  # counts of one print nothing; see ``silence``
         self.seats = [Seat(self, index) for index in range(n)]
-        self.models: list[mujoco.MjModel] = [model] * n
-        bind = self.batch.bind
-        self.time, self.commands = bind("time"), bind("ctrl")
-        self.positions, self.velocities = bind("qpos"), bind("qvel")
-        self.warm = bind("qacc_warmstart")
-        self.forces = bind("qfrc_actuator")
+        self.models: list[mujoco.MjModel] = [scene.model] * n
+        self.read = scene.rows(self.batch)
+        self._width = len(scene.command)
+        self._commands = self.batch.bind("ctrl")
 
     def step(self, which: Integers, commands: Floats, substeps: int) -> None:
-        """Hold commands, shape (n, 9), in some of the simulations."""
+        """Hold commands, shape (n, at least n_commands), in some of the simulations."""
+        width = self._width
         if len(which) == len(self.seats):
-            self.commands[:, :N_JOINTS] = commands
+            self._commands[:, :width] = commands[:, :width]
             self.batch.step(nstep=substeps)
         else:
-            self.commands[which, :N_JOINTS] = commands[which]
+            self._commands[which, :width] = commands[which, :width]
             self.batch.step(ids=which, nstep=substeps)
 
 
@@ -116,7 +104,7 @@ class MujocoBatch(EngineBatch):
     def __init__(self, guests: Sequence[Guest], threads: int) -> None:
         self._guests = tuple(guests)
         self._threads = max(1, min(threads, len(self._guests)))
-        self._rooms: dict[Structure, _Room] = {}
+        self._rooms: dict[Hashable, _Room] = {}
         self._seats: list[Seat | None] = [None] * len(self._guests)
         self._process = os.getpid()
 
@@ -137,7 +125,7 @@ class MujocoBatch(EngineBatch):
             key = id(seat.room)
             rooms.setdefault(key, (seat.room, []))[1].append(index)
             if self._guests[index].depart(seat, mode):
-                seat.room.models[index] = self._guests[index].model
+                seat.room.models[index] = self._guests[index].realization.model
                 changed.add(key)
         problems = []
         for key, (room, members) in rooms.items():
@@ -149,20 +137,18 @@ class MujocoBatch(EngineBatch):
             raise EngineFailure("; ".join(problems), "mujoco")
 
     def _seat(self, index: int) -> Seat:
-        """Give the seat of a scene in the room of its structure."""
-        guest, seat = self._guests[index], self._seats[index]
-        structure = guest.structure
-        if seat is None or seat.room.structure != structure:
+        """Give the seat of a scene in the room for models like its own."""
+        scene, seat = self._guests[index].realization, self._seats[index]
+        if seat is None or seat.room.key != scene.key:
             self._seats[index] = None
-            seat = self._seats[index] = self._room(structure, guest).seats[index]
+            seat = self._seats[index] = self._room(scene).seats[index]
         return seat
 
-    def _room(self, structure: Structure, guest: Guest) -> _Room:
-        found = self._rooms.get(structure)
+    def _room(self, scene: Realization) -> _Room:
+        found = self._rooms.get(scene.key)
         if found is None:
             self._leave_unused()
-            found = _Room(structure, guest.model, len(self._guests), self._threads)
-            self._rooms[structure] = found
+            found = self._rooms[scene.key] = _Room(scene, len(self._guests), self._threads)
         return found
 
     def _leave_threads(self) -> None:
@@ -190,7 +176,7 @@ def _step(room: _Room, which: Any, commands: Floats, substeps: int, into: Floats
         room.step(which, commands, substeps)
     except SimulationError as error:
         said = f"MuJoCo: {error}"
-    wrong = read_states(room.positions, room.velocities, room.forces, which, into)
+    wrong = room.read(which, into)
     if wrong >= 0 and not said:
         said = f"MuJoCo produced a state that is not finite in scene {wrong} of the batch"
     return said

@@ -1,4 +1,4 @@
-"""Kinds of places in the arrays of a compiled model."""
+"""Places of parameters in the arrays of a compiled model."""
 
 from __future__ import annotations
 
@@ -6,23 +6,20 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import final
 
-import numpy as np
-
 from scm_world._types import Floats
 
 
 class Slot(ABC):
     """A place in the arrays of a model.
 
+    What the arrays are after a write is a function of the values in force, and not of the order
+    in which they were written.
+
     Attributes:
-        constant: Whether derived constants have to follow a write.
-        coupled: Whether the friction of the pairs has to follow a write.
-        steered: Whether the gains of the servos have to follow a write.
+        constant: Whether derived constants have to follow a write (``mj_setConst``).
     """
 
     constant = False
-    coupled = False
-    steered = False
 
     @abstractmethod
     def write(self, value: Floats) -> None:
@@ -48,20 +45,3 @@ class Vector(Slot):
     def read(self) -> Floats:
         """Copy them."""
         return self.numbers.copy()
-
-
-@final
-@dataclass(frozen=True)
-class Everywhere(Slot):
-    """A number that stands in many places."""
-
-    places: Floats
-    coupled: bool = False
-
-    def write(self, value: Floats) -> None:
-        """Write it to all of them."""
-        self.places[:] = value
-
-    def read(self) -> Floats:
-        """Read the first."""
-        return np.array(self.places[0])

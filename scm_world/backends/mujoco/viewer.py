@@ -34,13 +34,13 @@ class Viewer:
             self.close()
             engine.build(scene)
             self._structure = scene.structure
-            self._handle = _launch(engine._model, engine._data)
+            self._handle = _launch(engine.realization.model, engine.realization.data)
         handle = self._handle
         if not handle.is_running():
             return
         with handle.lock():
             engine.build(scene)
-            mujoco.mj_forward(engine._model, engine._data)
+            mujoco.mj_forward(engine.realization.model, engine.realization.data)
             _draw_goals(handle.user_scn, scene.goals)
         handle.sync()
 

@@ -2,7 +2,8 @@
 
 Every write is a pure function of the values in force afterwards, so that any order of changes
 ends in the same model bit for bit. Derived constants of the model (bounding radii, inverse
-weights) follow with ``mj_setConst``, wherever ``constant`` says so.
+weights) follow with ``mj_setConst``, wherever ``constant`` says so; frictions of pairs with
+``couple``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.model import (
+from scm_world.backends.mujoco.slots import Slot, Vector
+from scm_world.backends.mujoco.trifinger.model import (
     FLOOR,
     STAGE,
     base_name,
@@ -25,13 +27,26 @@ from scm_world.backends.mujoco.model import (
     shape_owners,
     wall_name,
 )
-from scm_world.backends.mujoco.servos import controller_slots
-from scm_world.backends.mujoco.settings import settings
-from scm_world.backends.mujoco.slots import Everywhere, Slot, Vector
+from scm_world.backends.mujoco.trifinger.servos import controller_slots
+from scm_world.backends.mujoco.trifinger.settings import settings
 from scm_world.geometry.hulls import Hull
 from scm_world.models.scene import ParameterKey
 from scm_world.scene import trifinger
 from scm_world.scene.scene import WALL_SEGMENTS, Structure
+
+
+@final
+@dataclass(frozen=True)
+class _Everywhere(Slot):
+    """A number that stands in many places."""
+
+    places: Floats
+
+    def write(self, value: Floats) -> None:
+        self.places[:] = value
+
+    def read(self) -> Floats:
+        return np.array(self.places[0])
 
 
 @final
@@ -58,7 +73,6 @@ class _Friction(Slot):
 
     friction: Floats
     shapes: tuple[int, ...]
-    coupled = True
 
     def write(self, value: Floats) -> None:
         for shape in self.shapes:
@@ -234,11 +248,11 @@ def slots(model: mujoco.MjModel, structure: Structure) -> dict[ParameterKey, Slo
         ("world", "restitution"): _Restitution(
             model.pair_solref, settings(structure.preset).contact
         ),
-        ("world", "spinning_friction"): Everywhere(model.geom_friction[:, 1], coupled=True),
+        ("world", "spinning_friction"): _Everywhere(model.geom_friction[:, 1]),
         ("robot", "height"): _Height(
             model.body_pos, tuple(int(model.body(name).id) for name in hanging)
         ),
-        ("robot", "joint_damping"): Everywhere(model.dof_damping[: trifinger.N_JOINTS]),
+        ("robot", "joint_damping"): _Everywhere(model.dof_damping[: trifinger.N_JOINTS]),
         **controller_slots(model),
     }
     owners = shape_owners(structure)

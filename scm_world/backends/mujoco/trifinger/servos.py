@@ -28,7 +28,6 @@ class _Gains(Slot):
 
     places: Floats
     factor: float = 1.0
-    steered: bool = False
 
     def write(self, value: Floats) -> None:
         self.places[:] = np.tile(self.factor * value, len(FINGERS))
@@ -58,8 +57,8 @@ def controller_slots(model: mujoco.MjModel) -> dict[ParameterKey, Slot]:
     damping = model.actuator_biasprm[N_JOINTS:, 2]
     ranges = model.actuator_forcerange[:N_JOINTS], model.jnt_actfrcrange[:N_JOINTS]
     return {
-        ("controller", "position_gains"): _Gains(rest[:, _POSITION], steered=True),
-        ("controller", "velocity_gains"): _Gains(rest[:, _VELOCITY], steered=True),
+        ("controller", "position_gains"): _Gains(rest[:, _POSITION]),
+        ("controller", "velocity_gains"): _Gains(rest[:, _VELOCITY]),
         ("controller", "safety_damping"): _Gains(damping, factor=-1.0),
         ("controller", "torque_limit"): _Limit(ranges),
     }

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import mujoco
 
-from scm_world.backends.mujoco.settings import Settings, settings, write_options
+from scm_world.backends.mujoco.trifinger.settings import Settings, settings, write_options
 from scm_world.geometry.hulls import Hull
 from scm_world.scene import trifinger
 from scm_world.scene.controller import ControllerSpec

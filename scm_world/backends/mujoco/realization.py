@@ -1,0 +1,222 @@
+"""A structure as MuJoCo realizes it: one class for each kind of structure.
+
+``Realization`` holds a compiled model with its parameters, ``ModelRealization`` is that of a
+``Model``; the one of the TriFinger is in the folder ``trifinger``.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from scm_world._types import Floats
+from scm_world.backends.mujoco.slots import Slot
+from scm_world.backends.mujoco.state import (
+    sensible,
+)
+from scm_world.errors import Infeasible, UnknownOption
+from scm_world.models.scene import ControlMode, ParameterKey, Parameters
+
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+"""Everything that decides how MuJoCo goes on."""
+
+Rows = Callable[[Any, Floats], int]
+"""Reads some states of a batch, and gives a row that is not finite, or -1."""
+
+
+class Realization(ABC):
+    """A compiled model with parameters and a state of its own.
+
+    Args:
+        structure: What was compiled.
+        compiled: The result, which is copied and not changed.
+        slots: Finds the places of all parameters in a model.
+        bodies: Name of each body.
+        owners: Name of the body of each shape: the geoms, then the flexes.
+
+    Attributes:
+        structure: What was compiled.
+        model: With the present parameters.
+        data: With the present state.
+        owners: Name of the body of each shape.
+        kept: The parameters in force; at first, none has been written.
+        mode: What a command means.
+        command: Where it is written, shape (n_commands,).
+        edited: Whether the model has changed since someone last cleared this.
+    """
+
+    modes: ClassVar[tuple[ControlMode, ...]]
+
+    def __init__(
+        self,
+        structure: Any,
+        compiled: mujoco.MjModel,
+        slots: Callable[[mujoco.MjModel], Mapping[ParameterKey, Slot]],
+        bodies: tuple[str, ...],
+        owners: tuple[str, ...],
+    ) -> None:
+        self.structure = structure
+        self.model = model = copy.copy(compiled)
+        self.data = data = mujoco.MjData(model)
+        self._scratch = mujoco.MjData(model)
+        self._slots = slots(model)
+        self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
+        self._bodies, self.owners = bodies, owners
+        self.kept: dict[ParameterKey, Floats] = {}
+        self.mode = self.modes[0]
+        self.edited = True
+        self.command = data.ctrl[: structure.n_commands]
+        self._positions, self._velocities = data.qpos, data.qvel
+        self._weights = model.dof_M0, model.dof_invweight0, model.body_invweight0
+        self._size = int(mujoco.mj_stateSize(model, STATE))
+        silence(data)
+        silence(self._scratch)
+
+    # --- state: how numbers are converted differs between kinds of structures ------------------
+
+    @abstractmethod
+    def read(self, into: Floats) -> None:
+        """Write the state into a vector."""
+
+    @abstractmethod
+    def place(self, vector: Floats) -> None:
+        """Write a state; all else stays as it is."""
+
+    @abstractmethod
+    def settled(self) -> bool:
+        """Forget what was before a step; tell whether everything is finite after it."""
+
+    @abstractmethod
+    def rows(self, batch: Batch) -> Rows:
+        """Give what reads states of such models out of a batch."""
+
+    def reset(self) -> None:
+        """Forget every step."""
+        mujoco.mj_resetData(self.model, self.data)
+        silence(self.data)
+
+    def forget(self) -> None:  # noqa: B027 # most have nothing to forget
+        """Forget what was before a step that is made elsewhere."""
+
+    def numbers(self) -> Floats:
+        """Copy ``mjSTATE_INTEGRATION``."""
+        numbers = np.empty(self._size)
+        mujoco.mj_getState(self.model, self.data, numbers, STATE)
+        return numbers
+
+    def memory(self) -> Any:
+        """Give what there is to remember besides ``mjSTATE_INTEGRATION``; it can be pickled."""
+        return None
+
+    def recall(self, numbers: Floats, memory: Any) -> None:
+        """Go on from what was remembered."""
+        mujoco.mj_setState(self.model, self.data, numbers, STATE)
+
+    def follow(self, before: Realization) -> None:
+        """Go on after the last step of another realization; then the state is written."""
+        self.data.time = before.data.time
+
+    def switch(self, mode: ControlMode) -> None:
+        """Let commands mean something else.
+
+        Raises:
+            UnknownOption: This structure has no such mode.
+        """
+        if mode not in self.modes:
+            raise UnknownOption("control mode", str(mode), map(str, self.modes))
+        self.mode = mode
+
+    # --- model ---------------------------------------------------------------------------------
+
+    @property
+    def key(self) -> Hashable:
+        """What decides the sizes of arrays: the structure, and what was compiled into it."""
+        found: Hashable = self.structure
+        return found
+
+    def outdated(self, parameters: Parameters) -> bool:
+        """Tell whether these parameters need another compilation."""
+        return False
+
+    def inertia(self, body: str) -> Floats:
+        """Copy the principal moments of inertia of a body, shape (3,) [kg m²]."""
+        if body not in self._bodies:
+            raise UnknownOption("body", body, self._bodies)
+        moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
+        return moments
+
+    def check(self, keys: Iterable[ParameterKey]) -> None:
+        """Raise ``UnknownOption`` for the first parameter that there is not."""
+        for key in keys:
+            if key not in self._slots:
+                raise UnknownOption("parameter", ".".join(key), map(".".join, self._slots))
+
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Read parameters back from the arrays of the model."""
+        keys = tuple(keys)
+        self.check(keys)
+        return {key: self._slots[key].read() for key in keys}
+
+    def edit(self, parameters: Parameters) -> None:
+        """Write parameters, then whatever follows from them; those in force cost nothing.
+
+        Raises:
+            UnknownOption: There is no such parameter. Nothing has changed.
+            Infeasible: The model could not move with them. Nothing has changed.
+        """
+        self.check(parameters)
+        kept, slots = self.kept, self._slots
+        before: dict[ParameterKey, Floats | None] = {}
+        for key, value in parameters.items():
+            present = kept.get(key)
+            if present is value:
+                continue
+            kept[key] = given = np.array(value, dtype=np.float64)
+            if present is not None and given.tobytes() == present.tobytes():
+                continue
+            before[key] = present
+            slots[key].write(given)
+        if not before:
+            return
+        self.edited = True
+        reason = self.followed(before)
+        if reason:
+            self._take_back(before)
+            names = [".".join(key) for key in before]
+            raise Infeasible(", ".join(names), parameters[next(iter(before))], [reason])
+
+    def followed(self, keys: Iterable[ParameterKey]) -> str:
+        """Compute what follows from some parameters; say what is wrong with it, or nothing."""
+        if self._constant.isdisjoint(keys):
+            return ""
+        singular = self._scratch.warning.number
+        try:
+            mujoco.mj_setConst(self.model, self._scratch)
+        except (mujoco.FatalError, mujoco.UnexpectedError) as error:
+            return f"MuJoCo says: {error}"
+        if singular[0] != 1 or not sensible(*self._weights):
+            singular[0] = 1
+            return "the inertia of the model would not be that of something that can move"
+        return ""
+
+    def _take_back(self, before: Mapping[ParameterKey, Floats | None]) -> None:
+        """Write old values again; where there is none, the model is new and is given up."""
+        for key, value in before.items():
+            if value is not None:
+                self.kept[key] = value
+                self._slots[key].write(value)
+        self.followed(before)
+
+
+def silence(data: mujoco.MjData) -> None:
+    """Keep MuJoCo from printing warnings, and from writing them to a file.
+
+    It does so when it counts the first of each kind. We look for what is wrong ourselves.
+    """
+    data.warning.number[:] = 1

@@ -1,0 +1,1 @@
+"""How MuJoCo realizes the TriFinger."""
