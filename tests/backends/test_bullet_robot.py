@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.backends.bullet import BulletBackend, arena
-from scm_world.backends.bullet.description import PARTS, link_index
-from scm_world.backends.bullet.law import compile_law
-from scm_world.backends.bullet.passive import MASSES, inverse_dynamics, mass_matrix
+from scm_world.backends.bullet import BulletBackend
+from scm_world.backends.bullet.trifinger import arena
+from scm_world.backends.bullet.trifinger.description import PARTS, link_index
+from scm_world.backends.bullet.trifinger.law import compile_law
+from scm_world.backends.bullet.trifinger.passive import MASSES, inverse_dynamics, mass_matrix
 from scm_world.errors import EngineFailure, MissingEngine
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.scene import (

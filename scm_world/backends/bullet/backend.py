@@ -11,28 +11,32 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
-from scm_world.backends.bullet import touch, values
+from scm_world.backends.bullet import values
 from scm_world.backends.bullet.client import Client
 from scm_world.backends.bullet.engine import load, version
 from scm_world.backends.bullet.history import History, Record, SavedState, relive
+from scm_world.backends.bullet.model.client import ModelClient
+from scm_world.backends.bullet.trifinger.client import TriFingerClient
 from scm_world.backends.bullet.values import Instant, Values
 from scm_world.errors import EngineFailure, SnapshotMismatch
+from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
     Difference,
     ParameterKey,
     Parameters,
     Scene,
+    Structure,
     complete,
 )
-from scm_world.scene.state import PhysicalState
+from scm_world.models.state import State
 
 LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper than a replay
 
 
 @final
 class BulletBackend(Backend):
-    """Bullet, through pybullet.
+    """Bullet, through pybullet: the TriFinger, and what it can honour of a ``Model``.
 
     The engine cannot set a state exactly, because contact caches survive. So a state is set by
     bringing about a *canonical* world, which is a function of parameters and state alone. It is
@@ -59,7 +63,7 @@ class BulletBackend(Backend):
         self._before: Values = {}  # parameters of the last step
         self._present: Instant | None = None  # what was made of the last step since
         self._light = True  # whether the base itself holds the present, and not the spare
-        self._torques = [0.0] * 9
+        self._reported: list[float] = []  # what nobody can set, after the last step
         self._resting: list[float] | None = None  # state of the base, once it was asked for
         self._saved: SavedState | None = None  # of the base
 
@@ -69,11 +73,16 @@ class BulletBackend(Backend):
         return self._version
 
     @property
-    def n_blocks(self) -> int:
-        """How many movable blocks the scene has."""
-        return len((self._present or self._lived().origin).structure.blocks)
+    def structure(self) -> Structure:
+        """What was built."""
+        return (self._present or self._lived().origin).structure
 
     # --- clients -------------------------------------------------------------------------------
+
+    @staticmethod
+    def _kind(structure: Structure) -> type[Client]:
+        """Give the class of the clients that realise a structure."""
+        return ModelClient if isinstance(structure, Model) else TriFingerClient
 
     def _lived(self) -> History:
         if self._history is None:
@@ -83,37 +92,46 @@ class BulletBackend(Backend):
     def _last(self) -> Client:
         """Give the client that holds the world of the last step."""
         history = self._lived()
-        if self._base is None:
-            self._base, self._lost = self._opened(), True
+        base = self._fitting(self._base, history.origin.structure)
+        if base is not self._base:
+            self._base, self._lost = base, True
         if self._lost:
-            relive(self._base, history.past(self._torques))
+            relive(base, history.past(self._reported))
             self._lost = False
-        return self._base
+        return base
 
-    def _other(self) -> Client:
+    def _other(self, structure: Structure) -> Client:
         """Give the client that does not hold the last step."""
-        if self._spare is None:
-            self._spare = self._opened()
+        self._spare = self._fitting(self._spare, structure)
         return self._spare
 
-    def _opened(self) -> Client:
-        client = Client(self._engine)
+    def _fitting(self, client: Client | None, structure: Structure) -> Client:
+        """Pass on a client that can hold a structure; else close it, and open another one."""
+        kind = self._kind(structure)
+        if isinstance(client, kind):
+            return client
+        if client is not None:
+            client.close()
+        client = kind(self._engine)
         client.furnish()
         return client
 
     def _now(self) -> Client:
         """Give the client that holds the present."""
-        return self._last() if self._light else self._other()
+        return self._last() if self._light else self._other(self.structure)
 
     # --- the interface -------------------------------------------------------------------------
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; with the bodies that are there already, where possible."""
-        parameters = values.complete(scene.structure, scene.parameters)
-        origin = Instant(scene.structure, parameters, values.state(scene.structure, scene.state))
+        structure, kind = scene.structure, self._kind(scene.structure)
+        parameters = values.complete(scene.parameters, kind.keys(structure))
+        kind.check(structure, parameters)
+        origin = Instant(structure, parameters, kind.settle(structure, scene.state))
         with self._all_or_nothing():
-            self._other().canonicalize(origin)
-        self._present, self._light, self._torques = origin, False, [0.0] * 9
+            self._other(structure).canonicalize(origin)
+        self._present, self._light = origin, False
+        self._reported = [0.0] * int((~structure.layout.can_be_set).sum())
         self._commit()
 
     def apply(self, difference: Difference) -> None:
@@ -125,22 +143,23 @@ class BulletBackend(Backend):
         """
         present = self._described()
         wish = self._wish(present, difference)
-        light = values.light(self._described_base(), wish)
+        light = self._is_light(self._described_base(), wish)
         with self._all_or_nothing():
             if light:
                 changed = difference.parameters if self._light else wish.parameters
                 self._last().edit({key: wish.parameters[key] for key in changed})
-            elif not self._light and values.light(present, wish):
-                self._other().edit({key: wish.parameters[key] for key in difference.parameters})
+            elif not self._light and self._is_light(present, wish):
+                spare = self._other(wish.structure)
+                spare.edit({key: wish.parameters[key] for key in difference.parameters})
             else:
-                self._other().canonicalize(wish)
+                self._other(wish.structure).canonicalize(wish)
         self._present, self._light = wish, light
 
     def _described_base(self) -> Instant:
         """Describe the world of the last step."""
         structure = self._lived().origin.structure
         if self._resting is None:
-            self._resting = self._last().read(self._torques)
+            self._resting = self._last().read([0.0] * len(self._reported))
         return Instant(structure, self._before, self._resting)
 
     def _described(self) -> Instant:
@@ -150,16 +169,33 @@ class BulletBackend(Backend):
     def _wish(self, present: Instant, difference: Difference) -> Instant:
         """Say which world the difference makes of the present."""
         structure, parameters, state = present.structure, present.parameters, present.state
+        kind = self._kind(difference.structure or structure)
         if difference.structure is not None:
-            now = Scene(structure, values.arrays(parameters), values.physical(structure, state))
+            now = Scene(structure, values.arrays(parameters), values.state_of(structure, state))
             structure = difference.structure
             difference = complete(now, structure, difference)
-            parameters = values.complete(structure, difference.parameters)
+            parameters = values.complete(difference.parameters, kind.keys(structure))
         elif difference.parameters:
             parameters = {**parameters, **values.some(parameters, difference.parameters)}
+        if difference.structure is not None or difference.parameters:
+            kind.check(structure, parameters)
         if difference.state is not None:
-            state = values.state(structure, difference.state)
+            state = kind.settle(structure, difference.state)
         return Instant(structure, parameters, state)
+
+    def _is_light(self, here: Instant, there: Instant) -> bool:
+        """Tell whether one world becomes another without setting a state.
+
+        That is so if only parameters change that live bodies can take on.
+        """
+        return (
+            here.structure == there.structure
+            and here.state == there.state
+            and all(
+                here.parameters[key] == there.parameters[key]
+                for key in self._kind(here.structure).heavy(here.structure)
+            )
+        )
 
     @contextmanager
     def _all_or_nothing(self) -> Iterator[None]:
@@ -180,7 +216,7 @@ class BulletBackend(Backend):
         if self._light:
             self._last().edit(present.parameters)
         else:
-            self._other().canonicalize(present)
+            self._other(present.structure).canonicalize(present)
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Read parameters back from the engine itself; see ``Client.parameter``.
@@ -194,39 +230,39 @@ class BulletBackend(Backend):
         }
 
     def inertia(self, body: str) -> Floats:
-        """Read the principal moments of inertia of a block or link, shape (3,) [kg m²].
+        """Read the principal moments of inertia of a body, shape (3,) [kg m²].
 
-        The fingertip is a link of its own in this engine, and no part of link 3.
+        The TriFinger's fingertip is a link of its own in this engine, and no part of link 3.
+
+        Raises:
+            UnknownOption: There is no such body.
         """
-        values.known(self._described().parameters, [(body, "mass")])
-        client = self._now()
-        place = client.bodies.place(body)
-        return np.array(self._engine.getDynamicsInfo(*place, physicsClientId=client.handle)[2])
+        return self._now().inertia(body)
 
-    def read(self, into: PhysicalState) -> None:
+    def read(self, into: State) -> None:
         """Write the present state into an existing vector."""
-        numbers = self._now().read(self._torques)
+        numbers = self._now().read(self._reported)
         if not math.isfinite(sum(numbers)):
             raise EngineFailure("Bullet produced a state that is not finite", self.name)
         into.vector[:] = numbers
 
     def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
         """Hold a command for some physics steps."""
-        numbers = np.asarray(command, dtype=np.float64).tolist()
-        if len(numbers) != len(self._torques):
-            raise ValueError(f"a command has {len(self._torques)} numbers, got {len(numbers)}")
+        numbers, size = np.asarray(command, dtype=np.float64).tolist(), self.structure.n_commands
+        if len(numbers) != size:
+            raise ValueError(f"a command has {size} numbers, got {len(numbers)}")
         if substeps < 1:
             return
         self._commit()
         client, history = self._last(), self._lived()
         try:
-            torques = client.advance(mode, numbers, substeps)
+            reported = client.stepped(mode, numbers, substeps)
         except Exception as error:
             client.close()  # torques that were not stepped would count twice
             self._base = None
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
         history.step(mode, numbers, substeps)
-        self._torques, self._resting, self._saved = torques, None, None
+        self._reported, self._resting, self._saved = reported, None, None
 
     def _commit(self) -> None:
         """Make the present the world that everything after it starts from."""
@@ -247,15 +283,14 @@ class BulletBackend(Backend):
 
     def contacts(self) -> tuple[Contact, ...]:
         """List the contact points of the last physics step."""
-        client = self._last()
-        return touch.contacts(self._engine, client.handle, client.bodies)
+        return self._last().contacts()
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
         history, resting = self._lived(), self._described_base().state
         if history.substeps >= LONG and self._saved is None and not self._lost:
             self._saved = SavedState(self._last())
-        past = history.past(self._torques)
+        past = history.past(self._reported)
         record = Record(past, self._present, self._light, resting, self._saved)
         return EngineSnapshot(f"{self.name} {self._version}", record)
 
@@ -270,7 +305,7 @@ class BulletBackend(Backend):
             raise SnapshotMismatch(f"this is a snapshot of {snapshot.engine!r}, not of {mine!r}")
         self._history, self._before = History.of(record.past), record.past.parameters()
         self._present, self._light = record.present, record.light
-        self._torques, self._resting = record.past.torques, record.resting
+        self._reported, self._resting = record.past.reported, record.resting
         self._lost, self._saved = True, None
         try:
             self._recall(record.saved)

@@ -1,39 +1,36 @@
-"""One physics client of the engine, with robot, floor, stage and blocks in it."""
+"""One physics client of the engine, and what is particular to the structure in it."""
 
 from __future__ import annotations
 
 import operator
 import weakref
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.bullet import arena, dynamics
-from scm_world.backends.bullet.description import JOINTS
-from scm_world.backends.bullet.dynamics import Bodies
-from scm_world.backends.bullet.law import Law, compile_law
-from scm_world.backends.bullet.passive import MASSES, Resistance, resistance
-from scm_world.backends.bullet.values import Instant, Values, arrays, heavy, number, numbers
+from scm_world.backends.base import Contact
+from scm_world.backends.bullet.values import Instant, Values
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode, ParameterKey
-from scm_world.scene.scene import Structure, controller_spec
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
+from scm_world.models.scene import ControlMode, ParameterKey, Structure
+from scm_world.models.state import State
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
 TOLERANCE = 1e-6  # how far a state that was set may read back from what was asked
 
 
-@final
-class Client:
+class Client(ABC):
     """A physics client, and what is known about it without asking.
+
+    There is one subclass for each kind of structure. It says which parameters there are, makes
+    the bodies, sets and reads them, and steps. Everything else is here.
 
     Attributes:
         engine: The module ``pybullet``.
         handle: The number of the client; None once it is closed.
-        bodies: The engine's numbers of all bodies.
         applied: The value of each parameter that is in force.
         generation: Counts the canonical states; a saved state is exact within one of them.
     """
@@ -43,36 +40,104 @@ class Client:
         self.handle = engine.connect(engine.DIRECT)
         if self.handle < 0:
             raise EngineFailure("Bullet has no physics client left; close some backends", "bullet")
-        self.bodies = Bodies(-1, -1, ())
         self.applied: Values = {}
         self.generation = 0
-        self._timestep = 0.0
-        self._laws: dict[ControlMode, Law] = {}
         self._untouched: list[float] | None = None
+        self._rotations: Sequence[int] = ()  # where quaternions begin in the state
+        self._reported: Sequence[int] = ()  # where numbers stand that nobody can set
         self._saved: dict[int, int] = {}  # ticket to the engine's number, which it uses again
         self._tickets = 0
         self._doomed: list[int] = []
         self._close = weakref.finalize(self, _disconnect, engine, self.handle)
 
+    # --- what a structure of this kind is -------------------------------------------------------
+
+    @staticmethod
+    @abstractmethod
+    def keys(structure: Structure) -> Iterable[ParameterKey]:
+        """List every parameter of a structure, in the order in which they are set."""
+
+    @staticmethod
+    @abstractmethod
+    def check(structure: Structure, parameters: Values) -> None:
+        """Say what the engine cannot honour, before anything is made.
+
+        Raises:
+            ModelError: Something in the structure.
+            UnknownOption: A parameter that is not as the structure has it.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def heavy(structure: Structure) -> Iterable[ParameterKey]:
+        """List the parameters that need new bodies, or new contacts."""
+
+    @staticmethod
+    @abstractmethod
+    def settle(structure: Structure, given: State) -> list[float]:
+        """Turn a state into plain numbers: unit quaternions, and 0 for what nobody can set.
+
+        Raises:
+            ValueError: It is a state of another structure.
+            EngineFailure: A number is not finite.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def rotations(structure: Structure) -> Sequence[int]:
+        """List where in the state the quaternions (x, y, z, w) begin."""
+
+    # --- what is done in the engine -------------------------------------------------------------
+
+    @abstractmethod
+    def furnish(self) -> None:
+        """Add what stands in every scene, and set how the engine works."""
+
+    @abstractmethod
+    def construct(self, structure: Structure, parameters: Values) -> None:
+        """Make sure that the bodies are there, with their shapes.
+
+        What is made anew has no parameters in ``applied``.
+        """
+
+    @abstractmethod
+    def pose(self, parameters: Values, state: list[float]) -> None:
+        """Put all that moves in its place, and make the engine forget what touched what."""
+
+    @abstractmethod
+    def write(self, key: ParameterKey, value: Any) -> None:
+        """Set one parameter of live bodies."""
+
+    @abstractmethod
+    def written(self, keys: Iterable[ParameterKey]) -> None:
+        """Do what follows from parameters that were set: ``applied`` has them."""
+
+    @abstractmethod
+    def parameter(self, key: ParameterKey) -> Floats:
+        """Ask the engine for a parameter, in the units of the scene."""
+
+    @abstractmethod
+    def inertia(self, body: str) -> Floats:
+        """Ask the engine for principal moments of inertia, shape (3,) [kg m²]."""
+
+    @abstractmethod
+    def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
+        """Hold a command for some physics steps, and return the numbers that nobody can set."""
+
+    @abstractmethod
+    def ask(self) -> list[float]:
+        """Ask the engine for the state, with 0 for what nobody can set."""
+
+    @abstractmethod
+    def contacts(self) -> tuple[Contact, ...]:
+        """List the contact points of the last physics step."""
+
+    # --- the same for all -----------------------------------------------------------------------
+
     def close(self) -> None:
         """Disconnect. Closing twice is harmless."""
         self._close()
         self.handle = None
-
-    def furnish(self) -> None:
-        """Add what stands in every scene."""
-        engine, handle = self.engine, self.handle
-        floor = arena.add_floor(engine, handle)
-        stage = arena.add_stage(engine, handle)
-        self.bodies = Bodies(arena.add_robot(engine, handle), floor, stage)
-        engine.setPhysicsEngineParameter(
-            numSolverIterations=SOLVER_ITERATIONS,
-            # An early end, decided for all bodies together, would let bodies act on each other
-            # without touching.
-            solverResidualThreshold=0.0,
-            deterministicOverlappingPairs=1,
-            physicsClientId=handle,
-        )
 
     def canonicalize(self, instant: Instant) -> None:
         """Bring about the one world that has these parameters and this state, whatever was before.
@@ -83,151 +148,44 @@ class Client:
         self.generation += 1
         self._doomed.extend(self._saved)
         self._bury()
-        structure, parameters, state = instant.structure, instant.parameters, instant.state
-        timestep = structure.preset.timestep
-        if timestep != self._timestep:
-            self.engine.setPhysicsEngineParameter(
-                fixedTimeStep=timestep, physicsClientId=self.handle
-            )
-            self._timestep = timestep
-        self._shape(structure, parameters)
-        self._place(parameters)
-        self._pose(number(parameters, ("robot", "height")), state)
-        self.applied.update((key, parameters[key]) for key in heavy(structure))
+        structure, parameters = instant.structure, instant.parameters
+        self._rotations = self.rotations(structure)
+        self._reported = np.flatnonzero(~structure.layout.can_be_set).tolist()
+        self.construct(structure, parameters)
+        self.pose(parameters, instant.state)
+        self.applied.update((key, parameters[key]) for key in self.heavy(structure))
         self.edit(parameters)
-        self._check(state)
-        self._untouched = state
-
-    def _shape(self, structure: Structure, parameters: Values) -> None:
-        """Make sure that the obstacles and blocks are there, with their shapes."""
-        hulls = dict(structure.hulls)
-        shapes = {
-            name: hulls.get(name) or numbers(parameters, (name, "size"))
-            for name in (*structure.obstacles, *structure.blocks)
-        }
-        same = list(self.bodies.shapes.items()) == list(shapes.items())
-        if not same or tuple(self.bodies.blocks) != structure.blocks:
-            self._remake(structure, shapes)
-
-    def _remake(self, structure: Structure, shapes: dict[str, arena.Shape]) -> None:
-        """Replace all obstacles and blocks: their order in the engine is that in the structure."""
-        engine, handle, was = self.engine, self.handle, self.bodies
-        for body in reversed((*was.obstacles.values(), *was.blocks.values())):
-            engine.removeBody(body, physicsClientId=handle)
-        gone = {*was.shapes, "world"}  # what holds for every contact is set on every body
-        self.applied = {key: v for key, v in self.applied.items() if key[0] not in gone}
-        obstacles = {
-            name: arena.add_obstacle(engine, handle, shapes[name]) for name in structure.obstacles
-        }
-        blocks = {name: arena.add_block(engine, handle, shapes[name]) for name in structure.blocks}
-        self.bodies = Bodies(was.robot, was.floor, was.stage, obstacles, blocks, shapes)
-
-    def _place(self, parameters: Values) -> None:
-        """Put the obstacles in their places, and enter them anew."""
-        engine, handle = self.engine, self.handle
-        group, mask = arena.OBSTACLE, arena.OBSTACLE_MASK
-        for name, body in self.bodies.obstacles.items():
-            position = numbers(parameters, (name, "position"))
-            turn = numbers(parameters, (name, "orientation"))
-            if not any(turn):
-                raise EngineFailure(
-                    f"{name}.orientation must be a quaternion, got {turn}", "bullet"
-                )
-            engine.resetBasePositionAndOrientation(body, position, turn, physicsClientId=handle)
-            engine.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=handle)
-
-    def _pose(self, height: float, state: list[float]) -> None:
-        """Put all that moves in its place, and make the engine forget what touched what."""
-        engine, handle, robot = self.engine, self.handle, self.bodies.robot
-        position, orientation = arena.robot_pose(height)
-        engine.resetBasePositionAndOrientation(robot, position, orientation, physicsClientId=handle)
-        for joint, angle, speed in zip(JOINTS, state[:9], state[9:18], strict=True):
-            engine.resetJointState(robot, joint, angle, speed, physicsClientId=handle)
-        for link, group, mask in arena.LINK_GROUPS:
-            engine.setCollisionFilterGroupMask(robot, link, group, mask, physicsClientId=handle)
-        for index, body in enumerate(self.bodies.blocks.values()):
-            row = state[ROBOT_SIZE + BLOCK_SIZE * index :][:BLOCK_SIZE]
-            engine.resetBasePositionAndOrientation(body, row[:3], row[3:7], physicsClientId=handle)
-            engine.resetBaseVelocity(body, row[7:10], row[10:13], physicsClientId=handle)
-            engine.setCollisionFilterGroupMask(body, -1, arena.BLOCK, -1, physicsClientId=handle)
+        self._check(instant.state)
+        self._untouched = instant.state
 
     def edit(self, parameters: Values) -> None:
         """Change parameters that need no new bodies. What is in force already is left alone."""
-        other_law = False
+        others = []
         for key, value in parameters.items():
             if self.applied.get(key) != value:
                 self.applied.pop(key, None)  # unknown, should the engine fail
-                dynamics.write(self.engine, self.handle, self.bodies, key, value)
+                self.write(key, value)
                 self.applied[key] = value
-                other_law = other_law or key[0] == "controller"
-        if other_law:
-            told = {key: v for key, v in self.applied.items() if key[0] == "controller"}
-            spec = controller_spec(arrays(told))
-            self._laws = {mode: compile_law(spec, mode) for mode in ControlMode}
+                others.append(key)
+        if others:
+            self.written(others)
 
-    def parameter(self, key: ParameterKey) -> Floats:
-        """Ask the engine for a parameter, in the units of the scene.
-
-        Controller and joint damping are not in the engine, but in the torques it is given.
-        """
-        if key[0] == "controller" or key[1] == "joint_damping":
-            return np.array(self.applied[key])
-        value = dynamics.read(self.engine, self.handle, self.bodies, key)
-        if key[1] == "orientation" and np.dot(value, self.applied[key]) < 0.0:
-            return -value  # the same orientation
-        return value
-
-    def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
-        """Hold a command for some physics steps, and return the torques of the last one [N m].
-
-        Each physics step asks the engine once and tells it once. The torques are those of the
-        controller; the resistance of viscous joints comes on top.
-        """
-        engine, handle, robot = self.engine, self.handle, self.bodies.robot
-        ask, step = engine.getJointStates, engine.stepSimulation
-        tell, torque_control = engine.setJointMotorControlArray, engine.TORQUE_CONTROL
-        law, resist, torques = self._laws[mode], self._resistance(), []
+    def stepped(
+        self, mode: ControlMode, command: Sequence[float], substeps: int
+    ) -> list[float]:
+        """Hold a command for some physics steps; see ``advance``."""
         self._untouched = None
-        for _ in range(substeps):
-            joints = ask(robot, JOINTS, physicsClientId=handle)
-            torques = law(joints, command)
-            total = torques if resist is None else resist(joints, torques)
-            tell(robot, JOINTS, torque_control, forces=total, physicsClientId=handle)
-            step(physicsClientId=handle)
-        return torques
+        return self.advance(mode, command, substeps)
 
-    def _resistance(self) -> Resistance | None:
-        """Give what viscous joints add to torques; None where they are not viscous."""
-        damping = number(self.applied, ("robot", "joint_damping"))
-        if not damping:
-            return None
-        gravity = numbers(self.applied, ("world", "gravity"))
-        masses = [number(self.applied, key) for key in MASSES]
-        return resistance(damping, self._timestep, gravity, masses)
-
-    def read(self, torques: list[float]) -> list[float]:
-        """Read the present state as the numbers of a ``PhysicalState``.
+    def read(self, reported: list[float]) -> list[float]:
+        """Read the present state; the numbers that nobody can set are given.
 
         A state that was set and not stepped yet reads as it was set; ``canonicalize`` has made
         sure that the engine agrees up to rounding.
         """
-        if self._untouched is not None:
-            return [*self._untouched[:18], *torques, *self._untouched[ROBOT_SIZE:]]
-        return self._ask(torques)
-
-    def _ask(self, torques: list[float]) -> list[float]:
-        engine, handle = self.engine, self.handle
-        joints = engine.getJointStates(self.bodies.robot, JOINTS, physicsClientId=handle)
-        state = [joint[0] for joint in joints]
-        state += [joint[1] for joint in joints]
-        state += torques
-        for body in self.bodies.blocks.values():
-            position, turn = engine.getBasePositionAndOrientation(body, physicsClientId=handle)
-            linear, angular = engine.getBaseVelocity(body, physicsClientId=handle)
-            state += position
-            state += turn if turn[3] >= 0.0 else [-part for part in turn]
-            state += linear
-            state += angular
+        state = self.ask() if self._untouched is None else list(self._untouched)
+        for place, value in zip(self._reported, reported, strict=True):
+            state[place] = value
         return state
 
     def _check(self, state: list[float]) -> None:
@@ -236,8 +194,8 @@ class Client:
         Raises:
             EngineFailure: It did not.
         """
-        actual = self._ask(state[18:ROBOT_SIZE])
-        for start in range(ROBOT_SIZE + 3, len(actual), BLOCK_SIZE):
+        actual = self.ask()
+        for start in self._rotations:
             turn, wanted = actual[start : start + 4], state[start : start + 4]
             if sum(map(operator.mul, turn, wanted)) < 0.0:
                 actual[start : start + 4] = [-part for part in turn]

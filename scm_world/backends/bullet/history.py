@@ -15,7 +15,7 @@ from scm_world.models.scene import ControlMode
 Step = tuple[ControlMode, Sequence[float], int]
 
 MODES = tuple(ControlMode)
-ROW = 11  # numbers for each step: mode, substeps, command
+AHEAD = 2  # numbers of each step before its command: mode and substeps
 
 
 @final
@@ -40,28 +40,28 @@ class Past:
 
     Attributes:
         origin: Where it began.
-        rows: The steps, ``ROW`` numbers each; it may go on after ``length``.
+        rows: The steps: mode, substeps and command of each; it may go on after ``length``.
         length: How many numbers belong to this past.
         edits: Changes of parameters: the length of ``rows`` at that moment, and the new values.
-        torques: Of the last physics step [N m].
+        reported: What nobody can set, after the last step.
     """
 
     origin: Instant
     rows: array[float]
     length: int
     edits: tuple[tuple[int, Values], ...]
-    torques: list[float]
+    reported: list[float]
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "rows": self.rows[: self.length]}
 
     def events(self) -> Iterator[Values | Step]:
         """List what happened, in order."""
-        edits = list(reversed(self.edits))
-        for start in range(0, self.length, ROW):
+        edits, row = list(reversed(self.edits)), AHEAD + self.origin.structure.n_commands
+        for start in range(0, self.length, row):
             while edits and edits[-1][0] == start:
                 yield edits.pop()[1]
-            mode, substeps, *command = self.rows[start : start + ROW]
+            mode, substeps, *command = self.rows[start : start + row]
             yield MODES[int(mode)], command, int(substeps)
         yield from (edit for _, edit in reversed(edits))
 
@@ -116,8 +116,8 @@ class History:
     @classmethod
     def of(cls, past: Past) -> History:
         """Go on from a past without touching the history it was taken from."""
-        rows = past.rows[: past.length]
-        return cls(past.origin, rows, list(past.edits), int(sum(rows[1::ROW])))
+        rows, row = past.rows[: past.length], AHEAD + past.origin.structure.n_commands
+        return cls(past.origin, rows, list(past.edits), int(sum(rows[1::row])))
 
     def edit(self, values: Values) -> None:
         """Write down a change of parameters."""
@@ -129,9 +129,9 @@ class History:
         self.rows.extend((MODES.index(mode), substeps, *command))
         self.substeps += substeps
 
-    def past(self, torques: list[float]) -> Past:
+    def past(self, reported: list[float]) -> Past:
         """Take what was so far."""
-        return Past(self.origin, self.rows, len(self.rows), tuple(self.edits), torques)
+        return Past(self.origin, self.rows, len(self.rows), tuple(self.edits), reported)
 
 
 def relive(client: Client, past: Past) -> None:
@@ -141,4 +141,4 @@ def relive(client: Client, past: Past) -> None:
         if isinstance(event, dict):
             client.edit(event)
         else:
-            client.advance(*event)
+            client.stepped(*event)

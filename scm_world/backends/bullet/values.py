@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from scm_world.errors import EngineFailure, UnknownOption
-from scm_world.models.scene import ParameterKey, Parameters
-from scm_world.scene.scene import Structure, parameter_keys
-from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
+from scm_world.models.scene import ParameterKey, Parameters, Structure
+from scm_world.models.state import State
 
 Plain = float | list[float]
 """The value of a parameter."""
@@ -31,7 +30,7 @@ class Instant:
     Attributes:
         structure: The bodies.
         parameters: All of them.
-        state: The numbers of a ``PhysicalState``.
+        state: The numbers of a ``State``, with unit quaternions.
     """
 
     structure: Structure
@@ -84,60 +83,44 @@ def some(there: Mapping[ParameterKey, object], parameters: Parameters) -> Values
     return plain
 
 
-def complete(structure: Structure, parameters: Parameters) -> Values:
+def complete(parameters: Parameters, keys: Iterable[ParameterKey]) -> Values:
     """Turn all parameters of a structure into plain numbers.
+
+    Args:
+        parameters: Those of a scene.
+        keys: Those that the structure has.
 
     Raises:
         UnknownOption: One is missing.
         EngineFailure: One is not finite.
     """
-    wanted = known(parameters, parameter_keys(structure))
+    wanted = known(parameters, keys)
     return some(parameters, {key: parameters[key] for key in wanted})
 
 
-def state(structure: Structure, given: PhysicalState) -> list[float]:
-    """Turn a state into plain numbers, with unit quaternions whose w is not negative.
+def plain_state(structure: Structure, given: State) -> list[float]:
+    """Turn a state into plain numbers.
 
     Raises:
-        ValueError: It is a state of another number of blocks.
+        ValueError: It is a state of another structure.
         EngineFailure: A number is not finite.
     """
-    if given.n_blocks != len(structure.blocks):
-        raise ValueError(f"expected a state of {len(structure.blocks)} blocks, got {given!r}")
-    numbers: list[float] = given.vector.tolist()
-    if not math.isfinite(sum(numbers)):
+    plain: list[float] = given.vector.tolist()
+    if len(plain) != structure.layout.size:
+        raise ValueError(f"expected a state of {structure.layout.size} numbers, got {given!r}")
+    if not math.isfinite(sum(plain)):
         raise EngineFailure(f"a state must be finite, got {given!r}", "bullet")
-    for start in range(ROBOT_SIZE + 3, len(numbers), BLOCK_SIZE):
-        turn = numbers[start : start + 4]
+    return plain
+
+
+def normalize(state: list[float], rotations: Iterable[int]) -> None:
+    """Scale the quaternions that begin at some places of a state to unit length, in place."""
+    for start in rotations:
+        turn = state[start : start + 4]
         square = sum(part * part for part in turn)
-        scale = 1.0 if abs(square - 1.0) < UNIT or square == 0.0 else math.sqrt(square)
-        scale = -scale if turn[3] < 0.0 else scale
-        numbers[start : start + 4] = [part / scale for part in turn]
-    return numbers
-
-
-def light(here: Instant, there: Instant) -> bool:
-    """Tell whether one world becomes another without setting a state.
-
-    That is so if only parameters change that live bodies can take on.
-    """
-    return (
-        here.structure == there.structure
-        and here.state[:18] == there.state[:18]
-        and here.state[ROBOT_SIZE:] == there.state[ROBOT_SIZE:]
-        and all(here.parameters[key] == there.parameters[key] for key in heavy(here.structure))
-    )
-
-
-def heavy(structure: Structure) -> Iterator[ParameterKey]:
-    """List the parameters that need new bodies, or new contacts."""
-    yield ("robot", "height")
-    hulls = dict(structure.hulls)
-    for name in structure.blocks:
-        if name not in hulls:
-            yield (name, "size")
-    for name in structure.obstacles:
-        yield from ((name, quantity) for quantity in ("size", "position", "orientation"))
+        if abs(square - 1.0) >= UNIT and square != 0.0:
+            scale = math.sqrt(square)
+            state[start : start + 4] = [part / scale for part in turn]
 
 
 def arrays(parameters: Values) -> Parameters:
@@ -145,6 +128,6 @@ def arrays(parameters: Values) -> Parameters:
     return {key: np.array(value) for key, value in parameters.items()}
 
 
-def physical(structure: Structure, numbers: list[float]) -> PhysicalState:
+def state_of(structure: Structure, plain: list[float]) -> Any:
     """Turn plain numbers into a state."""
-    return PhysicalState(len(structure.blocks), np.array(numbers))
+    return structure.empty_state().with_vector(np.array(plain))

@@ -10,13 +10,13 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.bullet.arena import (
+from scm_world.backends.bullet.trifinger.arena import (
     BLOCK_SPINNING,
     COLLIDING_LINKS,
     OTHER_SPINNING,
     Shape,
 )
-from scm_world.backends.bullet.description import link_index
+from scm_world.backends.bullet.trifinger.description import link_index
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull
 from scm_world.models.scene import ParameterKey

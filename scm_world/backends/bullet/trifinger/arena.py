@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from scm_world.backends.bullet.description import JOINTS, PARTS, link_index, robot_urdf
+from scm_world.backends.bullet.trifinger.description import JOINTS, PARTS, link_index, robot_urdf
 from scm_world.geometry.hulls import Hull
 from scm_world.scene import trifinger
 from scm_world.scene.scene import WALL_HEIGHT, WALL_RADIUS, WALL_SEGMENTS, WALL_THICKNESS

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from scm_world.backends.base import Contact
-from scm_world.backends.bullet.description import LINKS_IN_ENGINE
-from scm_world.backends.bullet.dynamics import LOWER, Bodies
+from scm_world.backends.bullet.trifinger.description import LINKS_IN_ENGINE
+from scm_world.backends.bullet.trifinger.dynamics import LOWER, Bodies
 from scm_world.scene import trifinger
 
 

@@ -1,0 +1,1 @@
+"""How Bullet realizes a ``Model``."""

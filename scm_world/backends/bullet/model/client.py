@@ -1,0 +1,4 @@
+from scm_world.backends.bullet.client import Client
+
+class ModelClient(Client):
+    pass
