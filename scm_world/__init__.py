@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         do,
         verify,
     )
-    from scm_world.tasks import ModelTask, Task, TriFingerTask, make_task
+    from scm_world.tasks import ModelTask, StepTask, Task, TriFingerTask, make_task
     from scm_world.variables import (
         Action,
         Box,
@@ -58,6 +58,7 @@ _HOMES = {
     "ScmWorldEnv": "env",
     "ScmWorldError": "errors",
     "ModelTask": "tasks",
+    "StepTask": "tasks",
     "Task": "tasks",
     "TriFingerTask": "tasks",
     "discover": "discovery",
@@ -130,6 +131,7 @@ __all__ = [
     "ScmWorldEnv",
     "ScmWorldError",
     "Shift",
+    "StepTask",
     "Task",
     "TriFingerTask",
     "World",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Self, final
@@ -19,7 +19,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Samples, Setting
 from scm_world.queries.stages import stage_of
-from scm_world.tasks import ModelTask
+from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, WorldSnapshot
 from scm_world.world import World as Simulated
@@ -98,6 +98,54 @@ class World(Simulated):
             options: Of ``from_mjcf``.
         """
         return cls.from_mjcf(source, fixed_base=fixed_base, **options)
+
+    @classmethod
+    def from_step(
+        cls,
+        step: Callable[..., Any],
+        *,
+        backend: Backend | str = "step",
+        max_episode_length: int | None = None,
+        variables_space: AnyRegion | None = None,
+        **options: Any,
+    ) -> Self:
+        """Make a world of a function: ``step(parameters, state, action, noise) -> new state``.
+
+        Args:
+            step: The function, of four dicts by name; it gives a dict. See ``StepTask``.
+            backend: ``"step"``, or one that wraps it.
+            max_episode_length: In control steps.
+            variables_space: See ``scm_world.world.World``.
+            options: Of ``StepTask``: ``parameters``, ``states``, ``actions``, ``control_dt``,
+                ``noise``, ``outcomes``, ``reward``, ``start``, ``vectorized``, ….
+
+        Raises:
+            ModelError: The declaration is wrong.
+            UnknownOption: An option does not exist.
+
+        Example:
+            >>> from scm_world.variables import Box, Exogenous, Measured
+            >>> world = World.from_step(
+            ...     lambda parameters, state, action, noise: {
+            ...         "size": state["size"] * (1.0 + 0.1 * parameters["rate"])
+            ...     },
+            ...     parameters=[Exogenous(name="rate", default=1.0, bounds=Box(0.0, 2.0))],
+            ...     states=[Measured(name="size", default=1.0, parents=("rate", "size"))],
+            ...     control_dt=0.1,
+            ... )
+            >>> world.reset(seed=0)
+            >>> print(world.do({"rate": 2.0}))
+            rate = 2., engine reports 2.
+            >>> world.step([])
+            >>> float(world["size"])
+            1.2
+        """
+        return cls(
+            StepTask(step, **options),
+            backend=backend,
+            max_episode_length=max_episode_length,
+            variables_space=variables_space,
+        )
 
     _standing: Plan = Plan()
     _course: Course = Course(())

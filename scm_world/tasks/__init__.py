@@ -20,6 +20,7 @@ from scm_world.tasks.reaching import Reaching
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.stacked_blocks import StackedBlocks
 from scm_world.tasks.stacking2 import Stacking2
+from scm_world.tasks.step import StepTask
 from scm_world.tasks.towers import Towers
 from scm_world.tasks.trifinger import TriFingerTask
 
@@ -129,6 +130,7 @@ __all__ = [
     "Reaching",
     "StackedBlocks",
     "Stacking2",
+    "StepTask",
     "Task",
     "Timing",
     "Towers",

@@ -1,34 +1,34 @@
-"""A task whose physics is one function of the user's."""
+"""Any function as a task: ``step(parameters, state, action, noise)`` is the physics."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal, final
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Literal, Self, final
 
 import numpy as np
 
 from scm_world._types import Floats, Values
+from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
 from scm_world.entities import Clock, Commands, Composition
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.models import ParameterKey
 from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.model import REWARD, TERMINATED, _spread, beginning, declared
 from scm_world.tasks.observed import Observed
+from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import (
     Action,
+    Box,
     Derived,
     Distribution,
     Exogenous,
     Fixed,
-    Function,
     Measured,
     Parent,
     Variable,
 )
-
-LENGTH = 100
-"""Control steps of an episode, if no other length is asked for."""
 
 
 @final
@@ -46,7 +46,7 @@ class ProcessNoise(Commands):
     def __init__(
         self, sources: Mapping[str, Distribution], shapes: Mapping[str, tuple[int, ...]]
     ) -> None:
-        self._sources, self._shapes = dict(sources), dict(shapes)
+        self._drawn = [(name, source, shapes[name]) for name, source in sources.items()]
 
     def applies(self, values: Values) -> bool:
         """Tell that it is always needed."""
@@ -55,123 +55,206 @@ class ProcessNoise(Commands):
     def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
         """Give the action and the noise of a control step, shape (n_commands,)."""
         drawn = [
-            np.ravel(moment.draw(source, name, self._shapes[name], values, "process noise"))
-            for name, source in self._sources.items()
+            np.ravel(moment.draw(source, name, shape, values, "process noise"))
+            for name, source, shape in self._drawn
         ]
         return np.concatenate([action, *drawn])
 
 
 @final
 class StepComposition(Composition):
-    """What the variables of a step function mean to the backend.
+    """What the variables of a step function mean to the backend: each one itself.
 
     Args:
-        model: With the function.
-        names: Of the parameters.
-        clock: The counter of control steps.
+        system: With the function.
         noise: What draws the noise, if there is some.
     """
 
-    def __init__(
-        self, model: StepModel, names: Iterable[str], clock: Clock, noise: ProcessNoise | None
-    ) -> None:
-        self._model, self._keys = model, {q.name: q.key for q in model.parameters}
-        self.entities, self.commands = (clock,), noise
+    def __init__(self, system: StepModel, noise: ProcessNoise | None) -> None:
+        self._system, self.commands = system, noise
 
     def structure(self, values: Values) -> StepModel:
-        """Give the model, which is always the same."""
-        return self._model
+        """Give the system, which is always the same."""
+        return self._system
 
     def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which parameter: each one its own."""
-        return self._keys
+        """Say which variable sets which parameter."""
+        return {quantity.name: quantity.key for quantity in self._system.parameters}
 
     def slices(self) -> Mapping[str, slice]:
         """Say where each state stands in the state vector."""
-        return self._model.layout.slices
+        return self._system.layout.slices
 
 
 class StepTask(Task):
-    """A system that a function moves: ``step(parameters, state, action, noise) -> new state``.
+    """A system that a function moves, and what counts in it.
 
-    The causes of a state are the parents it declares, all of them one control step before; of a
-    state that declares none, every parameter, state and action is a cause. The function is held
-    against that by ``discover`` and ``verify``.
+    Every argument can also be an attribute of a class of your own::
+
+        class Growth(StepTask):
+            parameters = (Exogenous(name="rate", default=0.1, bounds=Box(0.0, 1.0)),)
+            states = (Measured(name="size", default=1.0, parents=("rate", "size")),)
+            control_dt = 0.1
+
+            @staticmethod
+            def step(parameters, state, action, noise):
+                return {"size": state["size"] * (1.0 + 0.1 * parameters["rate"])}
+
+    The causes of a state are the parents that it declares, all of them one control step before;
+    of one that declares none, every parameter, state and action is a cause. ``discover`` and
+    ``verify`` hold the function against that.
 
     Args:
-        step: The function; see ``StepModel`` for what it is given and gives. It must be the same
-            function of what it is given in every call.
+        step: The function; see ``StepModel`` for what it is given and gives.
         name: Of the task; that of the function if None.
         parameters: ``Exogenous`` variables, or ``Derived`` and ``Fixed`` ones.
-        states: ``Measured`` variables without a mechanism; ``do`` may set each of them. One with
-            ``start`` begins where that says, given its parents with ``when="set"``.
+        states: ``Measured`` variables without a mechanism. ``do`` may set each of them.
         actions: ``Action`` variables. The command is one after another.
-        control_dt: What one call of the function advances [s].
-        noise: What the function is given anew in every step, by name. What is named like a state
-            has its shape; else it is a number, or has as many components as its corners.
-        outcomes: ``Measured`` variables that are computed from others.
-        reward: A ``Measured`` variable named ``"reward"``, or a function and the names of what it
-            is a function of.
-        steps: Length of an episode in control steps.
+        control_dt: What one call of the function advances [s]: a control step.
+        noise: Distributions of what the function is given anew in every step, by name. What is
+            named like a state has its shape; else it is a number, or has the shape of the ends
+            of its box.
+        outcomes: ``Measured`` or ``Derived`` variables that are computed from others.
+        reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
+            parents: ``(harvested, "prey", "catch")``. A parent may be a ``Parent`` with lag 1.
+        success: The same for ``"success"``, 0 or 1.
+        terminated: The same for ``"terminated"``: whether the episode ends here.
+        start: Where episodes begin: for states a value, or a space or distribution to draw from.
+        observe: Names of what a policy observes; all states if None.
+        seconds: Length of an episode [s]; 100 control steps if None.
         vectorized: Whether the function takes many systems at once, with a leading axis.
         signature: ``"dicts"``, or ``"arrays"`` for flat arrays in the order of declaration.
 
     Raises:
         ModelError: With everything that is wrong with the declaration.
+        UnknownOption: An argument does not exist.
     """
 
     action_modes = ("actions",)
     presets = ("default",)
     frame_skip = 1
 
-    def __init__(
-        self,
-        step: Callable[..., Any],
-        *,
-        states: Sequence[Measured],
-        control_dt: float,
-        name: str | None = None,
-        parameters: Sequence[Variable] = (),
-        actions: Sequence[Action] = (),
-        noise: Mapping[str, Distribution] | None = None,
-        outcomes: Sequence[Variable] = (),
-        reward: Measured | tuple[Any, ...] | None = None,
-        steps: int = LENGTH,
-        vectorized: bool = False,
-        signature: Literal["dicts", "arrays"] = "dicts",
-    ) -> None:
-        noise = dict(noise or {})
-        _refuse(step, control_dt, parameters, states, actions, outcomes, noise, signature)
-        self.name = name or getattr(step, "__name__", type(step).__name__)
-        self.time_unit, self._steps = float(control_dt), steps
-        given = [variable.name for variable in (*parameters, *states, *actions)]
-        self._states = tuple(_with_causes(state, given) for state in states)
-        rewards = [] if reward is None else [_reward(reward)]
-        self._variables = (*parameters, *actions, *self._states, *outcomes, *rewards)
-        shapes = {state.name: state.shape for state in states}
-        self._noise = None
-        if noise:
-            own = {name: shapes.get(name, _shape(source)) for name, source in noise.items()}
-            self._noise = ProcessNoise(noise, own)
-        self.model = StepModel(
+    step: Callable[..., Any] | None = None
+    parameters: Iterable[Variable] = ()
+    states: Iterable[Measured] = ()
+    actions: Iterable[Action] = ()
+    control_dt: float = 0.1
+    noise: Mapping[str, Distribution] = {}  # a constant
+    outcomes: Iterable[Variable] = ()
+    reward: Any = None
+    success: Any = None
+    terminated: Any = None
+    start: Mapping[str, Any] = {}  # a constant
+    observe: Iterable[str] | None = None
+    seconds: float = None  # type: ignore[assignment] # a property of the base; filled in below
+    vectorized: bool = False
+    signature: Literal["dicts", "arrays"] = "dicts"
+
+    def __init__(self, step: Callable[..., Any] | None = None, **settings: Any) -> None:
+        allowed = [name for name in StepTask.__annotations__ if name != "step"] + ["name"]
+        for option, value in settings.items():
+            if option not in allowed:
+                raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
+            if value is not None:
+                setattr(self, option, value)
+        function = type(self).step if step is None else step
+        self.parameters, self.actions = tuple(self.parameters), tuple(self.actions)
+        self.states, self.outcomes = tuple(self.states), tuple(self.outcomes)
+        self._refuse(function)
+        named = "step" if type(self) is StepTask else type(self).__name__
+        self.name = getattr(self, "name", getattr(step, "__name__", named))
+        self.time_unit = float(self.control_dt)
+        if self.seconds is None:
+            self.seconds = 100 * self.time_unit
+        shapes = {state.name: state.shape for state in self.states}
+        shapes = {name: shapes.get(name, _shape(given)) for name, given in self.noise.items()}
+        self._drawn = ProcessNoise(self.noise, shapes) if self.noise else None
+        self.weights = {REWARD: 1.0} if self.reward is not None else {}
+        self.system = StepModel(
             self.name,
-            step,
+            function,  # type: ignore[arg-type] # it is callable, see above
             self.time_unit,
-            tuple(map(_quantity, parameters)),
-            tuple(map(_quantity, self._states)),
-            tuple(map(_quantity, actions)),
+            tuple(map(_quantity, self.parameters)),
+            tuple(map(_quantity, self.states)),
+            tuple(map(_quantity, self.actions)),
             tuple(
-                Quantity(name, own[name], integer=source.kind in ("integers", "categories"))
-                for name, source in noise.items()
+                Quantity(name, shapes[name], integer=given.kind in ("integers", "categories"))
+                for name, given in self.noise.items()
             ),
-            vectorized,
-            signature,
+            self.vectorized,
+            self.signature,
         )
 
-    @property
-    def seconds(self) -> float:
-        """Length of an episode [s]."""
-        return self._steps * self.time_unit
+    def _refuse(self, function: Any) -> None:
+        """Refuse what cannot be meant.
+
+        Raises:
+            ModelError: With all of it.
+        """
+        problems = []
+        if not callable(function):
+            problems.append(f"step={function!r} is no function")
+        elif hasattr(function, "py_func") and self.signature == "dicts":
+            problems.append('a compiled function takes no dicts: set signature="arrays"')
+        if self.signature not in ("dicts", "arrays"):
+            problems.append(f'signature={self.signature!r} must be "dicts" or "arrays"')
+        if not 0.0 < self.control_dt < np.inf:
+            problems.append(f"control_dt={self.control_dt!r} must be a positive number [s]")
+        if not self.states:
+            problems.append("there is no state: give states=[sw.Measured(name=…, parents=…)]")
+        kinds = {
+            "parameters": (Exogenous, Derived, Fixed),
+            "states": (Measured,),
+            "actions": (Action,),
+            "outcomes": (Measured, Derived),
+        }
+        for option, allowed in kinds.items():
+            choices = " or ".join(kind.__name__ for kind in allowed)
+            problems += [
+                f"{option}: {getattr(given, 'name', given)!r} must be {choices}"
+                for given in getattr(self, option)
+                if not isinstance(given, allowed)
+            ]
+        problems = problems or [*self._about_states(), *self._about_noise()]
+        if problems:
+            raise ModelError(problems)
+
+    def _about_states(self) -> Iterable[str]:
+        """Say what is wrong with the declaration of states."""
+        given = {variable.name for variable in (*self.parameters, *self.states, *self.actions)}
+        for state in self.states:
+            if state.mechanism is not None:
+                yield (
+                    f"{state.name!r} has a mechanism, but the step function moves it; "
+                    "what is computed from states belongs into outcomes="
+                )
+            for parent in state.parents:
+                if parent.name not in given and parent.when != "set":
+                    yield (
+                        f"{parent.name!r}, a parent of {state.name!r}, is no parameter, state or "
+                        "action: the step function is not given it"
+                    )
+        for name in self.start:
+            if name not in {state.name for state in self.states}:
+                yield f"start: {name!r} is no state"
+
+    def _about_noise(self) -> Iterable[str]:
+        """Say what is wrong with the distributions of the noise."""
+        for name, source in self.noise.items():
+            if not hasattr(source, "n_uniforms"):
+                yield f"noise: {name!r} is no distribution: {source!r}"
+            elif source.parents():
+                yield f"noise: {name!r} must not follow variables; scale it in the step function"
+
+    def on(self, backend: Backend) -> Self:
+        """Give the task as it is.
+
+        Raises:
+            UnknownOption: The backend is none of step functions.
+        """
+        if backend.name != "step":
+            raise UnknownOption("backend of a step function", backend.name, ("step",))
+        return self
 
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
         """Declare all variables, and say what they mean to the backend.
@@ -180,9 +263,47 @@ class StepTask(Task):
             UnknownOption: A control step is to be several calls of the function: the declared
                 edges are those of one.
         """
-        if timing.control_period != self.time_unit:
-            count = round(timing.control_period / self.time_unit)
-            raise UnknownOption("frame_skip", count, ("1: one call of the step function",))
-        clock = Clock(timing.steps, timing.control_period)
-        made = StepComposition(self.model, self._keys, clock, self._noise)
-        return made, [*self._variables, *clock.variables()]
+        calls = round(timing.control_period / self.time_unit)
+        if calls != 1:
+            raise UnknownOption("frame_skip", calls, ("1: a control step is one call of step",))
+        given = [v.name for v in (*self.parameters, *self.states, *self.actions)]
+        states = [one for state in self.states for one in self._state(state, given)]
+        clock = next(iter(Clock(timing.steps, timing.control_period).variables()))
+        counted = [
+            declared(name, getattr(self, name))
+            for name in (REWARD, SUCCESS, TERMINATED)
+            if getattr(self, name) is not None
+        ]
+        composition = StepComposition(self.system, self._drawn)
+        return composition, [
+            *self.parameters, *self.actions, *states, clock, *self.outcomes, *counted,
+        ]  # fmt: skip
+
+    def _state(self, state: Measured, given: Iterable[str]) -> Iterable[Variable]:
+        """Complete the declaration of a state, and declare what its beginning is drawn as."""
+        lagged = [Parent(p.name, 1, p.when) for p in state.parents if p.when != "set"]
+        causes = (
+            *(lagged or [Parent(name, 1) for name in given]),
+            *(p for p in state.parents if p.when == "set"),
+        )
+        default = _spread(0.0 if state.default is None else state.default, state.shape)
+        fields = {"parents": causes, "settable_state": True, "default": default}
+        return beginning(state.model_copy(update=fields), self.start.get(state.name))
+
+    def observed(self) -> Iterable[Observed]:
+        """List what a policy observes."""
+        names = self.system.layout.names if self.observe is None else tuple(self.observe)
+        return [Observed(name, (-np.inf, np.inf)) for name in names]
+
+
+def _quantity(variable: Any) -> Quantity:
+    """Say what the function is given, or gives, of a variable."""
+    default = getattr(variable, "value", getattr(variable, "default", None))
+    default = 0.0 if default is None else default
+    return Quantity(variable.name, variable.shape, default, integer=variable.dtype != "real")
+
+
+def _shape(source: Any) -> tuple[int, ...]:
+    """Give the shape of what is drawn from a distribution by itself."""
+    ends: Any = source.low if isinstance(source, Box) else 0.0
+    return np.shape(ends)
