@@ -13,6 +13,7 @@ from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode
 from scm_world.models.state import State
 from scm_world.scene import trifinger
+from scm_world.scene.scene import Structure
 from scm_world.scene.state import PhysicalState
 
 
@@ -20,17 +21,25 @@ from scm_world.scene.state import PhysicalState
 class FakeBackend(InMemory):
     """No forces and no contacts.
 
-    In ``joint_positions`` mode the joints jump to the command; in ``joint_torques`` mode they
-    stay. Blocks keep their velocity and their orientation.
+    In ``joint_positions`` mode the joints of the robot jump to the command; in ``joint_torques``
+    mode they stay. Blocks keep their velocity and their orientation. In any other structure
+    nothing moves.
     """
 
     name: ClassVar[str] = "fake"
     capabilities: ClassVar[Capabilities] = Capabilities(physics=False)
-    _state: PhysicalState
 
     def inertia(self, body: str) -> Floats:
-        """Compute the principal moments of inertia of a block or link, shape (3,) [kg m²]."""
+        """Compute the principal moments of inertia of a block or link, shape (3,) [kg m²].
+
+        Raises:
+            UnknownOption: There is no such body, or the structure is not that of the robot.
+        """
+        self._check([(body, "mass")])
         mass = self._parameters[body, "mass"]
+        if not isinstance(self._structure, Structure):
+            self._check([(body, "inertia")])
+            return self._parameters[body, "inertia"].copy()
         if body in trifinger.LINK_NAMES:
             index = trifinger.LINK_NAMES.index(body) % trifinger.LINKS_PER_FINGER
             return np.asarray(mass * np.array(trifinger.INERTIAL[index].per_mass))
@@ -47,6 +56,8 @@ class FakeBackend(InMemory):
             EngineFailure: A number is not finite afterwards.
         """
         state = self._state
+        if not isinstance(state, PhysicalState):
+            return
         if mode is ControlMode.JOINT_POSITIONS:
             state.joint_positions[:] = command
             state.joint_torques[:] = 0.0
@@ -58,4 +69,5 @@ class FakeBackend(InMemory):
 
     def _place(self, state: State) -> None:
         super()._place(state)
-        self._state.orientations[self._state.orientations[:, 3] < 0.0] *= -1.0
+        if isinstance(self._state, PhysicalState):
+            self._state.orientations[self._state.orientations[:, 3] < 0.0] *= -1.0

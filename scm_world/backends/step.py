@@ -294,11 +294,6 @@ class InMemory(Backend, ABC):
         """The structure of the scene."""
         return self._structure
 
-    @property
-    def n_blocks(self) -> int:
-        """How many movable blocks the scene has."""
-        return len(getattr(self._structure, "blocks", ()))
-
     def build(self, scene: Scene) -> None:
         """Remember the scene."""
         self._structure, self._state = scene.structure, scene.structure.empty_state()
@@ -343,10 +338,6 @@ class InMemory(Backend, ABC):
     def read(self, into: State) -> None:
         """Write the present state into an existing vector."""
         into.vector[:] = self._state.vector
-
-    def state(self) -> Any:
-        """Copy the present state."""
-        return self._state.copy()
 
     def contacts(self) -> tuple[Contact, ...]:
         """Nothing ever touches anything."""

@@ -250,9 +250,9 @@ class StepTask(Task):
         """Give the task as it is.
 
         Raises:
-            UnknownOption: The backend is none of step functions.
+            UnknownOption: The backend is one of bodies.
         """
-        if backend.name != "step":
+        if backend.name in ("mujoco", "bullet"):
             raise UnknownOption("backend of a step function", backend.name, ("step",))
         return self
 
