@@ -21,6 +21,7 @@ from scm_world.backends.mujoco.contacts import Touches, touches
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trifinger.realization import TriFinger
 from scm_world.errors import EngineFailure, SnapshotMismatch
+from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
     Difference,
@@ -55,7 +56,13 @@ class Payload:
 
 def realize(structure: Any, parameters: Parameters) -> Realization:
     """Compile a structure, and write all parameters."""
-    fresh = TriFinger(structure)
+    fresh: Realization
+    if isinstance(structure, Model):
+        from scm_world.backends.mujoco.articulated import Articulated
+
+        fresh = Articulated(structure, parameters)
+    else:
+        fresh = TriFinger(structure)
     fresh.edit(parameters)
     return fresh
 
@@ -144,7 +151,7 @@ class MujocoBackend(Backend):
         """Hold a command for some physics steps.
 
         Raises:
-            EngineFailure: A position or velocity is not finite afterwards.
+            EngineFailure: A number is not finite afterwards, or memory did not suffice.
             UnknownOption: The structure has no such mode.
         """
         if self._seat is not None:
@@ -153,14 +160,16 @@ class MujocoBackend(Backend):
         if mode is not now.mode:
             now.switch(mode)
         now.command[:] = command
+        now.forget()
         self._touches = None
         try:
             mujoco.mj_step(now.model, now.data, substeps)
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
-            now.forget()
+            now.recover()
             raise EngineFailure(f"MuJoCo: {error}", self.name) from error
-        if not now.settled():
-            raise EngineFailure("MuJoCo produced a state that is not finite", self.name)
+        problem = now.problem()
+        if problem:
+            raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[Contact, ...]:
         """List the contact points of the last physics step."""

@@ -12,7 +12,7 @@ from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
-from scm_world.backends.mujoco.realization import STATE, Realization
+from scm_world.backends.mujoco.realization import FULL, LOST, STATE, Realization
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode
 
@@ -71,7 +71,7 @@ class _Room:
         self.key = scene.key
         # An MjData for each scene: contacts of the last step can be asked for.
         self.batch: Any = Batch(scene.model, n, threads, persistent=True)
-        self.batch.warning[..., 1] = 1  # counts of one print nothing; see ``silence``
+        self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
         self.seats = [Seat(self, index) for index in range(n)]
         self.models: list[mujoco.MjModel] = [scene.model] * n
         self.read = scene.rows(self.batch)
@@ -114,7 +114,8 @@ class MujocoBatch(EngineBatch):
         """Hold commands for some physics steps.
 
         Raises:
-            EngineFailure: A position or velocity is not finite afterwards; all were stepped.
+            EngineFailure: A number is not finite afterwards, or memory did not suffice; all were
+                stepped.
         """
         if self._process != os.getpid():
             self._leave_threads()
@@ -176,7 +177,11 @@ def _step(room: _Room, which: Any, commands: Floats, substeps: int, into: Floats
         room.step(which, commands, substeps)
     except SimulationError as error:
         said = f"MuJoCo: {error}"
-    wrong = room.read(which, into)
-    if wrong >= 0 and not said:
-        said = f"MuJoCo produced a state that is not finite in scene {wrong} of the batch"
+    counts = room.batch.warning[..., 1]
+    wrong, full = room.read(which, into), counts[:, 1:3].max(axis=1) > 1
+    counts[:] = 1
+    if not said and full[which].any():
+        said = f"scene {which[full[which]][0]} of the batch: {FULL}"
+    elif not said and wrong >= 0:
+        said = f"scene {wrong} of the batch: {LOST}"
     return said

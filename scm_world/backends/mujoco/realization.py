@@ -17,14 +17,18 @@ from mujoco.batch import Batch
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.slots import Slot
-from scm_world.backends.mujoco.state import (
-    sensible,
-)
+from scm_world.backends.mujoco.state import sensible, sound
 from scm_world.errors import Infeasible, UnknownOption
 from scm_world.models.scene import ControlMode, ParameterKey, Parameters
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides how MuJoCo goes on."""
+
+LOST = "MuJoCo produced a state that is not finite"
+FULL = (
+    "MuJoCo has no memory for all contacts and constraints of this state; give it more in the file "
+    "of the model, for example with <size memory='100M'/>"
+)
 
 Rows = Callable[[Any, Floats], int]
 """Reads some states of a batch, and gives a row that is not finite, or -1."""
@@ -72,11 +76,18 @@ class Realization(ABC):
         self.mode = self.modes[0]
         self.edited = True
         self.command = data.ctrl[: structure.n_commands]
-        self._positions, self._velocities = data.qpos, data.qvel
-        self._weights = model.dof_M0, model.dof_invweight0, model.body_invweight0
+        self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
+        self._counts = data.warning.number
+        self._weights = (
+            model.body_mass,
+            model.body_inertia,
+            model.dof_M0,
+            model.dof_invweight0,
+            model.body_invweight0,
+        )
         self._size = int(mujoco.mj_stateSize(model, STATE))
-        silence(data)
-        silence(self._scratch)
+        # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
+        self._counts[:] = self._scratch.warning.number[:] = 1
 
     # --- state: how numbers are converted differs between kinds of structures ------------------
 
@@ -89,20 +100,31 @@ class Realization(ABC):
         """Write a state; all else stays as it is."""
 
     @abstractmethod
-    def settled(self) -> bool:
-        """Forget what was before a step; tell whether everything is finite after it."""
-
-    @abstractmethod
     def rows(self, batch: Batch) -> Rows:
         """Give what reads states of such models out of a batch."""
 
     def reset(self) -> None:
         """Forget every step."""
         mujoco.mj_resetData(self.model, self.data)
-        silence(self.data)
+        self._counts[:] = 1
 
     def forget(self) -> None:  # noqa: B027 # most have nothing to forget
-        """Forget what was before a step that is made elsewhere."""
+        """Forget what was before a step that is made now."""
+
+    def problem(self) -> str:
+        """Say what is wrong with what a step left, or nothing."""
+        if sound(self._positions, self._velocities, self._activations, self._counts):
+            return ""
+        full = self._counts[1] + self._counts[2] > 2
+        self._counts[:] = 1
+        return FULL if full else LOST
+
+    def recover(self) -> None:
+        """Free what a step was using when it failed; the state stays as the step left it."""
+        numbers = self.numbers()
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_setState(self.model, self.data, numbers, STATE)
+        self._counts[:] = 1
 
     def numbers(self) -> Floats:
         """Copy ``mjSTATE_INTEGRATION``."""
@@ -117,6 +139,7 @@ class Realization(ABC):
     def recall(self, numbers: Floats, memory: Any) -> None:
         """Go on from what was remembered."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
+        self._counts[:] = 1
 
     def follow(self, before: Realization) -> None:
         """Go on after the last step of another realization; then the state is written."""
@@ -173,36 +196,41 @@ class Realization(ABC):
         self.check(parameters)
         kept, slots = self.kept, self._slots
         before: dict[ParameterKey, Floats | None] = {}
-        for key, value in parameters.items():
-            present = kept.get(key)
-            if present is value:
-                continue
-            kept[key] = given = np.array(value, dtype=np.float64)
-            if present is not None and given.tobytes() == present.tobytes():
-                continue
-            before[key] = present
-            slots[key].write(given)
-        if not before:
-            return
-        self.edited = True
-        reason = self.followed(before)
-        if reason:
+        try:
+            for key, value in parameters.items():
+                present = kept.get(key)
+                if present is value:
+                    continue
+                given = np.array(value, dtype=np.float64)
+                if present is None or given.tobytes() != present.tobytes():
+                    before[key] = present
+                    slots[key].write(given)
+                kept[key] = given
+            if not before:
+                return
+            self.edited = True
+            reason = self.followed(before)
+            if reason:
+                names = ", ".join(".".join(key) for key in before)
+                raise Infeasible(names, parameters[next(iter(before))], [reason])
+        except BaseException:
             self._take_back(before)
-            names = [".".join(key) for key in before]
-            raise Infeasible(", ".join(names), parameters[next(iter(before))], [reason])
+            raise
 
     def followed(self, keys: Iterable[ParameterKey]) -> str:
         """Compute what follows from some parameters; say what is wrong with it, or nothing."""
         if self._constant.isdisjoint(keys):
             return ""
-        singular = self._scratch.warning.number
         try:
             mujoco.mj_setConst(self.model, self._scratch)
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
+            self._scratch = mujoco.MjData(self.model)  # the old one may still be in use inside
+            self._scratch.warning.number[:] = 1
             return f"MuJoCo says: {error}"
+        singular = self._scratch.warning.number
         if singular[0] != 1 or not sensible(*self._weights):
             singular[0] = 1
-            return "the inertia of the model would not be that of something that can move"
+            return "masses and moments of inertia would not be those of something that can move"
         return ""
 
     def _take_back(self, before: Mapping[ParameterKey, Floats | None]) -> None:
@@ -212,11 +240,3 @@ class Realization(ABC):
                 self.kept[key] = value
                 self._slots[key].write(value)
         self.followed(before)
-
-
-def silence(data: mujoco.MjData) -> None:
-    """Keep MuJoCo from printing warnings, and from writing them to a file.
-
-    It does so when it counts the first of each kind. We look for what is wrong ourselves.
-    """
-    data.warning.number[:] = 1

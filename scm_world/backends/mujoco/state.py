@@ -10,9 +10,17 @@ import numba
 from scm_world._types import Floats, Integers
 
 
-@numba.njit("b1(f8[::1], f8[::1], f8[::1])", cache=True)
-def finite(positions: Floats, velocities: Floats, activations: Floats) -> bool:
-    """Tell whether no number is infinite or not a number."""
+@numba.njit("b1(f8[::1], f8[::1], f8[::1], i4[:])", cache=True)
+def sound(positions: Floats, velocities: Floats, activations: Floats, counts: Any) -> bool:
+    """Tell whether all numbers are finite, and no contact or constraint was left out.
+
+    Args:
+        positions: Shape (nq,).
+        velocities: Shape (nv,).
+        activations: Shape (na,).
+        counts: Of MuJoCo's warnings, which begin with 1; the second is of contacts for which
+            there was no memory, the third of constraints.
+    """
     total = 0.0
     for value in positions:
         total += value * 0.0
@@ -20,7 +28,7 @@ def finite(positions: Floats, velocities: Floats, activations: Floats) -> bool:
         total += value * 0.0
     for value in activations:
         total += value * 0.0
-    return total == 0.0
+    return total == 0.0 and counts[1] + counts[2] == 2
 
 
 @numba.njit("void(f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])", cache=True)
@@ -84,20 +92,30 @@ def read_rows(states: Floats, places: Integers, which: Any, into: Floats) -> int
     return wrong
 
 
-@numba.njit("b1(f8[::1], f8[::1], f8[:, ::1])", cache=True)
-def sensible(inertia: Floats, dof_weights: Floats, body_weights: Floats) -> bool:
-    """Tell whether derived constants are those of something that can move.
+@numba.njit("b1(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", cache=True)
+def sensible(
+    masses: Floats, moments: Floats, inertia: Floats, dof_weights: Floats, body_weights: Floats
+) -> bool:
+    """Tell whether masses and what MuJoCo derives from them are those of something that can move.
 
     Args:
+        masses: Of the bodies, shape (nbody,).
+        moments: Their principal moments of inertia, shape (nbody, 3).
         inertia: Diagonal of the inertia matrix, shape (nv,).
         dof_weights: Inverse weights, shape (nv,).
         body_weights: Inverse weights, shape (nbody, 2).
     """
-    for i in range(inertia.shape[0]):
-        if not (0.0 < inertia[i] < math.inf and 0.0 <= dof_weights[i] < math.inf):
+    for body in range(masses.shape[0]):
+        a, b, c = moments[body]
+        least, most = min(a, b, c), max(a, b, c)
+        if not (0.0 <= masses[body] < math.inf and least >= 0.0 and most < math.inf):
             return False
-    for i in range(body_weights.shape[0]):
-        for j in range(2):
-            if not 0.0 <= body_weights[i, j] < math.inf:
+        if not a + b + c - 2.0 * most >= -1e-6 * most:  # the triangle inequality
+            return False
+        for weight in body_weights[body]:
+            if not 0.0 <= weight < math.inf:
                 return False
+    for dof in range(inertia.shape[0]):
+        if not (0.0 < inertia[dof] < math.inf and 0.0 <= dof_weights[dof] < math.inf):
+            return False
     return True

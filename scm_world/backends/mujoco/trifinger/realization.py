@@ -15,7 +15,6 @@ from scm_world.backends.mujoco.trifinger.parameters import couple, slots
 from scm_world.backends.mujoco.trifinger.servos import steer
 from scm_world.backends.mujoco.trifinger.state import (
     Instant,
-    finite,
     nothing,
     read_state,
     read_states,
@@ -97,13 +96,8 @@ class TriFinger(Realization):
         )
         self._source = np.arange(len(self.structure.blocks))
 
-    def settled(self) -> bool:
-        """Forget what was before a step; tell whether everything is finite after it."""
-        self._instant = self._written = None
-        return bool(finite(self._positions, self._velocities))
-
     def forget(self) -> None:
-        """Forget what was before a step that is made elsewhere."""
+        """Forget what was before a step that is made now."""
         self._instant = self._written = None
 
     def rows(self, batch: Batch) -> Rows:
