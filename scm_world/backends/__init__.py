@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
 from scm_world.backends.wrapper import BackendWrapper
 from scm_world.errors import MissingEngine, ModelError, UnknownOption
+from scm_world.models import Model
 
 BACKENDS = ("mujoco", "bullet", "step", "fake")
 """Names of the engines of this package."""
@@ -95,6 +96,13 @@ def make_backend(name: str) -> Backend:
     return backend
 
 
+def read_model(source: Any, **options: Any) -> Model:
+    """Read a model from a file; see ``scm_world.backends.mujoco.reading.read_model``."""
+    from scm_world.backends.mujoco.reading import read_model as read
+
+    return read(source, **options)
+
+
 __all__ = [
     "BACKENDS",
     "Backend",
@@ -104,5 +112,6 @@ __all__ = [
     "EngineSnapshot",
     "backends",
     "make_backend",
+    "read_model",
     "register",
 ]
