@@ -14,7 +14,6 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import gap
-from scm_world.queries.stillness import still
 from scm_world.scene import Scene
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Audit, World
@@ -135,7 +134,7 @@ def paired(request: dict[str, Any], options: Options) -> Outcome:
     try:
         world.reset(seed=options.seed)
         start, before, scene = world.snapshot(), world.values(), world.scene()
-        hold = still(world)
+        hold = world.task.idle(world)
         space: Any = options.space
         audit = world.do(request, space=space)
         at_once, models = world.values(), (world.model,)

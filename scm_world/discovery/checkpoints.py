@@ -12,7 +12,7 @@ from scm_world.output.locations import Location, located
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.paired import Paired
 
-FORMAT = "scm_world/discovery-progress/1"
+FORMAT = "scm_world/discovery-progress/2"
 ADVICE = "delete it to begin anew, or give another folder"
 
 
@@ -44,7 +44,9 @@ class Checkpoint:
                 raise ValueError(f"it is of another discovery: {', '.join(other)} differ")
             effects = Effects(
                 largest={(str(c), str(e), int(lag)): float(x) for c, e, lag, x in data["largest"]},
+                states={(str(c), str(e), int(lag)): int(n) for c, e, lag, n in data["states"]},
                 floor=float(data["floor"]),
+                resolution=paired.effects.resolution,
                 undone=set(map(str, data["undone"])),
                 rollouts=int(data["rollouts"]),
                 refused={str(name): int(n) for name, n in data["refused"].items()},
@@ -63,6 +65,7 @@ class Checkpoint:
             "terms": self._terms,
             "done": done,
             "largest": [[*key, size] for key, size in effects.largest.items()],
+            "states": [[*key, count] for key, count in effects.states.items()],
             "floor": effects.floor,
             "undone": sorted(effects.undone),
             "rollouts": effects.rollouts,

@@ -14,7 +14,6 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.queries.grasping import Grasp
 from scm_world.queries.planning import CrossEntropy
-from scm_world.queries.stillness import still as still  # it is one of the policies here
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import forward, inverse
 from scm_world.world import World
@@ -193,5 +192,5 @@ class _Hold(Blind):
     def ahead(self, world: World, first: int, count: int) -> Floats:
         """Give the action of the first step, again and again."""
         if self._action is None:
-            self._action = still(world)
+            self._action = world.task.idle(world)
         return np.tile(self._action, (count, 1))

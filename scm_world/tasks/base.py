@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self, final
 
@@ -15,6 +15,7 @@ from scm_world.backends import Backend
 from scm_world.entities import Composition
 from scm_world.errors import UnknownOption
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
+from scm_world.tasks.experiments import Scenario
 from scm_world.tasks.observed import Observed
 from scm_world.variables import Draw, Integers, Measured, Variable
 from scm_world.variables.kinds import SpaceName
@@ -59,6 +60,7 @@ class Task(ABC):
         goal_causes: The variables that a new goal is drawn for.
         plan: What there is, as ``arrange`` has it; None where that is always the same.
         absent: Entities that an intervention took away.
+        generated_graph: Whether edges follow from structure, so that some may never show.
         conventions: Ours or the predecessor's.
         given: What it was made with.
     """
@@ -78,6 +80,7 @@ class Task(ABC):
     goal_causes: ClassVar[tuple[str, ...]] = ()
     plan: Hashable = None
     absent: frozenset[str] = frozenset()
+    generated_graph: bool = False
     conventions: Conventions = CONVENTIONS["scm_world"]
 
     def __new__(cls, *args: Any, **given: Any) -> Self:
@@ -153,6 +156,26 @@ class Task(ABC):
     def solution(self, values: Values) -> dict[str, Value]:
         """Give an intervention after which the goal is fulfilled; none where there is no goal."""
         return {}
+
+    def idle(self, world: Any) -> Floats:
+        """Give the action that lets a world be: zero, or what is nearest to it.
+
+        Args:
+            world: In this task.
+
+        Returns:
+            Shape (n_actions,).
+        """
+        low, high = world.action_low, world.action_high
+        return np.asarray(np.clip(np.zeros(len(low)), low, high))
+
+    def scenarios(self, world: Any) -> Sequence[Scenario]:
+        """List kinds of state in which experiments tell something; none: those of any system.
+
+        Args:
+            world: In this task, where an episode begins.
+        """
+        return ()
 
     def nearby(self, values: Values) -> Iterable[dict[str, Value]]:
         """List interventions that change what stands in the world a little: one more, one fewer.

@@ -122,6 +122,7 @@ class ModelTask(Task):
 
     action_modes = ("controls",)
     presets = ("model",)
+    generated_graph = True
 
     model: Any = None
     expose: Iterable[str] | str | None = None

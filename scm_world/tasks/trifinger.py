@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Unpack
 
+import numpy as np
+
+from scm_world._types import Floats
 from scm_world.entities import ACTIONS, BlockWorld, Clock, Composition, Entity, Looks, Robot, Stage
 from scm_world.errors import UnknownOption
 from scm_world.models import ControlMode
@@ -14,7 +17,9 @@ from scm_world.scene import PRESETS, TIMESTEP, trifinger
 from scm_world.tasks import shaping
 from scm_world.tasks.arguments import numbers_of
 from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.experiments import Scenario
 from scm_world.tasks.rewards import Common, further_terms, resolve
+from scm_world.tasks.scenarios import scenarios
 from scm_world.variables import Linear, Measured, Variable
 
 REWARD = "reward"
@@ -68,6 +73,17 @@ class TriFingerTask(Task):
     @abstractmethod
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
+
+    def idle(self, world: Any) -> Floats:
+        """Keep the robot where it is told to be: joints, fingertips, or no torque, shape (9,)."""
+        if world.action_mode == "joint_torques":
+            return super().idle(world)
+        name = "end_effector_positions" if "effector" in world.action_mode else "joint_positions"
+        return np.array(world[name])
+
+    def scenarios(self, world: Any) -> Sequence[Scenario]:
+        """List where fingers and blocks touch, and where blocks come and go."""
+        return scenarios(world)
 
     def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
         """Leave out what is absent, and what is computed from something that is not there.

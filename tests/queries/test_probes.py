@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from scm_world.queries.experiments.probes import probes
-from scm_world.queries.experiments.scenarios import scenarios
 from scm_world.tasks import TASKS, make_task
 from scm_world.world import World
 
@@ -29,7 +28,7 @@ def test_every_scenario_is_feasible(task: str) -> None:
     """Of each kind of probe that there is room for, one can be prepared in two rounds."""
     world = World(make_task(task, **SMALL.get(task, {})), backend="fake")
     world.reset(seed=0)
-    kinds = [scenario.name for scenario in scenarios(world)]
+    kinds = [scenario.name for scenario in world.task.scenarios(world)]
     seen = {probe.kind for probe in probes(world, 2 * len(kinds), 0)}
     assert seen - {"start"} == {*kinds} - NO_ROOM.get(task, set())
 

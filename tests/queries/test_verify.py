@@ -16,7 +16,7 @@ from scm_world.cli import app
 from scm_world.cli.tasks import build
 from scm_world.cli.verification import SMALL
 from scm_world.discovery.coverage import draw_verification
-from scm_world.entities import Composition
+from scm_world.entities import BlockWorld
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.agreement import Agreement, Sign
 from scm_world.queries.verification import Verification
@@ -78,15 +78,15 @@ def test_pushing_on_one_engine_is_verified() -> None:
 
 def tampered(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., Any]) -> World:
     """Build a pushing world that declares other parents of one variable."""
-    honest = Composition.variables
+    honest = BlockWorld.variables
 
-    def variables(self: Composition) -> tuple[Variable, ...]:
+    def variables(self: BlockWorld) -> tuple[Variable, ...]:
         return tuple(
             v.model_copy(update={"parents": tuple(change(v.all_parents))}) if v.name == name else v
             for v in honest(self)
         )
 
-    monkeypatch.setattr(Composition, "variables", variables)
+    monkeypatch.setattr(BlockWorld, "variables", variables)
     return World("pushing")
 
 

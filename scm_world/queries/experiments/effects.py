@@ -13,7 +13,7 @@ EdgeKey = tuple[str, str, int]
 """Cause, effect, lag."""
 
 RESOLUTION = 1e-12
-"""Differences below it are not told from rounding, where the floor itself is exactly zero."""
+"""Differences below it count as none, where the floor is zero; of generated graphs, all count."""
 
 FACTOR = 10.0
 """How far above the floor an effect must lie."""
@@ -59,7 +59,9 @@ class Effects:
     Attributes:
         largest: By cause, effect and lag.
         settings: Where the largest effect of each pair was seen, if it is not zero.
+        states: In how many probe states each pair answered at all.
         floor: Largest difference after something was done and undone.
+        resolution: An effect must exceed it, however small the floor is.
         undone: Targets that were changed and put back.
         rollouts: Control steps simulated in an experiment of their own.
         refused: Targets for which no feasible value was found, with how often.
@@ -69,12 +71,15 @@ class Effects:
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
     settings: dict[EdgeKey, Setting] = field(default_factory=dict)
+    states: dict[EdgeKey, int] = field(default_factory=dict)
     floor: float = 0.0
+    resolution: float = RESOLUTION
     undone: set[str] = field(default_factory=set)
     rollouts: int = 0
     refused: dict[str, int] = field(default_factory=dict)
     setting: Setting | None = None
     responses: dict[tuple[EdgeKey, int], Response] | None = None
+    _answered: set[EdgeKey] = field(default_factory=set)
 
     def see(self, cause: str, effect: str, lag: int, after: Value, before: Value) -> None:
         """Remember a difference if it is the largest of its pair."""
@@ -83,8 +88,16 @@ class Effects:
             self.largest[key] = size
             if size > 0.0 and self.setting is not None:
                 self.settings[key] = self.setting
-        if self.responses is not None and size > 0.0:
-            self._respond(self.responses, key, np.ravel(after), np.ravel(before))
+        if size > 0.0:
+            self._answered.add(key)
+            if self.responses is not None:
+                self._respond(self.responses, key, np.ravel(after), np.ravel(before))
+
+    def end_of_probe(self) -> None:
+        """Count the pairs that answered in this probe state."""
+        for key in self._answered:
+            self.states[key] = self.states.get(key, 0) + 1
+        self._answered.clear()
 
     def _respond(
         self,
@@ -100,7 +113,7 @@ class Effects:
     @property
     def threshold(self) -> float:
         """What an effect must exceed, given the floor."""
-        return max(FACTOR * self.floor, RESOLUTION)
+        return max(FACTOR * self.floor, self.resolution)
 
     def found(self, threshold: float) -> set[EdgeKey]:
         """List the pairs whose effect exceeds a threshold."""
@@ -112,9 +125,11 @@ class Effects:
             self,
             largest=dict(self.largest),
             settings=dict(self.settings),
+            states=dict(self.states),
             undone=set(self.undone),
             refused=dict(self.refused),
             responses=None if self.responses is None else dict(self.responses),
+            _answered=set(),
         )
 
 

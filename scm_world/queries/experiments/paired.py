@@ -12,14 +12,21 @@ computed variable has a lagged cause if it still differs while all present value
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import InterventionError
-from scm_world.queries.experiments.effects import EdgeKey, Effects, Response, Setting, gap
+from scm_world.errors import EngineFailure, InterventionError
+from scm_world.queries.experiments.effects import (
+    RESOLUTION,
+    EdgeKey,
+    Effects,
+    Response,
+    Setting,
+    gap,
+)
 from scm_world.queries.experiments.mechanisms import see_mechanisms
 from scm_world.queries.experiments.probes import Probe
 from scm_world.variables import Box, Categories, Integers, Measured, Noise, Rotations, Variable
@@ -45,19 +52,39 @@ class Paired:
     Args:
         world: It is restored to the probe before every experiment.
         seed: Of the values that targets are set to.
+        causes: Names of the variables to experiment with; all if None.
         responses: Whether to keep every effect of every probe state.
+
+    Attributes:
+        effects: What was seen.
+        targets: The variables that ``do`` sets.
+        actions: The action variables.
     """
 
-    def __init__(self, world: World, seed: int, *, responses: bool = False) -> None:
+    def __init__(
+        self,
+        world: World,
+        seed: int,
+        *,
+        causes: Container[str] | None = None,
+        responses: bool = False,
+    ) -> None:
         self._world = world
         self._noise = Noise(seed)
         kept: dict[tuple[EdgeKey, int], Response] = {}
-        self.effects = Effects(responses=kept if responses else None)
+        self.effects = Effects(
+            responses=kept if responses else None,
+            resolution=0.0 if world.task.generated_graph else RESOLUTION,
+        )
         model = world.model
         self.targets = tuple(
             v.name
             for v in model.variables
             if v.settable and v.role != "action" and model.target(v.name) == v.name
+            if causes is None or v.name in causes
+        )
+        self.actions = tuple(
+            name for name in world.declaration.actions if causes is None or name in causes
         )
         self._declaration = world.declaration
         self._computed = world.computed
@@ -87,7 +114,8 @@ class Paired:
         self._later, self._memory = self._advanced(probe.action)
         for target in self.targets:
             self._experiment(target)
-        self._vary_action()
+        for action in self.actions:
+            self._vary_action(action)
         self._doing(None)
         if number < TRIED_ALONE:
             see_mechanisms(self._world, self._at_once, self.effects, self._noise, number)
@@ -95,6 +123,7 @@ class Paired:
             self._vary_readout(name)
             self._pool[name] = [*self._pool[name], self._at_once[name], self._later[name]]
             self._pool[name] = self._pool[name][-SEEN_ELSEWHERE:]
+        self.effects.end_of_probe()
 
     def memory(self) -> dict[str, list[Any]]:
         """Give what later probes need of earlier ones: values of readouts, as plain data."""
@@ -140,9 +169,9 @@ class Paired:
         self._doing(np.ravel(value) - np.ravel(self._at_once[target]))
         try:
             self._see_target(target, value)
-        except InterventionError:
+            self._undo(target, value)
+        except (InterventionError, EngineFailure):
             return False
-        self._undo(target, value)
         return True
 
     def _see_target(self, target: str, value: Value) -> None:
@@ -176,11 +205,12 @@ class Paired:
         uniforms = self._noise.uniforms(variable.name, n=n, episode=self._number, step=attempt)[0]
         direction = (0.5 + 0.5 * uniforms).reshape(variable.shape)
         match variable.bounds:
-            case Box():
-                low, high = variable.bounds.bounds(variable.shape, self._at_once)
-                moved = present + step * direction * (high - low)
-                inside = np.where((moved < low) | (moved > high), 2 * present - moved, moved)
-                return np.asarray(np.clip(inside, low, high))
+            case Box() | None if variable.dtype == "real":
+                high = np.full(variable.shape, np.inf)
+                ends = (-high, high)
+                if variable.bounds is not None:
+                    ends = variable.bounds.bounds(variable.shape, self._at_once)
+                return _elsewhere(present, step * direction, *ends)
             case Rotations():
                 return variable.bounds.nearest(present + 4 * step * direction)
             case Integers():
@@ -198,9 +228,11 @@ class Paired:
         reached = world.values()
         moved = [n for n in reached if n != target and gap(reached[n], self._at_once[n]) > 0.0]
         held = [n for n in moved if n not in self._computed]
-        self._see_settable(target, value, held, deciding)
-        self._hold(target, value, (*deciding, *held))
-        alone = world.values()
+        alone = reached
+        if held:
+            self._see_settable(target, value, held, deciding)
+            self._hold(target, value, (*deciding, *held))
+            alone = world.values()
         self._see_computed(target, [n for n in moved if n in self._computed], alone)
         self._see_later(target)
 
@@ -293,14 +325,21 @@ class Paired:
         worst = max(gap(after[name], self._later[name]) for name in after)
         self.effects.floor = max(self.effects.floor, worst)
 
-    def _vary_action(self) -> None:
+    def _vary_action(self, name: str) -> None:
+        """Find the effects of another value of one action, within its range."""
         self._world.restore(self._probe.snapshot)
-        spread = self._world.action_high - self._world.action_low
-        unit = self._noise.uniforms("action", n=9, episode=self._number)[0]
-        change = 0.1 * spread * (unit - 0.5)
-        self._doing(change)
-        after, memory = self._advanced(self._probe.action + change)
-        self._compare_later("action", after, memory)
+        where = self._world.declaration.actions[name]
+        low, high = self._world.action_low[where], self._world.action_high[where]
+        unit = self._noise.uniforms(name, n=len(low), episode=self._number)[0]
+        action = np.array(self._probe.action)
+        present = np.clip(action[where], low, high)
+        action[where] = _elsewhere(present, 0.1 * (unit - 0.5), low, high)
+        self._doing(action[where] - present)
+        try:
+            after, memory = self._advanced(action)
+        except EngineFailure:
+            return
+        self._compare_later(name, after, memory)
 
     def _vary_readout(self, cause: str) -> None:
         """Give a readout another value, seen elsewhere, and watch what is computed from it.
@@ -312,3 +351,16 @@ class Paired:
             known = {**self._at_once, cause: value}
             self._see_computed(cause, others, known)
             self._see_memory(cause, {**self._memory, cause: value})
+
+
+def _elsewhere(present: Value, share: Floats, low: Floats, high: Floats) -> Value:
+    """Move numbers by a share of their range; of one without ends, of their size.
+
+    Where that is outside, they are moved the other way.
+    """
+    size = np.where(present == 0.0, 1.0, np.abs(present))
+    with np.errstate(invalid="ignore"):  # a range from nowhere to nowhere
+        spread = np.where(np.isfinite(high - low), high - low, size)
+    moved = present + share * spread
+    inside = np.where((moved < low) | (moved > high), 2 * present - moved, moved)
+    return np.asarray(np.clip(inside, low, high))

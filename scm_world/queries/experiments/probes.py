@@ -1,24 +1,32 @@
 """Probe states: where experiments are made.
 
-All choices are drawn from keyed noise: probe i of a seed is the same, whatever ran before.
+A task may know where causes show; see ``Task.scenarios``. Of any other system, states are drawn:
+where episodes begin, where random actions lead, and anywhere that can be, with parameters as they
+are and with others. All choices are drawn from keyed noise: probe i of a seed is the same,
+whatever ran before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import Floats
-from scm_world.errors import InterventionError
-from scm_world.queries.experiments.placing import Dice, joints_for
-from scm_world.queries.experiments.scenarios import AT_START, Scenario, scenarios
-from scm_world.variables import Noise
+from scm_world._types import Floats, Value
+from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
+from scm_world.tasks.experiments import Dice, Scenario
+from scm_world.variables import Box, Exogenous, Measured, Noise, Rotations, Variable
 from scm_world.world import World, WorldSnapshot
 
 ATTEMPTS = 20  # how often a scenario is tried with other numbers where it is not feasible
+LONGEST = 60  # control steps of random actions before a probe state
+KEPT = 10  # for how many control steps an action is kept at most
+JITTER = 0.2  # how far, as a fraction, a parameter without a space is moved
+SHARE = 0.5  # of the parameters that have other values, in the probes where some have
+REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
+"""How far a state without bounds is moved from where it is, by its unit; others by 1."""
 
 
 @final
@@ -29,7 +37,7 @@ class Probe:
     Attributes:
         kind: How it came about.
         snapshot: Of the world.
-        action: What the robot does next, shape (9,).
+        action: What is done next, shape (n_actions,).
     """
 
     kind: str
@@ -52,40 +60,169 @@ def probes(
     """
     noise = Noise(seed)
     world.reset(seed=seed)
-    kinds = scenarios(world)
+    kinds = tuple(world.task.scenarios(world)) or (ANY if settled else ANY_MADE)
     for number in range(first, n):
         yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
 
 
 def _prepared(world: World, scenario: Scenario, noise: Noise, number: int, settled: bool) -> Probe:
+    """Prepare a state from which the world can go on; the beginning where nothing else is one.
+
+    Raises:
+        EngineFailure: It cannot go on from the beginning either.
+    """
     for attempt in range(ATTEMPTS):
-        dice = Dice(noise, number, attempt)
         world.reset(seed=number)
         try:
-            states, drive = scenario.prepare(world, dice)
-            world.do(states)
-        except InterventionError:
+            return _made(world, scenario, Dice(noise, number, attempt), settled)
+        except (InterventionError, EngineFailure):
             continue
-        return _settled(world, scenario if settled else replace(scenario, steps=0), drive, dice)
     world.reset(seed=number)
-    dice = Dice(noise, number)
-    start = AT_START if settled else replace(AT_START, steps=0)
-    return _settled(world, start, AT_START.prepare(world, dice)[1], dice)
+    return _made(world, AT_START, Dice(noise, number), settled)
 
 
-def _settled(world: World, scenario: Scenario, drive: Floats, dice: Dice) -> Probe:
-    action = _command(world, drive, dice)
+def _made(world: World, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
+    states, extra = scenario.prepare(world, dice)
+    if states:
+        world.do(states)
+    action = scenario.act(world, extra, dice)
     drawn = round(dice.between(0.0, 2.0))
-    for _ in range(drawn if scenario.steps is None else scenario.steps):
+    steps = drawn if scenario.steps is None else scenario.steps
+    for _ in range(steps if settled else 0):
         world.step(action)
-    return Probe(scenario.name, world.snapshot(), _command(world, drive, dice))
+    action = scenario.act(world, extra, dice)
+    snapshot = world.snapshot()
+    world.step(action)
+    if not np.isfinite(world.current()[1].vector).all():
+        raise EngineFailure("the state is lost", world.backend.name)
+    return Probe(scenario.name, snapshot, action)
 
 
-def _command(world: World, drive: Floats, dice: Dice) -> Floats:
-    """Turn fingertip positions into an action of the world's mode, with a little variety."""
-    if world.action_mode == "end_effector_positions":
-        return np.asarray(drive + dice.between(-0.005, 0.005, 9))
-    joints = joints_for(world, drive) + dice.between(-0.05, 0.05, 9)
-    if world.action_mode == "joint_positions":
-        return np.asarray(joints)
-    return np.asarray(np.clip(5.0 * (joints - np.array(world["joint_positions"])), -0.3, 0.3))
+# --- of any system ------------------------------------------------------------------------------
+
+
+def start(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+    """Stay where the episode begins."""
+    return {}, None
+
+
+def onward(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+    """Go where random actions lead, each kept for a while."""
+    steps = 1 + int(dice.between(0.0, LONGEST))
+    kept = 1 + int(dice.between(0.0, KEPT))
+    actions = dice.of("probe way", steps * world.declaration.n_actions).reshape(steps, -1)
+    for step in range(steps):
+        world.step(_within(world, actions[step // kept]))
+    return {}, None
+
+
+def anywhere(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+    """Move everything to where it can be, with velocities of a few natural units."""
+    model = world.model
+    variables = (v for v in model.variables if isinstance(v, Measured) and v.settable)
+    states = {
+        v.name: _moved(v, world[v.name], dice)
+        for v in variables
+        if v.dtype == "real" and model.target(v.name) == v.name
+    }
+    return states, None
+
+
+def _with_others(prepare: Any) -> Any:
+    """Prepare a state under other parameters."""
+
+    def prepared(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+        set_others(world, dice)
+        found: tuple[dict[str, Value], None] = prepare(world, dice)
+        return found
+
+    return prepared
+
+
+def set_others(world: World, dice: Dice) -> None:
+    """Set about half of the parameters to values of their spaces, or near those that they have.
+
+    What cannot be set together with the rest stays as it is.
+    """
+    drawn = (
+        (v.name, _jittered(v, world, dice))
+        for v in world.model.variables
+        if isinstance(v, Exogenous) and v.settable and v.dtype == "real"
+    )
+    request = {name: value for name, value in drawn if value is not None}
+    while request:
+        try:
+            world.do(request)
+        except InterventionError as error:
+            problems = error.problems if isinstance(error, SeveralProblems) else (error,)
+            refused = {problem.variable for problem in problems} & request.keys()
+            if not refused:
+                return
+            for name in refused:
+                del request[name]
+        else:
+            return
+
+
+def _jittered(variable: Exogenous, world: World, dice: Dice) -> Value | None:
+    """Give another value of a parameter, or None where it keeps the one that it has."""
+    n = int(np.prod(variable.shape))
+    unit = dice.of(f"{variable.name}|other", n + 2)
+    space = variable.a if unit[0] < 0.5 else variable.b
+    if unit[1] >= SHARE:
+        return None
+    present = world[variable.name]
+    if isinstance(space, Box):
+        low, high = space.bounds(variable.shape, world.current()[0])
+        if np.isfinite(low).all() and np.isfinite(high).all():
+            return np.asarray(low + unit[2:].reshape(variable.shape) * (high - low))
+    moved = present * (1.0 + JITTER * (2.0 * unit[2:].reshape(variable.shape) - 1.0))
+    bounds = variable.bounds
+    return np.asarray(moved if bounds is None else bounds.nearest(moved, world.current()[0]))
+
+
+def _moved(variable: Variable, present: Value, dice: Dice) -> Value:
+    """Draw a value of a state: within its bounds, or within reach of where it is."""
+    n = int(np.prod(variable.shape))
+    unit = 2.0 * dice.of(f"{variable.name}|moved", n).reshape(variable.shape) - 1.0
+    if isinstance(variable.bounds, Rotations):
+        return variable.bounds.nearest(present + 2.0 * unit)
+    reach = REACH.get(variable.unit, 1.0)
+    low, high = np.full(variable.shape, -np.inf), np.full(variable.shape, np.inf)
+    if isinstance(variable.bounds, Box):
+        low, high = variable.bounds.bounds(variable.shape, {})
+    low = np.where(np.isfinite(low), low, np.minimum(present, high) - reach)
+    high = np.where(np.isfinite(high), high, np.maximum(present, low) + reach)
+    return np.asarray(low + 0.5 * (1.0 + unit) * (high - low))
+
+
+def _within(world: World, unit: Floats) -> Floats:
+    """Give the action at some shares of its range; of one without an end, of [-1, 1]."""
+    low, high = world.action_low, world.action_high
+    low = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2.0))
+    high = np.where(np.isfinite(high), high, np.maximum(1.0, low + 2.0))
+    return np.asarray(low + unit * (high - low))
+
+
+def _at_random(world: World, extra: None, dice: Dice) -> Floats:
+    """Draw an action."""
+    return _within(world, dice.of("probe action", world.declaration.n_actions))
+
+
+AT_START = Scenario("start", start, _at_random, steps=0)
+_MADE = (
+    Scenario("anywhere", anywhere, _at_random),
+    Scenario("anywhere, other parameters", _with_others(anywhere), _at_random),
+)
+ANY = (
+    AT_START,
+    Scenario("onward", onward, _at_random, steps=0),
+    _MADE[0],
+    Scenario("onward, other parameters", _with_others(onward), _at_random, steps=0),
+    Scenario("onward", onward, _at_random, steps=0),
+    _MADE[1],
+)
+"""What is tried in a system of which the task knows nothing."""
+
+ANY_MADE = (AT_START, *_MADE)
+"""The same where a state is made of the same numbers on every engine."""

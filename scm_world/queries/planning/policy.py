@@ -14,7 +14,6 @@ from scm_world.graph import flatten
 from scm_world.queries.planning.model import Model
 from scm_world.queries.planning.scores import Score, as_score, nearness
 from scm_world.queries.planning.search import Found, Search, search
-from scm_world.queries.stillness import still
 from scm_world.world import World
 from scm_world.world.start import whole_number
 
@@ -148,7 +147,7 @@ class _Program:
 
     def _rest(self, world: World) -> Found:
         """Begin with staying where it is."""
-        actions = np.tile(still(world), (self._policy.search.horizon, 1))
+        actions = np.tile(world.task.idle(world), (self._policy.search.horizon, 1))
         return Found(actions, -np.inf, actions, actions[None][:0])
 
     def _left(self) -> Found:

@@ -1,4 +1,4 @@
-"""Scenarios: the kinds of place in state space where causes have a chance to show.
+"""Where causes in the robot's world have a chance to show.
 
 An edge that needs contact shows only where there is contact. So besides free motion, fingers are
 held against a block, on the floor and at the wall; blocks are in the air, at the wall, on one
@@ -8,18 +8,18 @@ another, in their goals, and where a further block or obstacle would come into b
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import final
+from typing import Any
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
-from scm_world.queries.experiments.placing import (
+from scm_world.scene.scene import WALL_RADIUS
+from scm_world.tasks.experiments import Dice, Scenario
+from scm_world.tasks.placing import (
     CLEARANCE,
     HIGHEST,
     TIP,
-    Dice,
     Setting,
     around,
     facing,
@@ -32,36 +32,15 @@ from scm_world.queries.experiments.placing import (
     top,
     touched,
 )
-from scm_world.scene.scene import WALL_RADIUS
 from scm_world.variables import catalogue as numbers
-from scm_world.world import World
 
 PLACES = "obstacle_places"
-
-
-@final
-@dataclass(frozen=True)
-class Scenario:
-    """A kind of probe.
-
-    Attributes:
-        prepare: Chooses what to set in a world that has just been reset.
-        steps: How many control steps are taken before the experiments; drawn from 0 to 2 if None.
-    """
-
-    prepare: Callable[[World, Dice], Setting]
-    steps: int | None = None
-
-    @property
-    def name(self) -> str:
-        """How the probe came about."""
-        return self.prepare.__name__
 
 
 # --- one block, or none -------------------------------------------------------------------------
 
 
-def touch(world: World, dice: Dice) -> Setting:
+def touch(world: Any, dice: Dice) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
     middle = dice.between(-0.02, 0.02, 2)
     states, angles, _ = touched(world, dice, middle, 0.0, heights=(0.3, 0.8), yaw=0.8)
@@ -70,7 +49,7 @@ def touch(world: World, dice: Dice) -> Setting:
     return states, drive
 
 
-def on_obstacle(world: World, dice: Dice) -> Setting:
+def on_obstacle(world: Any, dice: Dice) -> Setting:
     """Stand the blocks on the first obstacle and let all three fingers press on one."""
     obstacle = world.composition.obstacles[0]
     center = world[f"{obstacle}.cartesian_position"]
@@ -83,7 +62,7 @@ def on_obstacle(world: World, dice: Dice) -> Setting:
     return states, around(center, dice.between(0.0, 0.02), angles + 0.4, height - 0.02)
 
 
-def block_in_air(world: World, dice: Dice) -> Setting:
+def block_in_air(world: Any, dice: Dice) -> Setting:
     """Let the first block fall and tumble."""
     name = world.composition.blocks[0]
     states = {
@@ -95,17 +74,12 @@ def block_in_air(world: World, dice: Dice) -> Setting:
     return states, present_tips(world)
 
 
-def free(world: World, dice: Dice) -> Setting:
+def free(world: Any, dice: Dice) -> Setting:
     """Change nothing; the robot drives somewhere."""
     return {}, present_tips(world) + dice.between(-0.05, 0.05, 9)
 
 
-def start(world: World, dice: Dice) -> Setting:
-    """Change nothing; the robot stays where it is."""
-    return {}, present_tips(world)
-
-
-def finger_on_floor(world: World, dice: Dice) -> Setting:
+def finger_on_floor(world: Any, dice: Dice) -> Setting:
     """Put the fingertips on the floor and let them rub it."""
     angles, center = facing(dice), np.zeros(3)
     radius = dice.between(0.1, 0.13)
@@ -114,7 +88,7 @@ def finger_on_floor(world: World, dice: Dice) -> Setting:
     return states, around(center, radius - 0.02, angles + 0.2, -0.02)
 
 
-def finger_at_wall(world: World, dice: Dice) -> Setting:
+def finger_at_wall(world: Any, dice: Dice) -> Setting:
     """Put the fingertips at the ring wall and let them rub it."""
     angles, center = facing(dice), np.zeros(3)
     inside = WALL_RADIUS - TIP - 3e-3
@@ -127,12 +101,12 @@ def finger_at_wall(world: World, dice: Dice) -> Setting:
 # --- all blocks ---------------------------------------------------------------------------------
 
 
-def tower(world: World, dice: Dice) -> Setting:
+def tower(world: Any, dice: Dice) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
     return pressed(world, dice, dice.between(-0.01, 0.01, 2), 0.0)
 
 
-def block_at_wall(world: World, dice: Dice) -> Setting:
+def block_at_wall(world: Any, dice: Dice) -> Setting:
     """Let the blocks slide along the wall, on one another."""
     size = sizes(world)[0]
     angle = dice.between(-np.pi, np.pi)
@@ -147,12 +121,12 @@ def block_at_wall(world: World, dice: Dice) -> Setting:
     return states, present_tips(world)
 
 
-def solved(world: World, dice: Dice) -> Setting:
+def solved(world: Any, dice: Dice) -> Setting:
     """Begin where the goal is fulfilled."""
     return world.task.solution(world.values()), present_tips(world)
 
 
-def leaving(world: World, dice: Dice) -> Setting:
+def leaving(world: Any, dice: Dice) -> Setting:
     """Begin where the goal is fulfilled, with the blocks on their way up."""
     states = world.task.solution(world.values())
     for name in world.composition.blocks:
@@ -164,7 +138,7 @@ def leaving(world: World, dice: Dice) -> Setting:
 # --- what may come into being -------------------------------------------------------------------
 
 
-def on_newcomer(world: World, dice: Dice) -> Setting:
+def on_newcomer(world: Any, dice: Dice) -> Setting:
     """Stand some blocks where a further one would come into being, and press on one of them.
 
     High towers may be out of the fingers' reach there, so how many there are is drawn.
@@ -176,7 +150,7 @@ def on_newcomer(world: World, dice: Dice) -> Setting:
     return pressed(world, dice, place[:2], place[2], some)
 
 
-def all_on_newcomer(world: World, dice: Dice) -> Setting:
+def all_on_newcomer(world: Any, dice: Dice) -> Setting:
     """Stand all blocks where a further one would come into being; the robot stays where it is."""
     place = _newcomer(world)
     if place is None:
@@ -184,7 +158,7 @@ def all_on_newcomer(world: World, dice: Dice) -> Setting:
     return stacked(world, dice, place[:2], place[2]), present_tips(world)
 
 
-def on_coming_obstacle(world: World, dice: Dice) -> Setting:
+def on_coming_obstacle(world: Any, dice: Dice) -> Setting:
     """Say that the next obstacle comes to lie in the middle, and press on blocks above it."""
     places, here = np.array(world[PLACES]), len(world.composition.obstacles)
     edge = numbers.OBSTACLE_SIZE[2]
@@ -194,7 +168,7 @@ def on_coming_obstacle(world: World, dice: Dice) -> Setting:
     return {PLACES: places, **states}, drive
 
 
-def obstacle_ahead(world: World, dice: Dice) -> Setting:
+def obstacle_ahead(world: Any, dice: Dice) -> Setting:
     """Say that obstacles, should there be any, are where the fingers are about to go."""
     tips = present_tips(world).reshape(3, 3)
     places = np.array(world[PLACES])
@@ -203,7 +177,7 @@ def obstacle_ahead(world: World, dice: Dice) -> Setting:
     return {PLACES: places}, (tips + 0.05 * inward).ravel()
 
 
-def _newcomer(world: World) -> Floats | None:
+def _newcomer(world: Any) -> Floats | None:
     """Find where a further block or obstacle would be: its middle and its top, shape (3,) [m]."""
     before = world.snapshot()
     for request in world.task.nearby(world.values()):
@@ -220,47 +194,54 @@ def _newcomer(world: World) -> Floats | None:
 
 # --- which there are ----------------------------------------------------------------------------
 
-_WITHOUT_BLOCKS = (
-    Scenario(free),
-    Scenario(finger_on_floor),
-    Scenario(finger_at_wall),
-    Scenario(solved, steps=0),
+Kind = tuple[Callable[[Any, Dice], Setting], int | None]
+"""How a state is prepared, and how many control steps are then taken; see ``Scenario``."""
+
+_WITHOUT_BLOCKS: tuple[Kind, ...] = (
+    (free, None),
+    (finger_on_floor, None),
+    (finger_at_wall, None),
+    (solved, 0),
 )
-_WITH_BLOCK = (
-    Scenario(touch),
-    Scenario(free),
-    Scenario(block_at_wall, steps=0),  # a block hits the wall once
-    Scenario(finger_on_floor),
-    Scenario(touch),
-    Scenario(block_in_air, steps=0),
-    Scenario(finger_at_wall),
-    Scenario(solved, steps=0),
-    Scenario(leaving, steps=1),  # a goal that is fulfilled is left in one step
+_WITH_BLOCK: tuple[Kind, ...] = (
+    (touch, None),
+    (free, None),
+    (block_at_wall, 0),  # a block hits the wall once
+    (finger_on_floor, None),
+    (touch, None),
+    (block_in_air, 0),
+    (finger_at_wall, None),
+    (solved, 0),
+    (leaving, 1),  # a goal that is fulfilled is left in one step
 )
-_WITH_BLOCKS = (Scenario(tower), *_WITH_BLOCK[:4], Scenario(tower), *_WITH_BLOCK[5:])
-AT_START = Scenario(start)
-"""What is left where nothing else is feasible."""
+_WITH_BLOCKS: tuple[Kind, ...] = (
+    (tower, None),
+    *_WITH_BLOCK[:4],
+    (tower, None),
+    *_WITH_BLOCK[5:],
+)
 
 
-def _by_blocks(count: int) -> tuple[Scenario, ...]:
-    match count:
-        case 0:
-            return _WITHOUT_BLOCKS
-        case 1:
-            return _WITH_BLOCK
-    return _WITH_BLOCKS
-
-
-def scenarios(world: World) -> tuple[Scenario, ...]:
+def scenarios(world: Any) -> tuple[Scenario, ...]:
     """List what can be tried in a world, the most telling first."""
     made = world.composition
-    found = _by_blocks(len(made.blocks))
+    found = (_WITHOUT_BLOCKS, _WITH_BLOCK, _WITH_BLOCKS)[min(2, len(made.blocks))]
     if made.blocks and world.task.decided_by:
-        found = (Scenario(on_newcomer, steps=0), Scenario(all_on_newcomer, steps=0), *found)
+        found = ((on_newcomer, 0), (all_on_newcomer, 0), *found)
     if made.blocks and made.obstacles:
-        found = (Scenario(on_obstacle), *found)
-    if PLACES not in world.model:
-        return found
-    if made.blocks:
-        found = (Scenario(on_coming_obstacle, steps=0), *found)
-    return (*found, Scenario(obstacle_ahead, steps=0))
+        found = ((on_obstacle, None), *found)
+    if PLACES in world.model and made.blocks:
+        found = ((on_coming_obstacle, 0), *found)
+    if PLACES in world.model:
+        found = (*found, (obstacle_ahead, 0))
+    return tuple(Scenario(prepare.__name__, prepare, driven, steps) for prepare, steps in found)
+
+
+def driven(world: Any, drive: Floats, dice: Dice) -> Floats:
+    """Turn fingertip positions into an action of the world's mode, with a little variety."""
+    if world.action_mode == "end_effector_positions":
+        return np.asarray(drive + dice.between(-0.005, 0.005, 9))
+    joints = joints_for(world, drive) + dice.between(-0.05, 0.05, 9)
+    if world.action_mode == "joint_positions":
+        return np.asarray(joints)
+    return np.asarray(np.clip(5.0 * (joints - np.array(world["joint_positions"])), -0.3, 0.3))

@@ -2,67 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import inverse
-from scm_world.variables import Noise
-from scm_world.world import World
+from scm_world.tasks.experiments import Dice
 
 TIP = trifinger.COLLISION["tip"].radius  # [m]
 CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch
 LOOSE = 1.5e-3  # [m] the same for blocks on one another, which do not stand quite straight
 HIGHEST = 6  # blocks that are stacked
 REACH = 0.045  # [m] from here up all three fingers can press on something in the middle
-_DRAWS = 96
-
 
 Setting = tuple[dict[str, Value], Floats]
 """States to set, and the fingertip positions that the robot then drives at, shape (9,) [m]."""
 
 
-@final
-class Dice:
-    """The random numbers of one probe.
-
-    Args:
-        noise: The seed's noise.
-        probe: Number of the probe.
-        attempt: Counts up where a choice was not feasible.
-    """
-
-    def __init__(self, noise: Noise, probe: int, attempt: int = 0) -> None:
-        self._numbers = noise.uniforms("probe", n=_DRAWS, episode=probe, step=attempt)[0]
-        self._used = 0
-
-    def between(self, low: float, high: float, n: int | None = None) -> Any:
-        """Draw one number, or an array of ``n``."""
-        count = 1 if n is None else n
-        drawn = self._numbers[self._used : self._used + count]
-        self._used += count
-        scaled = low + (high - low) * drawn
-        return float(scaled[0]) if n is None else scaled
-
-
 # --- where bodies are ---------------------------------------------------------------------------
 
 
-def top(world: World, name: str) -> Floats:
+def top(world: Any, name: str) -> Floats:
     """Find the middle of the upper face of something upright, shape (3,) [m]."""
     center, size = world[f"{name}.cartesian_position"], world[f"{name}.size"]
     return np.array([center[0], center[1], center[2] + size[2] / 2])
 
 
-def sizes(world: World) -> Floats:
+def sizes(world: Any) -> Floats:
     """List the edge lengths of the blocks, shape (n, 3) [m]."""
     return np.array([world[f"{name}.size"] for name in world.composition.blocks]).reshape(-1, 3)
 
 
 def touched(
-    world: World,
+    world: Any,
     dice: Dice,
     middle: Floats,
     bottom: float,
@@ -95,7 +69,7 @@ def touched(
 
 
 def pressed(
-    world: World, dice: Dice, middle: Floats, bottom: float, count: int = HIGHEST
+    world: Any, dice: Dice, middle: Floats, bottom: float, count: int = HIGHEST
 ) -> Setting:
     """Stack the first blocks and let the fingers press on one of them that they reach."""
     edges = sizes(world)[:HIGHEST][:count]
@@ -111,7 +85,7 @@ def pressed(
 
 
 def stacked(
-    world: World,
+    world: Any,
     dice: Dice,
     middle: Floats,
     bottom: float,
@@ -130,7 +104,7 @@ def stacked(
     return states
 
 
-def out_of_the_way(world: World, dice: Dice) -> dict[str, Value]:
+def out_of_the_way(world: Any, dice: Dice) -> dict[str, Value]:
     """Stack the blocks in the middle, unless an obstacle may stand there."""
     if world.composition.obstacles:
         return {}
@@ -182,18 +156,18 @@ def beyond_faces(size: Floats, angles: Floats) -> Floats:
 
 
 def gripping(
-    world: World, middle: Floats, reach: float | Floats, angles: Floats, height: float
+    world: Any, middle: Floats, reach: float | Floats, angles: Floats, height: float
 ) -> Floats:
     """Find the joint positions with the tips around a place, shape (9,) [rad]."""
     return joints_for(world, around(np.array([*middle, 0.0]), reach, angles, height))
 
 
-def present_tips(world: World) -> Floats:
+def present_tips(world: Any) -> Floats:
     """Give the fingertip positions, shape (9,) [m]."""
     return np.array(world["end_effector_positions"])
 
 
-def joints_for(world: World, tips: Floats) -> Floats:
+def joints_for(world: Any, tips: Floats) -> Floats:
     """Find joint positions for fingertip positions, near the resting pose.
 
     Args:
