@@ -62,8 +62,9 @@ class Episode:
 
     @property
     def actions(self) -> Floats:
-        """What the policy asked for, shape (steps, 9)."""
-        return np.array(self.trace.actions).reshape(self.steps, 9)
+        """What the policy asked for, shape (steps, n_actions)."""
+        n = self.trace.declarations[0][1].n_actions
+        return np.array(self.trace.actions).reshape(self.steps, n)
 
     @property
     def audits(self) -> Mapping[int, Audit]:
@@ -97,7 +98,7 @@ class Episode:
             return np.array(self.trace.values[name])
         declarations = self.trace.declarations
         if len(declarations) == 1 and name in declarations[0][1].slices:
-            return np.array(self.trace.vectors)[:, declarations[0][1].slices[name]]
+            return declarations[0][1].read(name, np.array(self.trace.vectors))
         if all(name in values for _, values in self.trace.statics):
             return self._parameter(name)
         if not any(name in declaration.model for _, declaration in declarations):
@@ -279,8 +280,8 @@ def rollout(
 
     Args:
         stage: Of the world.
-        policy: A function of the world, actions of shape (9,) or (steps, 9), ``"random"``, or None:
-            the robot stays where it begins.
+        policy: A function of the world, actions of shape (n_actions,) or (steps, n_actions),
+            ``"random"``, or None: the action that lets the system be.
         seed: Of the noise.
         number: Of the episode within that noise.
         do: A plan, or interventions.

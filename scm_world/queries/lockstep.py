@@ -13,7 +13,6 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Integers, Value
-from scm_world.entities import ACTIONS
 from scm_world.queries.courses import Course
 from scm_world.queries.policies import Blind
 from scm_world.queries.traces import ALL, Trace, intervene, note_parameters, write
@@ -106,9 +105,9 @@ class _Life:
     version: int = -1
 
     def __post_init__(self) -> None:
-        self.course, self.policy = Course(()), self.unit.acts()
+        self.course, self.policy = Course(()), self.unit.acts(self.world)
         self.trace = self.unit.goes_on()
-        self.ahead: Floats = np.empty((0, 9))
+        self.ahead: Floats = np.empty((0, self.world.declaration.n_actions))
         self._shift = 0
 
     def arrive(self) -> None:
@@ -132,8 +131,8 @@ class _Life:
         world, left = self.world, self.unit.steps - step
         policy: Any = self.policy
         given = policy.ahead(world, world.index, left)
-        bounds, unit = world.declaration.action_bounds, ACTIONS[world.action_mode][0]
-        commands = np.empty((self.unit.steps, 9))
+        bounds, unit = world.declaration.action_bounds, world.declaration.action_unit
+        commands = np.empty((self.unit.steps, world.declaration.n_actions))
         for row, action in zip(commands[step:], given, strict=True):
             row[:] = clipped(action, *bounds, unit)
         self.ahead = commands
@@ -162,7 +161,7 @@ class _Together:
         self._goes_on = np.zeros(len(batch), dtype=np.bool_)
         self._goes_on[: len(lives)] = True
         self._pending = self._goes_on.copy()
-        self._commands = np.zeros((len(batch), 9))
+        self._commands = np.zeros((len(batch), lives[0].world.declaration.n_actions))
 
     def alone(self, row: int, step: int) -> None:
         """Let a world do something by itself at an instant, and write the instant down."""

@@ -14,13 +14,15 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.queries.grasping import Grasp
 from scm_world.queries.planning import CrossEntropy
+from scm_world.queries.ranges import action_range
 from scm_world.scene import trifinger
 from scm_world.scene.kinematics import forward, inverse
+from scm_world.tasks import Task, TriFingerTask
 from scm_world.world import World
 from scm_world.world.start import whole_number
 
 Policy = Callable[[World], Any]
-"""Looks at a world and gives an action, shape (9,) in the units of its action mode."""
+"""Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
 
 
 class Blind(ABC):
@@ -36,7 +38,7 @@ class Blind(ABC):
             count: How many.
 
         Returns:
-            Shape (count, 9).
+            Shape (count, n_actions).
         """
 
     def __call__(self, world: World) -> Floats:
@@ -67,12 +69,13 @@ class Random(Blind):
 
     def ahead(self, world: World, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""
-        drawn = np.empty((count, 9))
+        n, noise, episode = world.declaration.n_actions, world.noise, world.episode
+        drawn = np.empty((count, n))
         for row, index in enumerate(range(first, first + count)):
             step = index // self.every
-            drawn[row] = world.noise.uniforms("policy", n=9, episode=world.episode, step=step)[0]
-        middle = 0.5 * (world.action_low + world.action_high)
-        half = 0.5 * (world.action_high - world.action_low)
+            drawn[row] = noise.uniforms("policy", n=n, episode=episode, step=step)[0]
+        low, high = action_range(world)
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
         actions: Floats = middle + self.share * half * (2.0 * drawn - 1.0)
         return actions
 
@@ -82,10 +85,10 @@ class Sequence(Blind):
     """Actions that are given: one for all steps, or one for each.
 
     Args:
-        actions: Shape (9,) or (steps, 9); after the last one it is kept.
+        actions: Shape (n_actions,) or (steps, n_actions); after the last one it is kept.
 
     Raises:
-        ActionError: They have another shape, or are not finite.
+        ActionError: They are no rows of finite numbers; where they are used: of another length.
     """
 
     def __init__(self, actions: Any) -> None:
@@ -93,14 +96,19 @@ class Sequence(Blind):
             given = np.atleast_2d(np.asarray(actions, dtype=np.float64))
         except (TypeError, ValueError):
             given = np.empty((0, 0))
-        if given.ndim != 2 or given.shape[1:] != (9,) or not len(given):
-            raise ActionError("actions have shape (9,) or (steps, 9)", actions)
+        if given.ndim != 2 or not len(given):
+            raise ActionError("actions have shape (n,) or (steps, n)", actions)
         if not np.isfinite(given).all():
             raise ActionError("actions must be finite", actions)
         self.actions: Floats = given
 
     def ahead(self, world: World, first: int, count: int) -> Floats:
         """Give the actions of some control steps."""
+        n = world.declaration.n_actions
+        if self.actions.shape[1] != n:
+            raise ActionError(
+                f"actions have shape ({n},) or (steps, {n}), got {self.actions.shape}", self.actions
+            )
         return _kept(self.actions, first, count)
 
 
@@ -162,29 +170,35 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 }
 """Policies that have a name."""
 
+ANY = ("random", "mpc")
+"""Those of them that any system can have; the others move the fingers of the robot."""
 
-def as_policy(given: Any) -> Policy:
+
+def as_policy(given: Any, task: Task | None = None) -> Policy:
     """Turn what a user gives into a policy for one rollout.
 
     Args:
-        given: A policy, actions, ``"random"``, ``"sweep"`` (to the middle), ``"across"``
-            (one finger), ``"grasp"`` (blocks, to their goals), ``"hold"`` (likewise, but the last
-            block is not let go of), ``"mpc"`` (plans), or None: where the robot begins it stays.
+        given: A policy, actions, ``"random"``, ``"mpc"`` (plans), or None: the action that lets
+            the system be, as it was in the first step. Of the block-building robot also
+            ``"sweep"`` (to the middle), ``"across"`` (one finger), ``"grasp"`` (blocks, to their
+            goals), ``"hold"`` (likewise, but the last block is not let go of).
+        task: In which it acts, if that is known already.
 
     Raises:
         ActionError: It is none of these.
     """
     if given is None:
-        return _Hold()
+        return _Idle()
     if isinstance(given, str):
-        if given in NAMED:
+        known = [*NAMED] if task is None or isinstance(task, TriFingerTask) else [*ANY]
+        if given in known:
             return NAMED[given]()
-        raise ActionError(f"a policy is a function, actions, None, or one of {[*NAMED]}", given)
+        raise ActionError(f"a policy is a function, actions, None, or one of {known}", given)
     return given if callable(given) else Sequence(given)
 
 
-class _Hold(Blind):
-    """Tells the robot to stay where it was when it was asked for the first time."""
+class _Idle(Blind):
+    """Lets the system be: the same action as when it was asked for the first time."""
 
     def __init__(self) -> None:
         self._action: Floats | None = None

@@ -31,7 +31,7 @@ class Trace:
         vectors: State of each instant, after what was done then.
         statics: From when which values of parameters held.
         declarations: From when which structure there was.
-        actions: What the policy asked for, shape (9,) each.
+        actions: What the policy asked for, shape (n_actions,) each.
         snapshots: Of some instants, after what was done then.
         fired: When events happened.
         audits: What interventions did, by control step.
@@ -122,7 +122,7 @@ def _chosen(policy: Policy, world: World) -> Floats:
     try:
         return np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ActionError("an action is nine finite numbers", given) from None
+        raise ActionError("an action is finite numbers", given) from None
 
 
 def begin(world: World, seed: int, number: int, course: Course, trace: Trace) -> None:

@@ -70,7 +70,7 @@ class Unit:
             world,
             trace,
             course,
-            self.acts(),
+            self.acts(world),
             first=self.first,
             steps=self.steps,
             names=self.names,
@@ -85,6 +85,6 @@ class Unit:
         except Exception as error:
             return error
 
-    def acts(self) -> Policy:
-        """Make the policy, for one life."""
-        return as_policy(self.policy)
+    def acts(self, world: World | None = None) -> Policy:
+        """Make the policy, for one life, in a world if it is known."""
+        return as_policy(self.policy, None if world is None else world.task)

@@ -68,9 +68,7 @@ def touched(
     return states, angles, height
 
 
-def pressed(
-    world: Any, dice: Dice, middle: Floats, bottom: float, count: int = HIGHEST
-) -> Setting:
+def pressed(world: Any, dice: Dice, middle: Floats, bottom: float, count: int = HIGHEST) -> Setting:
     """Stack the first blocks and let the fingers press on one of them that they reach."""
     edges = sizes(world)[:HIGHEST][:count]
     states = stacked(world, dice, middle, bottom, count=count)

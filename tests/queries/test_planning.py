@@ -106,7 +106,7 @@ def test_the_present_is_carried_to_another_engine(acts: str, plans: str) -> None
 @pytest.mark.parametrize("horizon", [1, 2, 7, 8])
 def test_noise_has_variance_one(horizon: int) -> None:
     """Whatever its color and length."""
-    drawn = Search(samples=4000, horizon=horizon).noise(Noise(0), "plan", episode=0, step=0)
+    drawn = Search(samples=4000, horizon=horizon).noise(Noise(0), "plan", 9, episode=0, step=0)
     assert drawn.shape == (4000, horizon, 9)
     assert drawn.var(axis=(0, 2)) == pytest.approx(np.ones(horizon), abs=0.05)
 
@@ -115,7 +115,7 @@ def test_noise_is_correlated_in_time() -> None:
     """Colored noise changes less from step to step than white noise."""
     change = {
         color: np.diff(
-            Search(samples=200, color=color).noise(Noise(0), "plan", episode=0, step=0), axis=1
+            Search(samples=200, color=color).noise(Noise(0), "plan", 9, episode=0, step=0), axis=1
         ).std()
         for color in (0.0, 3.0)
     }

@@ -9,13 +9,14 @@ whatever ran before.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
+from scm_world.queries.ranges import action_range
 from scm_world.tasks.experiments import Dice, Scenario
 from scm_world.variables import Box, Exogenous, Measured, Noise, Rotations, Variable
 from scm_world.world import World, WorldSnapshot
@@ -196,12 +197,10 @@ def _moved(variable: Variable, present: Value, dice: Dice) -> Value:
     return np.asarray(low + 0.5 * (1.0 + unit) * (high - low))
 
 
-def _within(world: World, unit: Floats) -> Floats:
-    """Give the action at some shares of its range; of one without an end, of [-1, 1]."""
-    low, high = world.action_low, world.action_high
-    low = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2.0))
-    high = np.where(np.isfinite(high), high, np.maximum(1.0, low + 2.0))
-    return np.asarray(low + unit * (high - low))
+def _within(world: World, share: Floats) -> Floats:
+    """Give the action at some shares of its range."""
+    low, high = action_range(world)
+    return np.asarray(low + share * (high - low))
 
 
 def _at_random(world: World, extra: None, dice: Dice) -> Floats:

@@ -109,8 +109,8 @@ class Model:
 
         Args:
             start: As ``present`` gives it.
-            actions: Shape (n, steps, 9) in the units of the action mode, in their range; as many
-                as there are copies, or fewer.
+            actions: Shape (n, steps, n_actions) in the units of the action mode, in their range;
+                as many as there are copies, or fewer.
 
         Returns:
             By name, the values after each control step, shape (n, steps, *shape).
@@ -119,12 +119,13 @@ class Model:
             ActionError: Actions have another shape.
             EngineFailure: The engine lost a state.
         """
-        if actions.ndim != 3 or actions.shape[2] != 9 or len(actions) > len(self):
-            allowed = f"(n, steps, 9), with n up to {len(self)}"
+        size = self._copies[0].declaration.n_actions
+        if actions.ndim != 3 or actions.shape[2] != size or len(actions) > len(self):
+            allowed = f"(n, steps, {size}), with n up to {len(self)}"
             raise ActionError(f"actions have shape {allowed}, got {actions.shape}", actions)
         n, steps = actions.shape[:2]
         which = np.arange(len(self._copies)) < n
-        commands = np.zeros((len(which), steps, 9))
+        commands = np.zeros((len(which), steps, size))
         commands[:n] = actions
         for row in range(n):
             self._batch.world(row).restore(start)

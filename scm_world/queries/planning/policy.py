@@ -14,6 +14,7 @@ from scm_world.graph import flatten
 from scm_world.queries.planning.model import Model
 from scm_world.queries.planning.scores import Score, as_score, nearness
 from scm_world.queries.planning.search import Found, Search, search
+from scm_world.queries.ranges import action_range
 from scm_world.world import World
 from scm_world.world.start import whole_number
 
@@ -30,8 +31,8 @@ class CrossEntropy:
 
     Args:
         objective: What is summed up over the control steps of a plan: the name of a variable such
-            as ``"reward"``, weights by name, or a ``Score``; how near everything is to its goal
-            if None, see ``nearness``.
+            as ``"reward"``, weights by name, or a ``Score``; if None, how near everything is to
+            its goal, see ``nearness``, and the reward where the task has no goals.
         terminal: What the end of a plan is worth besides; nothing if None.
         every: For how many control steps a plan is followed.
         do: What the planner wrongly believes, as in ``World.do``: ``{"tool_block.friction": 0.2}``.
@@ -160,7 +161,8 @@ class _Program:
 
         def drawn(round_: int) -> Floats:
             stream = f"planning {seed}, round {round_}"
-            return setting.noise(world.noise, stream, episode=world.episode, step=world.index)
+            n, noise = world.declaration.n_actions, world.noise
+            return setting.noise(noise, stream, n, episode=world.episode, step=world.index)
 
         def evaluated(actions: Floats) -> Floats:
             values = self._model.rollouts(present, actions)
@@ -171,7 +173,7 @@ class _Program:
                 total = total + self._terminal.of(last, shape[:1])
             return total
 
-        return search(setting, evaluated, drawn, (world.action_low, world.action_high), start)
+        return search(setting, evaluated, drawn, action_range(world), start)
 
 
 def _place(world: World) -> tuple[int, int, int]:

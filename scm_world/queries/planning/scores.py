@@ -117,12 +117,21 @@ def nearness(task: Task) -> Score:
 
     Of blocks that is the mean distance of the eight corners of each block from those of its goal,
     so that turning counts, and a tenth of the mean distance of the fingertips from the block; of
-    a task without blocks the distance of what is achieved from what is desired.
+    a task without blocks the distance of what is achieved from what is desired. Of a task without
+    goals it is the reward.
 
     Args:
         task: Of the world.
+
+    Raises:
+        UnknownOption: It has neither goals nor a reward.
     """
     have, want = task.goal_names()
+    if not have and not task.weights:
+        allowed = ("the name of a variable", "weights by name", "a Score")
+        raise UnknownOption(f"objective of {task.name!r}, without goals and reward", None, allowed)
+    if not have:
+        return as_score("reward")
     if not isinstance(task, Building):
         return Score((*have, *want), partial(_apart, len(have)))
     return Score((TIPS, *have, *want), _boxes_apart)

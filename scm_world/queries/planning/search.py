@@ -69,17 +69,18 @@ class Search:
         """How many samples are elites."""
         return self.elites or max(1, self.samples // 6)
 
-    def noise(self, noise: Noise, stream: str, *, episode: int, step: int) -> Floats:
+    def noise(self, noise: Noise, stream: str, n: int, *, episode: int, step: int) -> Floats:
         """Draw noise of variance one that is correlated in time.
 
         Args:
             noise: Where to draw.
             stream: Of the noise.
+            n: How many numbers an action has.
             episode: Number of the episode.
             step: The control step.
 
         Returns:
-            Shape (samples, horizon, 9).
+            Shape (samples, horizon, n).
         """
         length = self.horizon
         frequencies = np.fft.rfftfreq(length)
@@ -90,7 +91,7 @@ class Search:
         if length % 2 == 0:
             counts[-1] = 1.0
         size *= length / math.sqrt(float((counts * size**2).sum()))
-        shape = (self.samples, 9, 2, len(size))
+        shape = (self.samples, n, 2, len(size))
         drawn = noise.draw(Normal(), stream, shape, {}, episode=episode, step=step)[0]
         waves = (drawn[:, :, 0] + 1j * drawn[:, :, 1]) * size
         return np.asarray(np.fft.irfft(waves, length, axis=-1)).swapaxes(1, 2)
@@ -102,10 +103,10 @@ class Found:
     """What a search has found.
 
     Attributes:
-        actions: The best sequence, shape (horizon, 9).
+        actions: The best sequence, shape (horizon, n_actions).
         score: Its score.
-        mean: Of the elites, shape (horizon, 9).
-        elites: The best sequences, shape (k, horizon, 9), best first.
+        mean: Of the elites, shape (horizon, n_actions).
+        elites: The best sequences, shape (k, horizon, n_actions), best first.
     """
 
     actions: Floats
@@ -134,10 +135,10 @@ def search(
 
     Args:
         setting: The numbers of the search.
-        evaluate: Scores sequences, shape (n, horizon, 9) with up to as many as there are samples;
-            gives shape (n,).
+        evaluate: Scores sequences, shape (n, horizon, n_actions) with up to as many as there are
+            samples; gives shape (n,).
         noise: Gives that of a round, see ``Search.noise``.
-        bounds: Lower and upper end of an action, shape (9,) each.
+        bounds: Lower and upper end of an action, shape (n_actions,) each.
         start: What is known already; the first round is drawn around its mean.
 
     Returns:
@@ -171,7 +172,7 @@ def search(
 
 
 def _later(actions: Floats, steps: int) -> Floats:
-    """Shift sequences, shape (..., horizon, 9)."""
+    """Shift sequences, shape (..., horizon, n_actions)."""
     length = actions.shape[-2]
     found: Floats = actions[..., np.minimum(np.arange(length) + steps, length - 1), :]
     return found
