@@ -1,0 +1,470 @@
+"""Any model file as a ``Model``: tables of what there is, and of what acts on what."""
+
+from __future__ import annotations
+
+import fnmatch
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from scm_world._types import Integers
+from scm_world.backends.mujoco.fields import Field, element_names, table, tendon_unit
+from scm_world.backends.mujoco.sources import Source, read_source
+from scm_world.backends.mujoco.trees import Couplings
+from scm_world.errors import ModelError, nearest
+from scm_world.models.model import Input, Model, Numbers, Parameter, Readout, StateRow
+
+_DSBL, _JNT, _TRN, _INT = (
+    mujoco.mjtDisableBit,
+    mujoco.mjtJoint,
+    mujoco.mjtTrn,
+    mujoco.mjtIntegrator,
+)
+_CALLBACKS = ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
+
+
+def read_model(
+    source: Any,
+    *,
+    name: str | None = None,
+    expose: Iterable[str] | str | None = None,
+    readouts: Iterable[str] = (),
+    fixed_base: bool = True,
+    settings: Mapping[str, Any] | None = None,
+) -> Model:
+    """Read a model, and describe it by tables.
+
+    Args:
+        source: A path to an MJCF or URDF file, XML text, a ``mujoco.MjSpec`` or a
+            ``mujoco.MjModel``. It is not changed.
+        name: Of the model; the one in the file if None.
+        expose: Patterns of the parameters that can be set: ``"*.mass"``, ``"cube.*"``. A pattern
+            that ends in ``*`` means the usual attributes; the others are exposed where they are
+            named, as in ``["*", "*.solref"]``. All usual ones if None.
+        readouts: Names of what is computed from the states: ``"tip.position"``,
+            ``"tip.orientation"``, ``"tip.linear_velocity"``, ``"tip.angular_velocity"`` of sites,
+            bodies and shapes, and ``"imu.value"`` of sensors.
+        fixed_base: Whether the root link of a URDF is fixed to the world.
+        settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
+
+    Raises:
+        UnreadableFile: There is no such file, or it is no text.
+        ModelError: It is no model, or one that cannot be a causal model; or a pattern or readout
+            names nothing.
+        UnknownOption: A setting does not exist.
+    """
+    sealed, own_name, where = read_source(
+        source, fixed_base=fixed_base, options=dict(settings or {})
+    )
+    try:
+        mj = _compiled(sealed)
+    except (ValueError, mujoco.FatalError) as error:
+        said = " ".join(str(error).split())
+        raise ModelError([f"MuJoCo cannot compile {where}: {said}; correct the model"]) from error
+    _check(mj, sealed, where)
+    trees = Couplings(mj)
+    names = element_names(mj)
+    states, inputs = tuple(_states(mj, names, trees)), tuple(_inputs(mj, names, trees))
+    patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
+    medium = ("density", "viscosity", "wind")
+    fluid = patterns is not None and any(fnmatch.filter(medium, p) for p in patterns if p != "*")
+    fields = table(mj, [("", row.name) for row in (*states, *inputs)], fluid=fluid)
+    chosen = _exposed(fields, patterns)
+    parameters = tuple(_parameter(mj, field) for field in fields if field.name in chosen)
+    model = Model(
+        name=name or own_name or "model",
+        digest=_digest(sealed, parameters),
+        source=sealed,
+        timestep=float(mj.opt.timestep),
+        parameters=parameters,
+        states=states,
+        inputs=inputs,
+        trees=tuple(names["body"][root] for root in trees.roots),
+        refused=tuple(
+            (field.name, field.refusal or "is not exposed; name it in expose=[…]")
+            for field in fields
+            if field.name not in chosen
+        ),
+        notes=tuple(_notes(mj, sealed)),
+    )
+    return model
+
+
+def compiled(model: Model) -> mujoco.MjModel:
+    """Compile what a description was read from, with settings under which it is exact.
+
+    It is compiled once in a process. Callers copy it before they change it.
+    """
+    source: Source = model.source
+    return _compiled(source)
+
+
+@lru_cache(maxsize=32)
+def _compiled(source: Source) -> mujoco.MjModel:
+    """Compile, and let trees that do not touch leave one another alone to the last bit.
+
+    The causes of leaks, as measured: one solve for all constraints instead of one for each island,
+    a warm start that is chosen for all, sleep, the reset of everything after a number that is not
+    finite, and Euler's implicit damping, which begins for all trees with the first damped joint.
+    """
+    mj = source.compile()
+    options = mj.opt
+    options.disableflags |= int(_DSBL.mjDSBL_WARMSTART) | int(_DSBL.mjDSBL_AUTORESET)
+    options.disableflags &= ~int(_DSBL.mjDSBL_ISLAND)
+    options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    if _mixes_damping(mj):
+        if mj.nflex:
+            options.disableflags |= int(_DSBL.mjDSBL_EULERDAMP)
+        else:
+            options.integrator = int(_INT.mjINT_IMPLICITFAST)
+    return mj
+
+
+def _mixes_damping(mj: mujoco.MjModel) -> bool:
+    """Tell whether Euler's implicit damping would tie trees together."""
+    several = len(set(mj.body_rootid[mj.body_treeid >= 0].tolist())) > 1
+    damped = not mj.opt.disableflags & int(_DSBL.mjDSBL_EULERDAMP)
+    return several and damped and mj.opt.integrator == int(_INT.mjINT_EULER)
+
+
+def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
+    """Refuse what has effects that no graph could declare.
+
+    Raises:
+        ModelError: All that is wrong.
+    """
+    problems = []
+    if mj.nv == 0:
+        problems.append(f"{where} has no joint: nothing in it can move; add one")
+    if mj.nplugin:
+        named = sorted({p.plugin_name for p in _spec(source).plugins}) if source.text else []
+        shown = f" ({', '.join(named)})" if named else ""
+        problems.append(
+            f"{where} uses {mj.nplugin} plugin(s){shown}: what they act on is unknown; remove them"
+        )
+    for i in range(mj.nactuator):
+        kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
+        users = mujoco.mjtDyn.mjDYN_USER, mujoco.mjtGain.mjGAIN_USER, mujoco.mjtBias.mjBIAS_USER
+        label = element_names(mj)["actuator"][i]
+        if any(int(kind) == int(user) for kind, user in zip(kinds, users, strict=True)):
+            problems.append(
+                f"{where}: the actuator {label!r} needs a callback of the user; give it one of "
+                "MuJoCo's own types"
+            )
+        if mj.actuator_historyadr[i] >= 0:
+            problems.append(
+                f"{where}: the actuator {label!r} acts with a delay, and what it remembers is no "
+                "state; remove its delay and nsample"
+            )
+    if mj.nplastic:
+        problems.append(
+            f"{where} has plastic springs or flexes, whose rest shape is a hidden state; remove "
+            "springyield and yield"
+        )
+    for name in _CALLBACKS:
+        if getattr(mujoco, f"get_mjcb_{name}")() is not None:
+            problems.append(
+                f"mujoco.set_mjcb_{name} is in use: what it acts on is unknown; call "
+                f"mujoco.set_mjcb_{name}(None)"
+            )
+    if problems:
+        raise ModelError(problems)
+
+
+def _spec(source: Source) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_string(source.text, assets=dict(source.assets))
+
+
+def _notes(mj: mujoco.MjModel, source: Source) -> Iterator[str]:
+    """Say what is different from the file, and what acts without having a variable."""
+    own = source.compile().opt if mj.opt.integrator == int(_INT.mjINT_IMPLICITFAST) else mj.opt
+    if own.integrator != mj.opt.integrator:
+        yield (
+            "The integrator is implicitfast instead of Euler, whose implicit damping would tie "
+            "trees together that do not touch."
+        )
+    if mj.nflex:
+        yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
+        if mj.opt.disableflags & int(_DSBL.mjDSBL_EULERDAMP):
+            yield "Joint damping is explicit, because flexes do not allow for implicitfast."
+    if mj.nskin:
+        yield f"{mj.nskin} skin(s) act on pictures only."
+    if mj.nkey:
+        yield f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file."
+    if mj.nuserdata:
+        yield "User data acts on nothing."
+
+
+def _digest(source: Source, parameters: Sequence[Parameter]) -> str:
+    """Hash what decides what an engine makes of a model."""
+    keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
+    return hashlib.sha256(f"{source.digest}\0{keys}".encode()).hexdigest()
+
+
+# --- parameters --------------------------------------------------------------------------------
+
+
+def _exposed(fields: Sequence[Field], patterns: Sequence[str] | None) -> set[str]:
+    """Choose the parameters that can be set.
+
+    Raises:
+        ModelError: A pattern names nothing, or only what cannot be set.
+    """
+    can = [field for field in fields if not field.refusal]
+    if patterns is None:
+        return {field.name for field in can if field.usual}
+    found: set[str] = set()
+    problems = []
+    for pattern in patterns:
+        open_end = pattern.rpartition(".")[2] == "*"
+        named = {
+            field.name
+            for field in can
+            if fnmatch.fnmatchcase(field.name, pattern) and (field.usual or not open_end)
+        }
+        found |= named
+        if named:
+            continue
+        refused = [f for f in fields if f.refusal and fnmatch.fnmatchcase(f.name, pattern)]
+        if refused:
+            problems.append(f"expose={pattern!r}: {refused[0].name!r} {refused[0].refusal}")
+        else:
+            near = nearest(pattern, (field.name for field in can))
+            hint = f"; did you mean {near!r}?" if near else ""
+            problems.append(f"expose={pattern!r} names no parameter{hint}")
+    if problems:
+        raise ModelError(problems)
+    return found
+
+
+def _parameter(mj: mujoco.MjModel, field: Field) -> Parameter:
+    """Describe a field with what it is in the model as it was given."""
+    assert field.slot is not None
+    slot = field.slot(mj, mujoco.MjData(mj) if "mocap" in field.doc else None)
+    default = slot.read()
+    always, contact = field.effect()
+    return Parameter(
+        name=field.name,
+        unit=field.unit,
+        shape=default.shape,
+        default=_numbers(default),
+        low=field.low,
+        high=field.high,
+        doc=field.doc,
+        always=always,
+        contact=contact,
+        key=field.key,
+        kind=field.nature,
+        change="constants" if slot.constant else "live",
+        visual=field.visual,
+    )
+
+
+def _numbers(values: Any) -> Numbers:
+    found = np.asarray(values, dtype=np.float64)
+    return tuple(found.ravel().tolist()) if found.ndim else float(found)
+
+
+# --- states and inputs -------------------------------------------------------------------------
+
+
+class Permutation(NamedTuple):
+    """Where each of MuJoCo's numbers stands in the state vector.
+
+    Attributes:
+        positions: ``vector[positions]`` is ``qpos``.
+        velocities: ``vector[velocities]`` is ``qvel``.
+        activations: ``vector[activations]`` is ``act``.
+    """
+
+    positions: Integers
+    velocities: Integers
+    activations: Integers
+
+
+def permutation(mj: mujoco.MjModel) -> Permutation:
+    """Give the place of every number of MuJoCo's state in that of the tables."""
+    found = Permutation(*(np.empty(n, dtype=np.int64) for n in (mj.nq, mj.nv, mj.na)))
+    arrays = {"qpos": found.positions, "qvel": found.velocities, "act": found.activations}
+    end = 0
+    for state in _moving(mj, element_names(mj)):
+        arrays[state.array][state.numbers] = np.arange(end, end + len(state.numbers))
+        end += len(state.numbers)
+    return found
+
+
+class _Moving(NamedTuple):
+    """A state: which of MuJoCo's numbers it is, and what it means."""
+
+    array: str
+    numbers: list[int]
+    kind: str
+    index: int
+    element: str
+    attribute: str
+    unit: str
+    doc: str
+    low: float = -math.inf
+    high: float = math.inf
+
+
+def _moving(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[_Moving]:
+    """List what moves, in the order of the state vector."""
+    for joint in range(mj.njnt):
+        name, body = names["joint"][joint], names["body"][int(mj.jnt_bodyid[joint])]
+        q, v = int(mj.jnt_qposadr[joint]), int(mj.jnt_dofadr[joint])
+        match mujoco.mjtJoint(int(mj.jnt_type[joint])):
+            case _JNT.mjJNT_FREE:
+                for array, numbers, attribute, unit, doc in (
+                    ("qpos", [q, q + 1, q + 2], "cartesian_position", "m",
+                     "Place of the frame of the body in the world."),
+                    ("qpos", [q + 4, q + 5, q + 6, q + 3], "orientation", "1",
+                     "Orientation of the body in the world (x, y, z, w)."),
+                    ("qvel", [v, v + 1, v + 2], "linear_velocity", "m/s",
+                     "Velocity of the origin of the body's frame, in the world."),
+                    ("qvel", [v + 3, v + 4, v + 5], "angular_velocity", "rad/s",
+                     "Angular velocity of the body, in its own frame."),
+                ):  # fmt: skip
+                    yield _Moving(array, numbers, "joint", joint, body, attribute, unit, doc)
+            case _JNT.mjJNT_BALL:
+                doc = "Orientation of the body in its parent (x, y, z, w)."
+                numbers = [q + 1, q + 2, q + 3, q]
+                yield _Moving("qpos", numbers, "joint", joint, name, "orientation", "1", doc)
+                doc, numbers = "Angular velocity in the frame of the body.", [v, v + 1, v + 2]
+                yield _Moving(
+                    "qvel", numbers, "joint", joint, name, "angular_velocity", "rad/s", doc
+                )
+            case kind:
+                turns = kind == _JNT.mjJNT_HINGE
+                unit, what = ("rad", "Angle") if turns else ("m", "Displacement")
+                low, high = mj.jnt_range[joint] if mj.jnt_limited[joint] else (-math.inf, math.inf)
+                yield _Moving(
+                    "qpos", [q], "joint", joint, name, "position", unit, f"{what} of the joint.",
+                    float(low), float(high),
+                )  # fmt: skip
+                doc = "Angular velocity of the joint." if turns else "Velocity of the joint."
+                yield _Moving("qvel", [v], "joint", joint, name, "velocity", f"{unit}/s", doc)
+    for actuator in range(mj.nactuator):
+        first, count = int(mj.actuator_actadr[actuator]), int(mj.actuator_actnum[actuator])
+        if first < 0 or not count:
+            continue
+        limited = mj.actuator_actlimited[actuator]
+        low, high = mj.actuator_actrange[actuator] if limited else (-math.inf, math.inf)
+        yield _Moving(
+            "act", list(range(first, first + count)), "actuator", actuator,
+            names["actuator"][actuator], "activation", "1", "Inner state of the actuator.",
+            float(low), float(high),
+        )  # fmt: skip
+
+
+def _repeated(names: Iterable[str]) -> set[str]:
+    return {name for name, n in Counter(names).items() if n > 1}
+
+
+def _states(
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
+) -> Iterator[StateRow]:
+    """Describe what moves, in the order of the state vector."""
+    data = mujoco.MjData(mj)
+    states = list(_moving(mj, names))
+    repeated = _repeated(f"{state.element}.{state.attribute}" for state in states)
+    for state in states:
+        plain = f"{state.element}.{state.attribute}"
+        default = getattr(data, state.array)[state.numbers]
+        if state.kind == "joint":
+            tree = trees.tree(int(mj.jnt_bodyid[state.index]))
+            always, contact = trees.always([tree])
+        else:
+            tree, always, contact = _of_actuator(trees, state.index, stateful=True)
+        scalar = len(state.numbers) == 1
+        rotation = state.attribute == "orientation"
+        yield StateRow(
+            name=f"{state.kind}:{plain}" if plain in repeated else plain,
+            unit=state.unit,
+            shape=() if scalar else (len(state.numbers),),
+            default=_numbers(default[0] if scalar else default),
+            low=-1.0 if rotation else min(state.low, float(default.min())),
+            high=1.0 if rotation else max(state.high, float(default.max())),
+            doc=state.doc,
+            always=always,
+            contact=contact,
+            tree=tree,
+            kind="rotation" if rotation else "real",
+        )
+
+
+def _of_actuator(
+    trees: Couplings, actuator: int, *, stateful: bool
+) -> tuple[int, frozenset[int], frozenset[int]]:
+    """Give the tree that an actuator is counted to, and what it acts on.
+
+    The inner state of an actuator belongs to the tree it moves.
+    """
+    always, contact = trees.actuator(actuator)
+    tree = min(always or contact or {0})
+    if stateful:
+        always |= {tree}
+    return tree, always, contact - always
+
+
+def _inputs(
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
+) -> Iterator[Input]:
+    """Describe the components of a command."""
+    for actuator in range(mj.nactuator):
+        name = names["actuator"][actuator]
+        first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
+        unit, doc = _control(mj, actuator)
+        stateful = bool(mj.actuator_actnum[actuator])
+        _, always, contact = _of_actuator(trees, actuator, stateful=stateful)
+        for i in range(count):
+            limited = mj.actuator_ctrllimited[first + i]
+            low, high = mj.actuator_ctrlrange[first + i] if limited else (-math.inf, math.inf)
+            yield Input(
+                name=f"{name}.control" if count == 1 else f"{name}.control_{i}",
+                unit=unit,
+                shape=(),
+                default=min(max(0.0, float(low)), float(high)),
+                low=float(low),
+                high=float(high),
+                doc=doc,
+                always=always,
+                contact=contact,
+            )
+
+
+def _control(mj: mujoco.MjModel, actuator: int) -> tuple[str, str]:
+    """Give the unit of the control of an actuator, and what it means."""
+    joint = mj.actuator_trntype[actuator] == int(_TRN.mjTRN_JOINT)
+    kind = int(mj.jnt_type[mj.actuator_trnid[actuator, 0]]) if joint else -1
+    turns = {int(_JNT.mjJNT_HINGE): True, int(_JNT.mjJNT_SLIDE): False}.get(kind)
+    gear = float(mj.actuator_gear[int(mj.actuator_outadr[actuator]), 0])
+    gain, bias = mj.actuator_gainprm[actuator], mj.actuator_biasprm[actuator]
+    plain = mj.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
+    affine = mj.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    if plain and affine and gain[0] > 0.0 and bias[1] == -gain[0]:
+        unit = {True: "rad", False: "m"}.get(turns, "1") if gear == 1.0 else "1"
+        return unit, "Position that the servo goes to."
+    if plain and affine and gain[0] > 0.0 and bias[2] == -gain[0] and not bias[1]:
+        unit = {True: "rad/s", False: "m/s"}.get(turns, "1") if gear == 1.0 else "1"
+        return unit, "Velocity that the servo keeps to."
+    if plain and gain[0] == 1.0 and gear == 1.0 and not mj.actuator_dyntype[actuator]:
+        return {True: "N m", False: "N"}.get(turns, "1"), "Force of the actuator."
+    return "1", "Control of the actuator; gear and gain make it a force."
+
+
+def contact_bodies(mj: mujoco.MjModel) -> tuple[str, ...]:
+    """Name the body of every shape, then the flexes, as lists of contacts do."""
+    names = element_names(mj)
+    return (*(names["body"][int(body)] for body in mj.geom_bodyid), *names["flex"])
+
+
+def body_names(mj: mujoco.MjModel) -> tuple[str, ...]:
+    """Name all bodies, by number; the first is the world."""
+    return element_names(mj)["body"]

@@ -1,0 +1,385 @@
+"""Which kinematic trees a compiled model has, and which elements act on which of them.
+
+A tree is everything below one child of the world (MuJoCo's ``body_rootid``) that can move. Trees
+are coupled always by tendons, equality constraints and actuators that reach several of them, and
+while there is contact by shapes that may touch. What cannot move passes nothing on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from typing import final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Trees = frozenset[int]
+NONE: Trees = frozenset()
+Effect = tuple[Trees, Trees]
+"""The trees that something acts on in every step, and those that it reaches by contact."""
+
+NOTHING: Effect = (NONE, NONE)
+
+_OBJ, _TRN, _WRAP, _EQ, _OFF = (
+    mujoco.mjtObj,
+    mujoco.mjtTrn,
+    mujoco.mjtWrap,
+    mujoco.mjtEq,
+    mujoco.mjtDisableBit,
+)
+
+
+def disabled(mj: mujoco.MjModel, flag: mujoco.mjtDisableBit) -> bool:
+    """Tell whether a part of physics is switched off by a flag of the model."""
+    return bool(mj.opt.disableflags & int(flag))
+
+
+@final
+class Couplings:
+    """The trees of a compiled model, and what reaches them.
+
+    Args:
+        mj: The model. It is only read.
+        fluid: Whether a medium acts, or may be made to act.
+
+    Attributes:
+        roots: Number of the body at the root of each tree.
+    """
+
+    def __init__(self, mj: mujoco.MjModel, fluid: bool = False) -> None:
+        self._mj, self._fluid = mj, fluid
+        self._moves = np.asarray(mj.body_treeid) >= 0
+        self.roots = sorted({int(root) for root in mj.body_rootid[self._moves]})
+        number = {root: i for i, root in enumerate(self.roots)}
+        self._tree = np.array([number.get(int(root), -1) for root in mj.body_rootid])
+        self._coupled = _groups(len(self.roots), self._couplings())
+
+    @property
+    def every(self) -> Trees:
+        """All trees."""
+        return frozenset(range(len(self.roots)))
+
+    def tree(self, body: int) -> int:
+        """Give the number of the tree of a body; -1 where nothing in it can move."""
+        return int(self._tree[body])
+
+    # --- what elements act on ------------------------------------------------------------------
+
+    def always(self, trees: Iterable[int]) -> Effect:
+        """Give the effect of something that acts on some trees in every step."""
+        found = frozenset().union(*(self._coupled[tree] for tree in trees))
+        return found, self._reached(found) - found
+
+    def touching(self, trees: Iterable[int]) -> Effect:
+        """Give the effect of something that acts on some trees by contact alone."""
+        return NONE, self._reached(trees)
+
+    def body(self, body: int) -> Effect:
+        """Give the effect of the inertia of a body; a static one moves the center of its tree."""
+        tree = self.tree(body)
+        return NOTHING if tree < 0 else self.always([tree])
+
+    def frame(self, body: int) -> Effect:
+        """Give the effect of the place of a body in its parent, with all that hangs from it."""
+        parents, found = self._mj.body_parentid, {body}
+        for other in range(body + 1, self._mj.nbody):
+            if int(parents[other]) in found:
+                found.add(other)
+        if self._moves[body]:
+            return self.body(body)
+        trees = {self.tree(b) for b in found if self.tree(b) >= 0}
+        always, contact = self.always(trees | self._held(found))
+        shapes = [g for g in range(self._mj.ngeom) if int(self._mj.geom_bodyid[g]) in found]
+        touched = self._reached({tree for g in shapes for tree in self._touched(g)})
+        return always, (contact | touched) - always
+
+    def contact_of(self, geom: int) -> Effect:
+        """Give the effect of how a shape behaves in contact."""
+        return self.touching(self._touched(geom))
+
+    def shape(self, geom: int) -> Effect:
+        """Give the effect of the size or place of a shape: contact, tendons around it, a medium."""
+        body, trees = int(self._mj.geom_bodyid[geom]), self._wrapped.get(geom, NONE)
+        if self._fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
+            trees |= {self.tree(body)}
+        always, contact = self.always(trees)
+        return always, (contact | self._reached(self._touched(geom))) - always
+
+    def site(self, site: int) -> Effect:
+        """Give the effect of the place of a site: on what is attached to it."""
+        return self.always(self._attached.get(site, NONE))
+
+    def pair(self, pair: int) -> Effect:
+        """Give the effect of how a declared pair of shapes behaves in contact."""
+        if not self._contacts_on:
+            return NOTHING
+        geoms = int(self._mj.pair_geom1[pair]), int(self._mj.pair_geom2[pair])
+        return self.touching(self._moving([int(self._mj.geom_bodyid[g]) for g in geoms]))
+
+    def tendon(self, tendon: int) -> Effect:
+        """Give the effect of a tendon: on what it reaches."""
+        return self.always(self._of_tendon(tendon))
+
+    def equality(self, equality: int) -> Effect:
+        """Give the effect of an equality constraint: on what it joins."""
+        if disabled(self._mj, _OFF.mjDSBL_EQUALITY):
+            return NOTHING
+        return self.always(self._of_equality(equality))
+
+    def actuator(self, actuator: int) -> Effect:
+        """Give the effect of an actuator: on what its transmission reaches."""
+        mj, group = self._mj, int(self._mj.actuator_group[actuator])
+        off = 0 <= group < 31 and bool(mj.opt.disableactuator & (1 << group))
+        if off or disabled(mj, _OFF.mjDSBL_ACTUATION):
+            return NOTHING
+        if mj.actuator_trntype[actuator] == int(_TRN.mjTRN_BODY):
+            body = int(mj.actuator_trnid[actuator, 0])
+            shapes = [g for g in range(mj.ngeom) if int(mj.geom_bodyid[g]) == body]
+            return self.touching({tree for g in shapes for tree in self._touched(g)})
+        return self.always(self._of_actuator(actuator))
+
+    def highest_condim(self, geom: int) -> int:
+        """Give the largest number of dimensions of the contacts of a shape; 0 if it has none."""
+        others = np.flatnonzero(self._dynamic[geom])
+        if not len(others):
+            return 0
+        mj = self._mj
+        mine, their = mj.geom_priority[geom], mj.geom_priority[others]
+        larger = np.maximum(mj.geom_condim[geom], mj.geom_condim[others])
+        decided = np.where(mine > their, mj.geom_condim[geom], mj.geom_condim[others])
+        return int(np.where(mine == their, larger, decided).max())
+
+    # --- contact -------------------------------------------------------------------------------
+
+    @cached_property
+    def _contacts_on(self) -> bool:
+        off = (_OFF.mjDSBL_CONTACT, _OFF.mjDSBL_CONSTRAINT)
+        return not any(disabled(self._mj, flag) for flag in off)
+
+    @cached_property
+    def _dynamic(self) -> NDArray[np.bool_]:
+        """Which shapes may touch by their masks, as MuJoCo filters them, shape (ngeom, ngeom)."""
+        mj = self._mj
+        if not self._contacts_on:
+            return np.zeros((mj.ngeom, mj.ngeom), dtype=np.bool_)
+        kind, affinity, body = mj.geom_contype, mj.geom_conaffinity, mj.geom_bodyid
+        one = (kind[:, None] & affinity[None, :]) != 0
+        bodies = self._may_meet[np.ix_(body, body)]
+        found: NDArray[np.bool_] = (one | one.T) & bodies
+        for first, second in zip(mj.pair_geom1, mj.pair_geom2, strict=True):
+            found[first, second] = found[second, first] = False  # the pair has its own numbers
+        return found
+
+    @cached_property
+    def _may_meet(self) -> NDArray[np.bool_]:
+        """Which bodies are not kept from touching one another, shape (nbody, nbody)."""
+        mj, moves = self._mj, self._moves
+        weld = np.asarray(mj.body_weldid)
+        parent = weld[mj.body_parentid[weld]]
+        found: NDArray[np.bool_] = moves[:, None] | moves[None, :]
+        found &= weld[:, None] != weld[None, :]
+        if not disabled(mj, _OFF.mjDSBL_FILTERPARENT):
+            free = (weld != 0)[:, None] & (weld != 0)[None, :]
+            family = (weld[:, None] == parent[None, :]) | (parent[:, None] == weld[None, :])
+            found &= ~(free & family)
+        for signature in mj.exclude_signature.tolist():
+            first, second = signature >> 16, signature & 0xFFFF
+            found[first, second] = found[second, first] = False
+        return found
+
+    @cached_property
+    def _touches(self) -> NDArray[np.bool_]:
+        """Which shapes may touch, by their masks or because a pair says so."""
+        found: NDArray[np.bool_] = self._dynamic.copy()
+        if self._contacts_on:
+            for first, second in zip(self._mj.pair_geom1, self._mj.pair_geom2, strict=True):
+                found[first, second] = found[second, first] = True
+        return found
+
+    def _touched(self, geom: int) -> Trees:
+        """Give the trees that feel a shape: its own, or those that touch it if it is static."""
+        others = self._mj.geom_bodyid[np.flatnonzero(self._touches[geom])]
+        body = int(self._mj.geom_bodyid[geom])
+        meets = self._flexes_at(geom)
+        if not (len(others) or meets):
+            return NONE
+        if self._moves[body]:
+            return frozenset({self.tree(body)})
+        return self._moving(others.tolist()) | meets
+
+    def _flexes_at(self, geom: int) -> Trees:
+        """Give the trees of the flexes that may touch a shape."""
+        mj, found = self._mj, NONE
+        for flex in range(mj.nflex if self._contacts_on else 0):
+            one = mj.geom_contype[geom] & mj.flex_conaffinity[flex]
+            if one or mj.geom_conaffinity[geom] & mj.flex_contype[flex]:
+                found |= self._of_flex(flex)
+        return found
+
+    @cached_property
+    def _islands(self) -> list[Trees]:
+        """For each tree, all those that a chain of contacts and couplings may link to it."""
+        mj = self._mj
+        links: list[Iterable[int]] = [*self._couplings()]
+        tree = np.where(self._moves, self._tree, -1)[mj.geom_bodyid]
+        for first, second in np.argwhere(np.triu(self._touches)):
+            if tree[first] >= 0 and tree[second] >= 0 and tree[first] != tree[second]:
+                links.append((int(tree[first]), int(tree[second])))
+        for flex in range(mj.nflex if self._contacts_on else 0):
+            own = self._of_flex(flex)
+            links += [
+                own | {int(tree[g])}
+                for g in range(mj.ngeom)
+                if tree[g] >= 0 and self._flexes_at(g) & own
+            ]
+            for other in range(flex):
+                one = mj.flex_contype[flex] & mj.flex_conaffinity[other]
+                if one or mj.flex_contype[other] & mj.flex_conaffinity[flex]:
+                    links.append(own | self._of_flex(other))
+        return _groups(len(self.roots), links)
+
+    def _reached(self, trees: Iterable[int]) -> Trees:
+        return frozenset().union(*(self._islands[tree] for tree in trees))
+
+    # --- couplings -----------------------------------------------------------------------------
+
+    def _couplings(self) -> Iterator[Trees]:
+        """List the groups of trees that something joins for good."""
+        mj = self._mj
+        yield from (self._of_tendon(i) for i in range(mj.ntendon))
+        yield from (self._of_equality(i) for i in range(mj.neq))
+        yield from (self._of_actuator(i) for i in range(mj.nactuator))
+        yield from (self._of_flex(i) for i in range(mj.nflex))
+
+    def _moving(self, bodies: Iterable[int]) -> Trees:
+        """Give the trees of the bodies that can move."""
+        return frozenset(self.tree(body) for body in bodies if self._moves[body])
+
+    def _of_tendon(self, tendon: int) -> Trees:
+        return self._moving(body for _, _, body in self._path(tendon))
+
+    def _path(self, tendon: int) -> Iterator[tuple[int, int, int]]:
+        """List what a tendon runs through: kind, number and body of each."""
+        mj, first = self._mj, int(self._mj.tendon_adr[tendon])
+        for i in range(first, first + int(mj.tendon_num[tendon])):
+            kind, element = int(mj.wrap_type[i]), int(mj.wrap_objid[i])
+            if kind == int(_WRAP.mjWRAP_JOINT):
+                yield kind, element, int(mj.jnt_bodyid[element])
+            elif kind == int(_WRAP.mjWRAP_SITE):
+                yield kind, element, int(mj.site_bodyid[element])
+            elif kind in (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER)):
+                yield kind, element, int(mj.geom_bodyid[element])
+
+    def _bodies_of_equality(self, equality: int) -> list[int]:
+        """List the bodies that a connection or weld holds together."""
+        mj = self._mj
+        if mj.eq_type[equality] not in (int(_EQ.mjEQ_CONNECT), int(_EQ.mjEQ_WELD)):
+            return []
+        sites = mj.eq_objtype[equality] == int(_OBJ.mjOBJ_SITE)
+        ends = int(mj.eq_obj1id[equality]), int(mj.eq_obj2id[equality])
+        return [int(mj.site_bodyid[end]) if sites else end for end in ends]
+
+    def _of_equality(self, equality: int) -> Trees:
+        mj = self._mj
+        ends = [int(e) for e in (mj.eq_obj1id[equality], mj.eq_obj2id[equality]) if e >= 0]
+        match mujoco.mjtEq(int(mj.eq_type[equality])):
+            case _EQ.mjEQ_CONNECT | _EQ.mjEQ_WELD:
+                return self._moving(self._bodies_of_equality(equality))
+            case _EQ.mjEQ_JOINT:
+                return self._moving(int(mj.jnt_bodyid[end]) for end in ends)
+            case _EQ.mjEQ_TENDON:
+                return frozenset().union(*map(self._of_tendon, ends))
+            case _:
+                return self._of_flex(ends[0])
+
+    def _of_actuator(self, actuator: int) -> Trees:
+        mj = self._mj
+        first, second = (int(end) for end in mj.actuator_trnid[actuator])
+        match mujoco.mjtTrn(int(mj.actuator_trntype[actuator])):
+            case _TRN.mjTRN_JOINT | _TRN.mjTRN_JOINTINPARENT:
+                return self._moving([int(mj.jnt_bodyid[first])])
+            case _TRN.mjTRN_SO3 if second < 0:
+                return self._moving([int(mj.jnt_bodyid[first])])
+            case _TRN.mjTRN_TENDON:
+                return self._of_tendon(first)
+            case _TRN.mjTRN_SITE | _TRN.mjTRN_SLIDERCRANK | _TRN.mjTRN_SO3:
+                ends = [end for end in (first, second) if end >= 0]
+                return self._moving(int(mj.site_bodyid[end]) for end in ends)
+            case _:
+                return NONE  # adhesion acts by contact
+
+    def _of_flex(self, flex: int) -> Trees:
+        mj = self._mj
+        vertex, node = int(mj.flex_vertadr[flex]), int(mj.flex_nodeadr[flex])
+        vertices = mj.flex_vertbodyid[vertex : vertex + int(mj.flex_vertnum[flex])]
+        nodes = mj.flex_nodebodyid[node : node + int(mj.flex_nodenum[flex])]
+        return self._moving(int(b) for b in (*vertices, *nodes) if b >= 0)
+
+    # --- what is attached to bodies ------------------------------------------------------------
+
+    @cached_property
+    def _attached(self) -> dict[int, Trees]:
+        """Map sites to the trees of the tendons, actuators and constraints that use them."""
+        mj = self._mj
+        found: dict[int, Trees] = {}
+
+        def add(site: int, trees: Trees) -> None:
+            found[site] = found.get(site, NONE) | trees
+
+        for i in range(mj.ntendon):
+            for kind, element, _ in self._path(i):
+                if kind == int(_WRAP.mjWRAP_SITE):
+                    add(element, self._of_tendon(i))
+        for i in range(mj.nactuator):
+            on_sites = mj.actuator_trntype[i] in (
+                int(_TRN.mjTRN_SITE),
+                int(_TRN.mjTRN_SLIDERCRANK),
+                int(_TRN.mjTRN_SO3),
+            )
+            if on_sites and (mj.actuator_trnid[i] >= 0).all():
+                for site in mj.actuator_trnid[i].tolist():
+                    add(site, self._of_actuator(i))
+            elif on_sites and mj.actuator_trntype[i] != int(_TRN.mjTRN_SO3):
+                add(int(mj.actuator_trnid[i, 0]), self._of_actuator(i))
+        for i in range(mj.neq):
+            if mj.eq_objtype[i] == int(_OBJ.mjOBJ_SITE):
+                for site in (int(mj.eq_obj1id[i]), int(mj.eq_obj2id[i])):
+                    add(site, self._of_equality(i))
+        return found
+
+    @cached_property
+    def _wrapped(self) -> dict[int, Trees]:
+        """Map shapes to the trees of the tendons that run around them."""
+        found: dict[int, Trees] = {}
+        for i in range(self._mj.ntendon):
+            for kind, element, _ in self._path(i):
+                if kind in (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER)):
+                    found[element] = found.get(element, NONE) | self._of_tendon(i)
+        return found
+
+    def _held(self, bodies: set[int]) -> Trees:
+        """Give the trees that tendons, actuators and constraints tie to some static bodies."""
+        mj = self._mj
+        found = NONE
+        for i in range(mj.neq):
+            if bodies & set(self._bodies_of_equality(i)):
+                found |= self._of_equality(i)
+        for site, trees in self._attached.items():
+            if int(mj.site_bodyid[site]) in bodies:
+                found |= trees
+        for geom, trees in self._wrapped.items():
+            if int(mj.geom_bodyid[geom]) in bodies:
+                found |= trees
+        return found
+
+
+def _groups(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
+    """Merge what is linked, directly or through others; give the group of each."""
+    group = [{i} for i in range(n)]
+    for link in links:
+        members = set().union(*(group[i] for i in link))
+        for member in members:
+            group[member] = members
+    return [frozenset(members) for members in group]
