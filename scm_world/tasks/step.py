@@ -234,6 +234,9 @@ class StepTask(Task):
                         f"{parent.name!r}, a parent of {state.name!r}, is no parameter, state or "
                         "action: the step function is not given it"
                     )
+        for action in self.actions:
+            if action.dtype != "real":
+                yield f"{action.name!r}: actions are real numbers; round it in the step function"
         for name in self.start:
             if name not in {state.name for state in self.states}:
                 yield f"start: {name!r} is no state"
@@ -268,7 +271,9 @@ class StepTask(Task):
             raise UnknownOption("frame_skip", calls, ("1: a control step is one call of step",))
         given = [v.name for v in (*self.parameters, *self.states, *self.actions)]
         states = [one for state in self.states for one in self._state(state, given)]
-        clock = next(iter(Clock(timing.steps, timing.control_period).variables()))
+        clock: Variable = next(iter(Clock(timing.steps, timing.control_period).variables()))
+        if self._drawn is not None:  # noise goes by the control step: setting that is no cause
+            clock = clock.model_copy(update={"settable_state": False, "parents": ()})
         counted = [
             declared(name, getattr(self, name))
             for name in (REWARD, SUCCESS, TERMINATED)

@@ -89,6 +89,7 @@ class Declaration:
         model: The causal model, without interventions.
         composition: What the variables mean to an engine.
         slices: Where each state stands in the state vector.
+        whole: States that are whole numbers.
         actions: Where each action stands in the vector of all actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
@@ -107,6 +108,9 @@ class Declaration:
         self._places = [
             (name, where, self.model.declared(name).shape) for name, where in self.slices.items()
         ]
+        self.whole = tuple(
+            name for name in self.slices if self.model.declared(name).dtype != "real"
+        )
         self.actions: dict[str, slice] = {}
         for action in (v for v in self.model.variables if isinstance(v, Action)):
             first = self.n_actions
@@ -190,9 +194,18 @@ class Declaration:
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
     def states(self, state: State) -> dict[str, Value]:
-        """Give the states by name, as views of a vector."""
+        """Give the states by name, as views of a vector; whole numbers as copies."""
         vector = state.vector
-        return {name: vector[where].reshape(shape) for name, where, shape in self._places}
+        found = {name: vector[where].reshape(shape) for name, where, shape in self._places}
+        for name in self.whole:
+            found[name] = found[name].astype(np.int64)
+        return found
+
+    def read(self, name: str, vectors: Floats) -> Value:
+        """Give a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
+        variable = self.model.declared(name)
+        found = vectors[:, self.slices[name]].reshape(len(vectors), *variable.shape)
+        return found.astype(np.int64) if name in self.whole else found
 
     def view(self, name: str, state: State) -> Value:
         """Give one state, as a view of a vector."""

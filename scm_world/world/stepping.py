@@ -34,6 +34,7 @@ class Stepped(Declared):
     _now: dict[str, Value]
     _before: dict[str, Value]
     _state: State
+    _counted: tuple[tuple[Value, Value], ...]
     _held: SCM
     _readouts: Readouts
     _instant: Instant | None
@@ -118,8 +119,14 @@ class Stepped(Declared):
         """Be at another control step; where everything is has been written already."""
         self._index = index
         self._clock[...] = index
+        self._count()
         self._readouts.moved()
         self._instant = None
+
+    def _count(self) -> None:
+        """Take over the states that are whole numbers; the others are views of the vector."""
+        for value, view in self._counted:
+            value[...] = view
 
     def arrive(self, vector: Floats, index: int, action: Floats, earlier: Values) -> None:
         """Take over what happened while the engine was stepped by a ``Batch``.

@@ -310,6 +310,7 @@ class World(Stepped):
             self.backend.read(self._state)
         else:
             self._state.vector[:] = state.vector
+        self._count()
         if changed:
             self._readouts.recall(earlier)
 
@@ -323,6 +324,8 @@ class World(Stepped):
         self._before: dict[str, Value] = {}
         self._state = declaration.empty_state()
         self._now.update(declaration.states(self._state))
+        views = [(name, declaration.view(name, self._state)) for name in declaration.whole]
+        self._counted = tuple((self._now[name], view) for name, view in views)
         self._readouts = Readouts(declaration.model, self._now, self._before, declaration.computed)
 
     def current(self) -> tuple[Values, State]:
