@@ -172,3 +172,10 @@ for _task in (
             vector_entry_point="scm_world.env.batched:ScmWorldVectorEnv",
             kwargs={"task": _task},
         )
+
+if "scm_world/Model-v0" not in gymnasium.registry:
+    gymnasium.register(
+        id="scm_world/Model-v0",
+        entry_point="scm_world.env:model_env",
+        vector_entry_point="scm_world.env:model_vector_env",
+    )

@@ -4,19 +4,21 @@ import gymnasium
 
 from scm_world.env.batched import ScmWorldVectorEnv
 from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.models import MODEL_ID, model_env, model_vector_env
 from scm_world.env.observer import CONTEXTS, MODES, Observation
 from scm_world.env.wrappers import DeltaAction, MovingAverageAction, ObjectSelector
 
 IDS = {
     name: str(spec.kwargs["task"])
     for name, spec in gymnasium.registry.items()
-    if spec.namespace == "scm_world"
+    if spec.namespace == "scm_world" and "task" in spec.kwargs
 }
-"""The registered environments, each with its task."""
+"""The registered environments of tasks, each with its task."""
 
 __all__ = [
     "CONTEXTS",
     "IDS",
+    "MODEL_ID",
     "MODES",
     "DeltaAction",
     "MovingAverageAction",
@@ -24,4 +26,6 @@ __all__ = [
     "Observation",
     "ScmWorldEnv",
     "ScmWorldVectorEnv",
+    "model_env",
+    "model_vector_env",
 ]

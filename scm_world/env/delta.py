@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.entities import ACTIONS
 from scm_world.env.vector import box
 from scm_world.errors import UnknownOption
+from scm_world.tasks import Task
 from scm_world.world import World
+from scm_world.world.family import Family
 
 PREFIX = "delta_"
 JOINTS, TIPS = "joint_positions", "end_effector_positions"
@@ -21,8 +22,20 @@ COMMAND, MEASURED = "command", "measured"
 ORIGINS = (COMMAND, MEASURED)
 """What relative joint positions are relative to."""
 
-MODES = (*ACTIONS, *(PREFIX + mode for mode in ACTIONS))
-"""What an environment calls its actions."""
+
+def checked_mode(mode: Any, task: Task | Family) -> str:
+    """Check what actions should mean; None stands for the first mode of the task.
+
+    Raises:
+        UnknownOption: The task has no such mode, neither by itself nor after ``"delta_"``.
+    """
+    modes = (task.task if isinstance(task, Family) else task).action_modes
+    allowed = (*modes, *(PREFIX + one for one in modes))
+    if mode is None:
+        return modes[0]
+    if mode not in allowed:
+        raise UnknownOption("action_mode", mode, allowed)
+    return str(mode)
 
 
 @final
@@ -31,13 +44,13 @@ class Delta:
 
     What they are relative to is a function of the world alone, so that snapshots and
     counterfactuals hold: for joint positions the last target (the present joints at the start of
-    an episode and after an intervention on them), for torques the last torques, for fingertips
-    the present ones.
+    an episode and after an intervention on them), for fingertips the present ones, for torques
+    and the controls of a model the last ones.
 
     Args:
         world: That takes the actions.
-        middle: What an absolute action of 0 stands for, shape (9,).
-        half: What an absolute action of 1 adds, shape (9,).
+        middle: What an absolute action of 0 stands for, shape (n,).
+        half: What an absolute action of 1 adds, shape (n,).
         scale: Share of half of the range that the largest relative action stands for, in (0, 1].
         origin: ``"command"``: joint positions are relative to their last target; ``"measured"``:
             to where the joints are.
@@ -79,7 +92,7 @@ class Delta:
         return self.moved(action, self._offset())
 
     def moved(self, action: Floats, offset: Floats) -> Floats:
-        """Add what actions are relative to, shape (..., 9) [SI units]; clip to the range."""
+        """Add what actions are relative to, shape (..., n) [SI units]; clip to the range."""
         relative = (offset - self._middle) / self._half
         step = self._gain * np.clip(action, -self._reach, self._reach)
         found: Floats = np.clip(step + relative, self._low, self._high)
@@ -104,8 +117,7 @@ class Delta:
         if world.action_mode == JOINTS and self.is_set():
             found: Floats = state["joint_positions"]
             return found
-        last: Floats = now["action"]
-        return last
+        return np.concatenate([np.ravel(now[name]) for name in world.declaration.actions])
 
     def is_set(self) -> bool:
         """Tell whether nothing was commanded since the joints were put where they are."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, final
 from weakref import WeakKeyDictionary
 
 import gymnasium
@@ -13,20 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.copies import Copied
-from scm_world.env.delta import COMMAND, MODES, PREFIX, Delta, delta_for
-from scm_world.env.given import doubles, made_task, names_of
+from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode, delta_for
+from scm_world.env.given import doubles, finite, made_task, names_of
 from scm_world.env.goals import GoalReward, Goals, reward_scale
 from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
 from scm_world.env.start import asked, begin, beginning_structure
 from scm_world.env.vector import box
 from scm_world.env.window import Window
-from scm_world.errors import ActionError, UnknownOption
+from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.direct import direct
 from scm_world.scene.camera import OVERVIEW, Camera
 from scm_world.scene.kinematics import scaled_clip_kernel
 from scm_world.tasks import Task
-from scm_world.tasks.rewards import one_number
+from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, World
@@ -36,18 +37,42 @@ from scm_world.world.start import whole_number
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
+REWARD, TERMINATED = "reward", "terminated"
 _NOT_GIVEN = ("self", "__class__")
+_NO_REWARD = (
+    "the task {!r} has no reward, and an environment gives one at every step; give "
+    "reward=(function, 'hinge.position', …): a function and the names of what it is given"
+)
 _RESETS = ("do", "episode")
+
+
+@final
+@dataclass(frozen=True)
+class Counted:
+    """Which of the variables that count a structure has.
+
+    Attributes:
+        success: Whether it says if the task is solved.
+        fraction: Whether it says to which part.
+        terminated: Whether it says if the episode ends.
+    """
+
+    success: bool
+    fraction: bool
+    terminated: bool
 
 
 class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]):
     """An environment whose every variable is a node of a causal graph.
 
-    Made by ``gymnasium.make("scm_world/Pushing-v0")``; ``scm_world.env.IDS`` lists the ids.
+    Made by ``gymnasium.make("scm_world/Pushing-v0")``; ``scm_world.env.IDS`` lists the ids. Any
+    other model is ``gymnasium.make("scm_world/Model-v0", model="cartpole.xml", reward=…)``.
 
-    Every observation lies in ``observation_space``. Bounds are physical; a number beyond them (a
-    joint faster than 50 rad/s) saturates, like a sensor. An episode is truncated at its length
-    and never terminated. An intervention that changes which bodies exist changes what is
+    Every observation lies in ``observation_space``. Bounds are physical; a number of the robot's
+    tasks beyond them (a joint faster than 50 rad/s) saturates, like a sensor. An episode is
+    truncated at its length, and terminated where the variable ``terminated`` says so, if the task
+    has one. ``info`` has ``success``, ``fractional_success`` and goals if the task has them. An
+    intervention that changes which bodies exist changes what is
     observed: ``observation_space`` is then the one of the new structure. A copy, or what comes
     out of a pickle, goes on bit for bit like the original.
 
@@ -55,10 +80,12 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         task: Name of a registered task, or a task.
         task_options: Arguments of the constructor of a task that is given by its name.
         backend: ``"mujoco"``, ``"bullet"`` or ``"fake"``.
-        preset: ``"fast"`` or ``"precise"``.
-        frame_skip: Length of a control step in units of 4 ms.
-        action_mode: ``"joint_positions"``, ``"joint_torques"`` or ``"end_effector_positions"``,
-            or one of them after ``"delta_"``: see ``DeltaAction``.
+        preset: One of the task's ``presets``; the first one if None.
+        frame_skip: Length of a control step: of the robot's tasks in units of 4 ms, of a model in
+            its physics steps; the task's own if None.
+        action_mode: One of the task's ``action_modes`` (of the robot's tasks
+            ``"joint_positions"``, ``"joint_torques"``, ``"end_effector_positions"``), or one of
+            them after ``"delta_"``: see ``DeltaAction``; the first one if None.
         delta_scale: Share of half of the range that the largest relative action stands for.
         delta_origin: Joint positions are relative to the last ``"command"``, or ``"measured"``.
         normalize_actions: Take actions in [-1, 1] instead of SI units.
@@ -90,6 +117,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
+        ModelError: The task has no reward.
         EngineError: The engine is not installed, or there is no screen for ``"human"``.
 
     Example:
@@ -112,9 +140,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         *,
         task_options: Mapping[str, Any] | None = None,
         backend: str = "mujoco",
-        preset: str = "fast",
-        frame_skip: int = 10,
-        action_mode: str = "joint_positions",
+        preset: str | None = None,
+        frame_skip: int | None = None,
+        action_mode: str | None = None,
         delta_scale: float = 1.0,
         delta_origin: str = COMMAND,
         normalize_actions: bool = True,
@@ -138,7 +166,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         render_mode: str | None = None,
     ) -> None:
         made_with = {name: value for name, value in locals().items() if name not in _NOT_GIVEN}
-        Copied.__init__(self, **made_with)
         self._how = Observing(
             mode=observation_mode,
             names=names_of("observe", observe),
@@ -150,34 +177,40 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             normalize=normalize_observations,
             goals=goal_env,
         )
-        if action_mode not in MODES:
-            raise UnknownOption("action_mode", action_mode, MODES)
+        made = made_task(task, task_options)
+        mode = checked_mode(action_mode, made)
         self.world = World(
-            made_task(task, task_options),
+            made,
             backend=backend,
             preset=preset,
-            action_mode=action_mode.removeprefix(PREFIX),
+            action_mode=mode.removeprefix(PREFIX),
             frame_skip=frame_skip,
             max_episode_length=max_episode_length,
             conventions=conventions,
             variables_space=as_region("variables_space", variables_space),
         )
-        self._modes = (observation_mode, action_mode)
+        used = {"preset": self.world.options.preset, "frame_skip": self.world.frame_skip}
+        Copied.__init__(self, **made_with | used | {"action_mode": mode})
+        if REWARD not in self.world.model:
+            self.world.close()
+            raise ModelError([_NO_REWARD.format(self.world.task.name)])
+        self._modes = (observation_mode, mode)
         self._rich = (info_contacts, info_state)
         self._begin_with(start, random_goal, attempts)
         self._open(render_mode)
-        self._act(normalize_actions, action_mode, {"scale": delta_scale, "origin": delta_origin})
+        self._act(normalize_actions, mode, {"scale": delta_scale, "origin": delta_origin})
         extra = int(self.world.conventions.extra_step)
         self.limit = self.world.max_episode_length + extra
         self._scale = reward_scale(self.world)
         self._terms = tuple(self.world.task.weights)
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
-        self._observers: WeakKeyDictionary[Declaration, tuple[Observer, Goals, tuple[str, ...]]]
-        self._observers = WeakKeyDictionary()
+        self._observers: WeakKeyDictionary[
+            Declaration, tuple[Observer, Goals | None, Counted, tuple[str, ...]]
+        ] = WeakKeyDictionary()
+        self._arrange(beginning_structure(self.world, self._start))
         if goal_env:
             self.compute_reward = GoalReward(self.world)
-        self._arrange(beginning_structure(self.world, self._start))
 
     def _open(self, render_mode: str | None) -> None:
         """Choose how pictures are shown."""
@@ -201,14 +234,14 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._attempts = whole_number("attempts", attempts, least=1)
 
     def _act(self, normalize: bool, mode: str, steps: Mapping[str, Any]) -> None:
-        """Choose what an action means."""
+        """Choose what an action means; what has no two bounds keeps its unit."""
         low, high = self.world.action_low, self.world.action_high
-        self._middle, self._half = (low + high) / 2.0, (high - low) / 2.0
-        if not normalize:
-            self._middle, self._half = np.zeros(9), np.ones(9)
-        bounds = (-np.ones(9), np.ones(9)) if normalize else (low, high)
+        scaled = normalize & np.isfinite(low) & np.isfinite(high) & (low < high)
+        inside = np.where(scaled, low, -1.0), np.where(scaled, high, 1.0)
+        self._middle, self._half = (inside[0] + inside[1]) / 2.0, (inside[1] - inside[0]) / 2.0
+        bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         self._delta = delta_for(mode, self.world, self._middle, self._half, **steps)
-        self._given = np.empty(9)
+        self._given = np.empty(low.size)
         self._range = (self._middle, self._half, low, high)
         self._scale_and_clip = direct(scaled_clip_kernel, self._given, *self._range, self._given)
         self.action_space = self._delta.space() if self._delta else box(*bounds)
@@ -218,12 +251,12 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return Delta(self.world, self._middle, self._half)
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Give the (absolute) action that stands for a command in SI units, shape (9,)."""
+        """Give the (absolute) action that stands for a command in SI units, shape (n,)."""
         found: NDArray[np.float64] = (np.asarray(command) - self._middle) / self._half
         return found
 
     def toward(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Give the action, now, that leads to a command in SI units or near it, shape (9,)."""
+        """Give the action, now, that leads to a command in SI units or near it, shape (n,)."""
         if self._delta is None:
             return self.as_action(command)
         return self._delta.toward(np.asarray(command, dtype=np.float64))
@@ -232,12 +265,17 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """Observe the structure that there is."""
         found = self._observers.get(declaration)
         if found is None:
-            goals = Goals(declaration)
+            goals = Goals(declaration) if any(declaration.task.goal_names()) else None
             made = observer(self.world, declaration, self._how, goals)
-            needed = (*made.names, *goals.names, *self._terms, "success", "reward")
-            found = self._observers[declaration] = made, goals, tuple(dict.fromkeys(needed))
+            counted = tuple(name for name in (SUCCESS, TERMINATED) if name in declaration.model)
+            fraction = (FRACTION,) if FRACTION in declaration.model else ()
+            wanted = () if goals is None else goals.names
+            needed = (*made.names, *wanted, *self._terms, *fraction, *counted, REWARD)
+            flags = (SUCCESS in counted, bool(fraction), TERMINATED in counted)
+            found = made, goals, Counted(*flags), tuple(dict.fromkeys(needed))
+            self._observers[declaration] = found
         self._declaration = declaration
-        self._observer, self._goals, self._needed = found
+        self._observer, self._goals, self._counted, self._needed = found
         self.observation_space = self._observer.space
 
     def _look(self) -> Values:
@@ -300,25 +338,26 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """
         self.world.advance(self._command(action))
         now = self._look()
-        reward = self._scale * one_number(now, "reward", self._terms)
+        reward = self._scale * one_number(now, REWARD, self._terms)
+        terminated = self._counted.terminated and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
         if self._window is not None:
             self._show()
-        return self._observer.observe(now), reward, False, truncated, self._info(now)
+        return self._observer.observe(now), reward, terminated, truncated, self._info(now)
 
     def _command(self, action: NDArray[np.float32]) -> Floats:
-        """Turn an action into what the world takes, shape (9,)."""
+        """Turn an action into what the world takes, shape (n,)."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
-            given = doubles(action)
-        if given.shape != (9,):
-            raise ActionError(f"an action has shape (9,), got {given.shape}", action)
+            given = doubles(action, self._given.size)
+        if given.shape != self._given.shape:
+            raise ActionError(f"an action has shape {self._given.shape}, got {given.shape}", action)
         if self._delta is not None:
             given = self._delta.absolute(np.array(given, dtype=np.float64))
         self._given[...] = given  # every 32-bit number is a 64-bit one
-        command = np.empty(9)
+        command = np.empty(self._given.size)
         if not self._scale_and_clip(self._given, *self._range, command):
-            raise ActionError(f"an action is nine finite numbers, got {action!r}", action)
+            raise ActionError(f"an action is {finite(command.size)}, got {action!r}", action)
         return command
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
@@ -352,16 +391,14 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return self._observer.observe(now), self._info(now)
 
     def _info(self, now: Values) -> dict[str, Any]:
-        achieved, desired = self._goals.read(self.world, now)
-        success = bool(now["success"])
-        info = {
-            "is_success": success,
-            "success": success,
-            "fractional_success": float(now["fractional_success"]),
-            "achieved_goal": achieved,
-            "desired_goal": desired,
-            "reward_terms": {name: float(now[name]) for name in self._terms},
-        }
+        info: dict[str, Any] = {}
+        if self._counted.success:
+            info["is_success"] = info["success"] = bool(now[SUCCESS])
+        if self._counted.fraction:
+            info["fractional_success"] = float(now[FRACTION])
+        if self._goals is not None:
+            info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world, now)
+        info["reward_terms"] = {name: float(now[name]) for name in self._terms}
         contacts, state = self._rich
         if contacts:
             info["contacts"] = _touches(self.world.backend)

@@ -13,8 +13,17 @@ from scm_world.tasks import Task, make_task
 from scm_world.world.family import Family
 
 
-def doubles(action: Any) -> Floats:
+def finite(size: int) -> str:
+    """Say what an action of so many numbers is, for messages."""
+    return "a finite number" if size == 1 else f"{size} finite numbers"
+
+
+def doubles(action: Any, size: int) -> Floats:
     """Read an action.
+
+    Args:
+        action: What was given.
+        size: How many numbers it should be, for the message.
 
     Raises:
         ActionError: It is no numbers.
@@ -22,7 +31,7 @@ def doubles(action: Any) -> Floats:
     try:
         return np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ActionError(f"an action is nine finite numbers, got {action!r}", action) from None
+        raise ActionError(f"an action is {finite(size)}, got {action!r}", action) from None
 
 
 def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:

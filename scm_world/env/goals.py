@@ -10,15 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scm_world._types import Floats, Values
+from scm_world.env.bounds import WIDE
+from scm_world.errors import UnknownOption
 from scm_world.geometry.direct import direct
 from scm_world.geometry.gather import gather_copied, places
-from scm_world.tasks import Task
+from scm_world.tasks import Task, TriFingerTask
 from scm_world.tasks.rewards import FRACTION, SUCCESS
+from scm_world.variables import Linear
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
 
 BOUND = 10.0
-"""Goals are positions [m], sizes [m] and unit quaternions; what lies beyond saturates."""
+"""Goals of the robot are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
 
 TERMS: dict[str, Callable[[Task, Floats, Floats], Any]] = {
     FRACTION: lambda task, have, want: task.fraction(have, want),
@@ -37,6 +40,7 @@ class Goals:
 
     Attributes:
         names: The variables that have to be computed.
+        bound: Numbers beyond it saturate in observations.
         spaces: Of ``achieved_goal`` and of ``desired_goal``: 64-bit floats of their true shapes,
             so that a reward that is computed from them is exact.
     """
@@ -47,8 +51,9 @@ class Goals:
         self._both = Collected(declaration, self.names)
         self._middle = Collected(declaration, sides[0]).size
         sizes = (self._middle, self._both.size - self._middle)
+        self.bound = BOUND if isinstance(declaration.task, TriFingerTask) else WIDE
         self.spaces: dict[str, gymnasium.Space[Any]] = {
-            name: gymnasium.spaces.Box(-BOUND, BOUND, (size,), np.float64)
+            name: gymnasium.spaces.Box(-self.bound, self.bound, (size,), np.float64)
             for name, size in zip(("achieved_goal", "desired_goal"), sizes, strict=True)
         }
 
@@ -60,7 +65,7 @@ class Goals:
     def observe(self, world: World, now: Values) -> dict[str, Floats]:
         """Give both vectors, by name."""
         pair = zip(self.spaces, self.read(world, now), strict=True)
-        return {name: np.clip(goal, -BOUND, BOUND) for name, goal in pair}
+        return {name: np.clip(goal, -self.bound, self.bound) for name, goal in pair}
 
 
 @final
@@ -111,9 +116,16 @@ class GoalReward:
 
     Args:
         world: Whose task, weights and conventions hold.
+
+    Raises:
+        UnknownOption: The reward is no weighted sum of terms.
     """
 
     def __init__(self, world: World) -> None:
+        reward: Any = world.model.declared("reward")
+        if not isinstance(reward.mechanism, Linear):
+            allowed = ("False", "a reward that is Linear in terms: Measured(mechanism=Linear(…))")
+            raise UnknownOption("goal_env", True, allowed)
         self._world = world
         self._warned = False
 

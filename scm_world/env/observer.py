@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, final
 
 import gymnasium
@@ -17,7 +17,7 @@ from scm_world.env.keypoints import CORNERS, KEYPOINTS, Keypoints
 from scm_world.env.vector import Layouts, Part, Vector
 from scm_world.errors import UnknownOption
 from scm_world.scene.camera import Camera
-from scm_world.tasks import HEAD, TIME, Building, Observed
+from scm_world.tasks import HEAD, TIME, Building, Observed, TriFingerTask
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
 
@@ -108,20 +108,24 @@ class Together:
         return found if self._goals is None else found | self._goals.observe(self._world, now)
 
 
-def observer(world: World, declaration: Declaration, how: Observing, goals: Goals) -> Observer:
+def observer(
+    world: World, declaration: Declaration, how: Observing, goals: Goals | None
+) -> Observer:
     """Put together what is asked for.
 
     Args:
         world: That is observed.
         declaration: Of the structure; the observer holds for that one only.
         how: What is asked for.
-        goals: Of the structure.
+        goals: Of the structure, if it has some.
 
     Raises:
-        UnknownOption: The task has no boxes, or there is no such camera.
+        UnknownOption: The task has no boxes or no goals, or there is no such camera.
         UnknownVariable: There is no such variable.
     """
     main: Observer
+    if how.goals and goals is None:
+        raise UnknownOption("goal_env", True, (f"False: {declaration.task.name} has no goals",))
     if how.mode == "pixel":
         from scm_world.env.pixels import Pixels, chosen, followed
 
@@ -149,9 +153,11 @@ def context(declaration: Declaration) -> tuple[str, ...]:
 
 def published(world: World, declaration: Declaration) -> dict[str, Observed]:
     """List the parts of the structured observation, by variable."""
-    length = world.max_episode_length * world.control_period
-    end = length if world.given_length is None else float(world.given_length)
-    parts = (Observed(TIME, (0.0, end)), *HEAD, *declaration.task.observed())
+    parts = list(declaration.task.observed())
+    if isinstance(declaration.task, TriFingerTask):
+        length = world.max_episode_length * world.control_period
+        end = length if world.given_length is None else float(world.given_length)
+        parts = [Observed(TIME, (0.0, end)), *HEAD, *parts]
     return {part.variable: part for part in parts}
 
 
@@ -171,23 +177,30 @@ def _vector(world: World, declaration: Declaration, how: Observing) -> Vector:
 
 
 def _parts(world: World, declaration: Declaration, names: Iterable[str]) -> list[Part]:
-    """Give variables the bounds of the structured observation, or those they declare."""
+    """Give variables the bounds of the structured observation, or those they declare.
+
+    States of a model scale by the bounds they declare, and do not saturate: joint limits are soft.
+    """
     known = published(world, declaration)
+    soft = frozenset[str]()
+    if not isinstance(declaration.task, TriFingerTask):
+        soft = frozenset(declaration.slices)
     as_published = world.conventions.published_observation
     parts = []
     for name in names:
         low, high = bounds(declaration.model, name)
         observed, shape = known.get(name), declaration.model.declared(name).shape
+        saturates = name not in soft or (observed is not None and observed.low is not None)
         if observed is not None and as_published:
             low, high = (spread(side, shape) for side in observed.published)
         elif observed is not None and observed.low is not None:
             low, high = spread(observed.low, shape), spread(observed.high, shape)
-        parts.append(Part(name, low, high))
+        parts.append(Part(name, low, high, saturates=saturates))
     return parts
 
 
 def _quiet(parts: Iterable[Part]) -> list[Part]:
-    return [Part(part.name, part.low, part.high, sensed=False) for part in parts]
+    return [replace(part, sensed=False) for part in parts]
 
 
 def _keypoints(declaration: Declaration) -> Keypoints:

@@ -40,12 +40,14 @@ class Part:
         low: Lower bound of each number, shape (n,).
         high: Upper bound.
         sensed: Whether the noise of the sensors reaches it.
+        saturates: Whether numbers beyond the bounds are cut off; else the bounds only scale.
     """
 
     name: str
     low: Floats
     high: Floats
     sensed: bool = True
+    saturates: bool = True
 
 
 @final
@@ -87,8 +89,10 @@ class Vector:
         self._raw = np.empty(low.size)
         self._arrange(declaration)
         self._published = world.conventions.published_observation
-        self._scale(low, high, normalize & bounded & (high > low))
+        hard = np.concatenate([np.full(part.low.size, part.saturates) for part in parts])
+        self._scale(low, high, normalize & bounded & (high > low), hard)
         self._version = -1
+        self._senses = SENSOR_NOISE in declaration.model
         self._noise = 0.0
 
     def _arrange(self, declaration: Declaration) -> None:
@@ -107,17 +111,21 @@ class Vector:
         self._computed = [view for view in computed if view[1].ndim]
         self._single = [(n, self._slices[n].start) for n, view in computed if not view.ndim]
 
-    def _scale(self, low: Floats, high: Floats, scaled: NDArray[np.bool_]) -> None:
+    def _scale(
+        self, low: Floats, high: Floats, scaled: NDArray[np.bool_], hard: NDArray[np.bool_]
+    ) -> None:
         width = np.where(scaled, high - low, 2.0)
         gain = np.where(scaled, 2.0 / width, 1.0)
         offset = np.where(scaled, -low * gain - 1.0, 0.0)
         everything = np.full(low.size, np.inf)
-        limits = (-everything, everything) if self._published else (low, high)
+        limits = (np.where(hard, low, -everything), np.where(hard, high, everything))
+        limits = (-everything, everything) if self._published else limits
         self._scales = np.stack([*limits, gain, offset])
         single = np.empty(0, dtype=np.float32)
         like = (self._raw, *self._read, self._raw, self._scales, single)
         self._write = direct(gather_scaled, *like)
         inside = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
+        inside = (np.where(hard, inside[0], -WIDE), np.where(hard, inside[1], WIDE))
         self.space = box(*(limits if self._published else inside))
         world = self._world
         self._shift = 0.0
@@ -130,7 +138,7 @@ class Vector:
         raw = self._raw
         if self._version != self._world.version:
             self._version = self._world.version
-            self._noise = float(now[SENSOR_NOISE])
+            self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
             for name, place in self._still:
                 place[...] = now[name]
         for name, place in self._computed:

@@ -51,8 +51,8 @@ def test_options_that_do_not_go_together(options: dict[str, Any], words: str) ->
     [
         (lambda env: env.reset(options={"do": 5}), UnknownOption, "dictionary"),
         (lambda env: env.do([1]), UnknownOption, "dictionary"),
-        (lambda env: env.step("abc"), ActionError, "nine finite numbers"),
-        (lambda env: env.step([[1], [2, 3]]), ActionError, "nine finite numbers"),
+        (lambda env: env.step("abc"), ActionError, "9 finite numbers"),
+        (lambda env: env.step([[1], [2, 3]]), ActionError, "9 finite numbers"),
         (lambda env: env.do({"gravity": [0, 0, -9]}, space="a"), UnknownOption, "A, B, A"),
         (lambda env: env.do({"gravity": [0, 0, -9]}, space=""), UnknownOption, "A, B, A"),
         (lambda env: env.depth("6"), UnknownOption, "did you mean '60'"),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.env.given import doubles
+from scm_world.env.given import doubles, finite
 from scm_world.errors import ActionError, UnknownOption
 
 PER_WORLD = ("do", "episode")
@@ -153,26 +153,27 @@ def index_of(index: Any, size: int) -> int:
     return number
 
 
-def actions_of(actions: Any, which: NDArray[np.bool_]) -> Floats:
+def actions_of(actions: Any, which: NDArray[np.bool_], size: int) -> Floats:
     """Read the actions of all environments.
 
     Args:
         actions: One for each.
         which: The environments that are stepped, shape (n,).
+        size: How many numbers an action has.
 
     Returns:
-        Shape (n, 9).
+        Shape (n, size).
 
     Raises:
         ActionError: Another shape, or a number that is not finite, where one is stepped.
     """
-    given = doubles(actions)
-    if given.shape != (which.size, 9):
-        shape = f"actions of {which.size} environments have shape ({which.size}, 9)"
+    given = doubles(actions, size)
+    if given.shape != (which.size, size):
+        shape = f"actions of {which.size} environments have shape ({which.size}, {size})"
         raise ActionError(f"{shape}, got {given.shape}", actions)
     if not np.isfinite(given).all():
         wrong = np.flatnonzero(which & ~np.isfinite(given).all(axis=1))
         if wrong.size:
-            text = f"environment {wrong[0]}: an action is nine finite numbers"
+            text = f"environment {wrong[0]}: an action is {finite(size)}"
             raise ActionError(f"{text}, got {given[wrong[0]]!r}", actions)
     return given

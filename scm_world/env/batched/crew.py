@@ -51,7 +51,7 @@ class Crew(Protocol):
 
         Args:
             which: Which ones, shape (n,), bool.
-            actions: Shape (n, 9), 64-bit floats; those of the others are not looked at.
+            actions: Shape (n, n_actions), 64-bit floats; those of the others are not looked at.
         """
 
     def do(

@@ -10,6 +10,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.env.delta import Delta
 from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.goals import Goals
 from scm_world.env.keypoints import KEYPOINTS
 from scm_world.env.observer import Together
 from scm_world.env.vector import Vector
@@ -23,12 +24,13 @@ class Inside:
 
     Attributes:
         needed: Variables that have to be computed.
-        middle: The command that an action of 0 stands for, shape (9,).
-        half: What an action of 1 adds to it, shape (9,).
+        middle: The command that an action of 0 stands for, shape (n_actions,).
+        half: What an action of 1 adds to it, shape (n_actions,).
         delta: What makes actions relative, if they are.
         vectors: Observations that are vectors of variables, by name; None is the whole.
         is_partial: Whether something else is observed, or told in ``info``.
         shows_goals: Whether goals are part of the observation.
+        goals: What is achieved and desired, if the task has goals.
         terms: Names of the reward terms.
         scale: What rewards are multiplied by.
         limit: Control steps of an episode.
@@ -41,6 +43,7 @@ class Inside:
     vectors: dict[str | None, Vector]
     is_partial: bool
     shows_goals: bool
+    goals: Goals | None
     terms: tuple[str, ...]
     scale: float
     limit: int
@@ -61,6 +64,7 @@ class Inside:
             plain,
             len(plain) < len(parts) or any(env._rich),
             together and seen._goals is not None,
+            env._goals,
             env._terms,
             env._scale,
             env.limit,

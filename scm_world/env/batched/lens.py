@@ -7,13 +7,14 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Integers
+from scm_world.entities import CONTROL_INDEX
 from scm_world.env.batched.inside import Inside, scaling
 from scm_world.env.batched.sheet import FLAGS, FRACTION, GOALS, TERMS, Sheet
-from scm_world.env.environment import ScmWorldEnv
-from scm_world.env.goals import BOUND
+from scm_world.env.environment import REWARD, TERMINATED, ScmWorldEnv
 from scm_world.env.vector import Vector
 from scm_world.geometry.gather import places
 from scm_world.geometry.rows import scale_rows
+from scm_world.tasks.rewards import SUCCESS
 from scm_world.world.columns import Table
 
 OBSERVATION = "observation"
@@ -35,12 +36,17 @@ class Lens:
         inside = Inside.of(env)
         self._vectors = {name: _Gathered(part, table) for name, part in inside.vectors.items()}
         self.is_partial, self._shows_goals = inside.is_partial, inside.shows_goals
-        sides = env.world.task.goal_names()
-        self._goals = tuple(places(table.where[name] for name in side) for side in sides)
-        self._terms = {name: table.where[name].start for name in inside.terms}
-        self._reward = table.where["reward"].start
-        self._success, self._fraction = table.where["success"].start, table.where[FRACTION].start
-        self._clock = table.where["control_index"].start
+        sides = env.world.task.goal_names() if inside.goals is not None else ()
+        self._goals = {
+            name: places(table.where[one] for one in side)
+            for name, side in zip(GOALS, sides, strict=False)
+        }
+        self._bound = 0.0 if inside.goals is None else inside.goals.bound
+        where = {name: place.start for name, place in table.where.items()}
+        self._terms = {name: where[name] for name in inside.terms}
+        self._reward, self._terminated = where[REWARD], where.get(TERMINATED)
+        self._success, self._fraction = where.get(SUCCESS), where.get(FRACTION)
+        self._clock = where[CONTROL_INDEX]
         self._scale, self._limit = inside.scale, inside.limit
 
     def write(self, table: Table, rows: Integers, sheet: Sheet) -> int | None:
@@ -55,7 +61,10 @@ class Lens:
         if wrong.any():
             return int(rows[wrong][0])
         sheet.rewards[rows] = rewards
-        sheet.terminations[rows] = False
+        if self._terminated is None:
+            sheet.terminations[rows] = False
+        else:
+            sheet.terminations[rows] = numbers[rows, self._terminated] != 0.0
         sheet.truncations[rows] = numbers[rows, self._clock] >= self._limit
         if not self.is_partial:
             self._show(numbers, rows, sheet)
@@ -67,15 +76,16 @@ class Lens:
                 numbers, rows, sheet.observations if name is None else sheet.observations[name]
             )
         infos: dict[str, Any] = sheet.infos
-        for name in FLAGS:
-            infos[name][rows] = numbers[rows, self._success] != 0.0
-        infos[FRACTION][rows] = numbers[rows, self._fraction]
+        if self._success is not None:
+            infos[FLAGS[0]][rows] = infos[FLAGS[1]][rows] = numbers[rows, self._success] != 0.0
+        if self._fraction is not None:
+            infos[FRACTION][rows] = numbers[rows, self._fraction]
         for name, column in self._terms.items():
             infos[TERMS][name][rows] = numbers[rows, column]
-        for name, columns in zip(GOALS, self._goals, strict=True):
+        for name, columns in self._goals.items():
             found = infos[name][rows] = numbers[rows[:, None], columns]
             if self._shows_goals:
-                sheet.observations[name][rows] = np.clip(found, -BOUND, BOUND)
+                sheet.observations[name][rows] = np.clip(found, -self._bound, self._bound)
 
 
 @final

@@ -17,9 +17,8 @@ from scm_world.env.batched.crew import located
 from scm_world.env.batched.inside import Inside
 from scm_world.env.batched.lens import Lens
 from scm_world.env.batched.loop import LoopCrew
-from scm_world.env.batched.sheet import FRACTION
 from scm_world.env.copies import EnvSnapshot
-from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.environment import REWARD, ScmWorldEnv
 from scm_world.errors import ScmWorldError
 from scm_world.tasks.rewards import one_number
 from scm_world.variables.subsets import AnyRegion
@@ -55,7 +54,7 @@ class NativeCrew:
         self._envs = self._members.envs
         lead = self._envs[0]
         self._commands = Commands(lead, num_envs)
-        names = (*Inside.of(lead).needed, FRACTION, *self._commands.names)
+        names = (*Inside.of(lead).needed, *self._commands.names)
         self._batch = Batch([env.world for env in self._envs], threads=threads, names=names)
         self._lenses: WeakKeyDictionary[Table, Lens] = WeakKeyDictionary()
         self._sensed: set[int] = set()
@@ -173,7 +172,7 @@ class NativeCrew:
             if not env.world.has_begun:
                 continue
             self._commands.look(index, env)
-            if env.world.current()[0][SENSOR_NOISE]:
+            if env.world.current()[0].get(SENSOR_NOISE):
                 self._sensed.add(index)
             else:
                 self._sensed.discard(index)
@@ -194,6 +193,6 @@ class NativeCrew:
         self._bring([row])
         terms = Inside.of(self._envs[row]).terms
         try:
-            one_number(self._envs[row].world.evaluate(("reward", *terms)), "reward", terms)
+            one_number(self._envs[row].world.evaluate((REWARD, *terms)), REWARD, terms)
         except ScmWorldError as error:
             raise located(error, row) from error.__cause__

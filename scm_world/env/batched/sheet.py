@@ -12,7 +12,7 @@ from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.env.environment import ScmWorldEnv
+from scm_world.env.environment import Counted, ScmWorldEnv
 from scm_world.errors import InterventionError
 
 Allocate = Callable[[tuple[int, ...], Any], NDArray[Any]]
@@ -35,7 +35,8 @@ class Form:
     Attributes:
         observation_space: Of one of them.
         action_space: Of one of them.
-        goals: How many numbers ``achieved_goal`` and ``desired_goal`` have.
+        goals: How many numbers ``achieved_goal`` and ``desired_goal`` have, if there are goals.
+        counted: Which of the variables that count there are.
         terms: Names of the reward terms.
         metadata: As Gymnasium wants it.
         render_mode: Of all of them.
@@ -43,7 +44,8 @@ class Form:
 
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
-    goals: tuple[int, int]
+    goals: tuple[int, int] | None
+    counted: Counted
     terms: tuple[str, ...]
     metadata: Mapping[str, Any] = field(compare=False)
     render_mode: str | None
@@ -55,6 +57,7 @@ class Form:
             env.observation_space,
             env.action_space,
             _goal_sizes(env),
+            env._counted,
             tuple(env.world.task.weights),
             env.metadata,
             env.render_mode,
@@ -84,7 +87,9 @@ class Form:
         )
 
 
-def _goal_sizes(env: ScmWorldEnv) -> tuple[int, int]:
+def _goal_sizes(env: ScmWorldEnv) -> tuple[int, int] | None:
+    if env._goals is None:
+        return None
     achieved, desired = (space.shape or () for space in env._goals.spaces.values())
     return int(np.prod(achieved)), int(np.prod(desired))
 
@@ -125,10 +130,14 @@ class Sheet:
             size: How many there are.
             allocate: Called in the same order whenever the arguments are the same.
         """
-        infos: dict[str, Column] = {name: allocate((size,), np.bool_) for name in FLAGS}
-        infos[FRACTION] = allocate((size,), np.float64)
-        for name, width in zip(GOALS, form.goals, strict=True):
-            infos[name] = allocate((size, width), np.float64)
+        infos: dict[str, Column] = {}
+        if form.counted.success:
+            infos = {name: allocate((size,), np.bool_) for name in FLAGS}
+        if form.counted.fraction:
+            infos[FRACTION] = allocate((size,), np.float64)
+        if form.goals is not None:
+            for name, width in zip(GOALS, form.goals, strict=True):
+                infos[name] = allocate((size, width), np.float64)
         infos[TERMS] = {name: allocate((size,), np.float64) for name in form.terms}
         return cls(
             observations=_rows(form.observation_space, size, allocate),

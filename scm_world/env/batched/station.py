@@ -32,13 +32,13 @@ class Desk:
     Attributes:
         sheet: What they said last.
         which: Those that are stepped or reset, shape (n,).
-        actions: Shape (n, 9).
+        actions: Shape (n, n_actions).
     """
 
     def __init__(self, form: Form, size: int, allocate: Allocate) -> None:
         self.sheet = Sheet.empty(form, size, allocate)
         self.which = allocate((size,), np.bool_)
-        self.actions = allocate((size, 9), np.float64)
+        self.actions = allocate((size, *(form.action_space.shape or ())), np.float64)
 
 
 @final

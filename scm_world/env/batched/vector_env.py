@@ -110,6 +110,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = form.action_space
         self.observation_space = batch_space(form.observation_space, self.num_envs)
         self.action_space = batch_space(form.action_space, self.num_envs)
+        self._action_size = int(np.prod(form.action_space.shape or ()))
         self._all = range(self.num_envs)
         self._nothing = [None] * self.num_envs, [None] * self.num_envs  # seeds and options
         self._everyone = np.ones(self.num_envs, bool)
@@ -143,7 +144,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         """Advance all environments one control step.
 
         Args:
-            actions: Shape (n, 9).
+            actions: Shape (n, n_actions).
 
         Raises:
             ActionError: Another shape, a number that is not finite, or one of them is done and
@@ -151,7 +152,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             NotReset: One of them has no episode yet.
         """
         sheet, stepping = self.crew.sheet, self._stepping(actions)
-        given = actions_of(actions, stepping)
+        given = actions_of(actions, stepping, self._action_size)
         if not stepping.all():
             self._begin_next(~stepping)
         self.crew.step(stepping, given)

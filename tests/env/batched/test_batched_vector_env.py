@@ -211,7 +211,7 @@ def test_what_cannot_be_stepped_is_refused() -> None:
             envs.step(wrong)
     bad = actions(1)[0]
     bad[2, 4] = np.nan
-    with pytest.raises(ActionError, match="environment 2: an action is nine finite numbers"):
+    with pytest.raises(ActionError, match="environment 2: an action is 9 finite numbers"):
         envs.step(bad)
     check_alike(envs, twin, 3)
     ended = np.full((SIZE, 9), np.nan)

@@ -1,0 +1,86 @@
+"""``scm_world/Model-v0``: an environment of any model, from a file or a task of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from inspect import signature
+from typing import Any
+
+from scm_world.env.batched import ScmWorldVectorEnv
+from scm_world.env.environment import ScmWorldEnv
+from scm_world.errors import UnknownOption
+from scm_world.tasks import ModelTask, Task, make_task
+
+MODEL_ID = "scm_world/Model-v0"
+
+OF_TASK = ("name", *(name for name in ModelTask.__annotations__ if name != "model"))
+"""Options of a model; where the environment has one of the same name, the model's is meant."""
+
+OF_ENV = tuple(name for name in signature(ScmWorldEnv).parameters if name != "task")
+
+OF_VECTOR = tuple(
+    name for name in signature(ScmWorldVectorEnv).parameters if name not in ("num_envs", "options")
+)
+
+
+def model_env(model: Any = None, **options: Any) -> ScmWorldEnv:
+    """Make an environment of a model.
+
+    Args:
+        model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel``, a
+            ``Model``, ``"module:function"`` for a function that gives a task, or a task.
+        options: Of ``ModelTask`` (``reward``, ``terminated``, ``spaces``, ``seconds``, …) and of
+            ``ScmWorldEnv``. ``start`` and ``frame_skip`` are those of ``ModelTask``, and
+            ``observe`` is, except with ``observation_mode="custom"``.
+
+    Raises:
+        UnknownOption: An option exists in neither, or the task is made already.
+        ModelError: The model cannot be read, or it has no reward.
+
+    Example:
+        >>> pendulum = '''<mujoco><worldbody><body name="pole"><joint name="hinge" damping="0.1"/>
+        ...   <geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/></body></worldbody>
+        ...   <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>'''
+        >>> env = gymnasium.make(MODEL_ID, model=pendulum, reward=(np.cos, "hinge.position"))
+        >>> env.reset(seed=0)[0]
+        array([0., 0.], dtype=float32)
+        >>> env.step(env.action_space.high)[1] < 1.0
+        True
+    """
+    task, of_env = _split(model, options)
+    return ScmWorldEnv(task, **of_env)
+
+
+def model_vector_env(num_envs: int = 1, model: Any = None, **options: Any) -> ScmWorldVectorEnv:
+    """Make many environments of a model, stepped in one call where the engine can.
+
+    Args:
+        num_envs: How many.
+        model: As in ``model_env``.
+        options: As in ``model_env``, and those of ``ScmWorldVectorEnv``.
+
+    Raises:
+        UnknownOption: As in ``model_env``.
+        ModelError: Likewise.
+    """
+    of_vector = {name: options.pop(name) for name in OF_VECTOR if name in options}
+    task, of_env = _split(model, options)
+    return ScmWorldVectorEnv(num_envs, task=task, **of_vector, **of_env)
+
+
+def _split(model: Any, options: Mapping[str, Any]) -> tuple[Task, dict[str, Any]]:
+    """Make the task, and give the options that are left for the environment."""
+    shared = ("observe",) if options.get("observation_mode") == "custom" else ()
+    of_task = {name: options[name] for name in options if name in OF_TASK and name not in shared}
+    of_env = {name: options[name] for name in options if name not in of_task}
+    for name in of_env:
+        if name not in OF_ENV:
+            raise UnknownOption(f"option of {MODEL_ID}", name, (*OF_TASK, *OF_ENV))
+    if isinstance(model, Task):
+        if of_task:
+            raise UnknownOption(
+                "options of the model", of_task, ("none, with a task that is made",)
+            )
+        return model, of_env
+    is_text = isinstance(model, str) and "<" not in model
+    return (make_task if is_text else ModelTask)(model, **of_task), of_env
