@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from scm_world._types import Floats, Integers
+from scm_world._types import ArrayLike, Floats, Integers
 
 Kind = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "mesh"]
+
+
+_UNIT_CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
 
 
 class Mesh(NamedTuple):
@@ -18,15 +22,22 @@ class Mesh(NamedTuple):
         vertices: Shape (n, 3) [m].
         faces: Three vertices each, counterclockwise seen from outside, shape (m, 3).
         normals: Unit outward normals at the three corners of each triangle, shape (m, 3, 3).
+        low: Least coordinates, shape (3,) [m].
+        high: Greatest coordinates, shape (3,) [m].
     """
 
     vertices: Floats
     faces: Integers
     normals: Floats
+    low: Floats
+    high: Floats
 
 
 class Tiles(NamedTuple):
-    """The checkerboard on a plane.
+    """The checkerboard on a plane; the shape has the color of the first tile.
+
+    The first tile is the one with the least x and the greatest y. Along an axis along which the
+    plane does not end, it is the one whose edge with the least x, or the greatest y, is at 0.
 
     Attributes:
         size: Edges of a tile along the first and the second axis, shape (2,) [m].
@@ -46,7 +57,7 @@ class Shape(NamedTuple):
     Attributes:
         kind: What it is.
         halves: Half the edges of the box around it in its own frame, shape (3,) [m]; of a plane,
-            0 along an axis along which it does not end.
+            0 along an axis along which it does not end; of a mesh, without meaning.
         position: Origin of its frame in the world, shape (3,) [m].
         rotation: From its frame to the world, shape (3, 3).
         color: Red, green, blue and opacity in [0, 1], shape (4,).
@@ -67,25 +78,32 @@ class Shape(NamedTuple):
     tiles: Tiles | None = None
 
 
-def mesh_of(vertices: Floats, faces: Integers) -> Mesh:
-    """Make a mesh with flat sides, whose normals are those of its triangles.
+def mesh_of(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = None) -> Mesh:
+    """Make a mesh.
 
     Args:
         vertices: Shape (n, 3) [m].
         faces: Counterclockwise seen from outside, shape (m, 3).
+        normals: See ``Mesh``; those of the triangles if not given.
 
     Example:
-        >>> mesh_of(np.eye(3), np.array([[0, 1, 2]])).normals[0, 0].round(3).tolist()
+        >>> mesh_of(np.eye(3), [[0, 1, 2]]).normals[0, 0].round(3).tolist()
         [0.577, 0.577, 0.577]
     """
-    first, second, third = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(second - first, third - first)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return Mesh(vertices, faces, np.repeat(normals[:, None], 3, axis=1))
+    vertices = np.array(vertices, dtype=np.float64)
+    faces = np.array(faces, dtype=np.int64)
+    if normals is None:
+        first, second, third = (vertices[faces[:, i]] for i in range(3))
+        flat = np.cross(second - first, third - first)
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+        normals = np.repeat(flat[:, None], 3, axis=1)
+    normals = np.array(normals, dtype=np.float64)
+    return Mesh(vertices, faces, normals, vertices.min(axis=0), vertices.max(axis=0))
 
 
 def corners(shape: Shape) -> Floats:
     """Give the corners in the world of the box around a shape, shape (8, 3) [m]."""
-    signs = np.array(np.meshgrid((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0))).reshape(3, 8).T
-    points: Floats = shape.position + (signs * shape.halves) @ shape.rotation.T
+    mesh = shape.mesh
+    low, high = (-shape.halves, shape.halves) if mesh is None else (mesh.low, mesh.high)
+    points: Floats = shape.position + (low + _UNIT_CUBE * (high - low)) @ shape.rotation.T
     return points

@@ -1,7 +1,17 @@
 """A software renderer: the same picture for every engine, without a screen and without OpenGL."""
 
 from scm_world.backends.renderer.bodies import FLOOR, NOTHING, STAGE, body_names
-from scm_world.backends.renderer.picture import RenderedImage, render, render_views, write_png
+from scm_world.backends.renderer.picture import (
+    RENDERERS,
+    RenderedImage,
+    automatic_camera,
+    following_camera,
+    picture,
+    render,
+    render_views,
+    scene_camera,
+    write_png,
+)
 from scm_world.backends.renderer.pixels import (
     ORIGINAL,
     PLAIN,
@@ -18,16 +28,21 @@ __all__ = [
     "NOTHING",
     "ORIGINAL",
     "PLAIN",
+    "RENDERERS",
     "STAGE",
     "Convention",
     "RenderedImage",
+    "automatic_camera",
     "body_names",
     "depth_and_segmentation",
+    "following_camera",
     "goal_pixels",
     "now_pixels",
+    "picture",
     "pixels",
     "render",
     "render_views",
     "resized",
+    "scene_camera",
     "write_png",
 ]

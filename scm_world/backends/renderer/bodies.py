@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
 from scm_world._types import Floats, Integers
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.hulls import Hull, solid
 from scm_world.geometry.rotations import rotation_kernel
+from scm_world.models.model import Model
 from scm_world.models.scene import Goal, Scene
+from scm_world.models.shapes import Shape
 from scm_world.scene import trifinger
+from scm_world.scene.camera import Camera
 from scm_world.scene.kinematics import FRAMES_PER_FINGER, link_frames
 from scm_world.scene.scene import Structure
+
+if TYPE_CHECKING:
+    from scm_world.backends.mujoco.drawing import Drawing
 
 BOX, ELLIPSOID, CAPSULE, HULL, CYLINDER = range(5)
 GOAL_SHAPES = {"box": BOX, "sphere": ELLIPSOID, "hull": HULL}
@@ -57,7 +64,7 @@ class Bodies(NamedTuple):
     first: Integers
 
 
-def body_names(structure: Structure) -> tuple[str, ...]:
+def body_names(structure: Structure | Model) -> tuple[str, ...]:
     """Name what the numbers of a segmentation stand for.
 
     Example:
@@ -67,8 +74,48 @@ def body_names(structure: Structure) -> tuple[str, ...]:
         >>> body_names(Structure(blocks=("tool_block",), obstacles=("wall",)))[-2:]
         ('tool_block', 'wall')
     """
+    if isinstance(structure, Model):
+        return model_shapes(structure.default_scene())[1]
     links = trifinger.LINK_NAMES
     return ("floor", "stage", "robot", *links, *structure.blocks, *structure.obstacles)
+
+
+def model_shapes(scene: Scene) -> tuple[list[Shape], tuple[str, ...]]:
+    """List the shapes of a scene of a ``Model``, without goals, and name its bodies.
+
+    Raises:
+        ModelError: It has no shapes.
+    """
+    drawing, data = _drawn(scene)
+    return drawing.shapes(data), drawing.names
+
+
+def model_camera(scene: Scene, name: str, size: tuple[int, int]) -> Camera:
+    """Give one of the cameras in the file of a ``Model``, where it stands now.
+
+    Args:
+        scene: Of the model.
+        name: Of the camera.
+        size: Height and width of the picture [pixels].
+
+    Raises:
+        UnknownOption: There is no such camera.
+        ModelError: The structure has no shapes.
+    """
+    drawing, data = _drawn(scene)
+    if name not in drawing.cameras:
+        raise UnknownOption("camera", name, ("automatic", *drawing.cameras))
+    return drawing.camera(data, name, size)
+
+
+def _drawn(scene: Scene) -> tuple[Drawing, Any]:
+    """Put a scene of a ``Model`` into MuJoCo, which is imported only where it is needed."""
+    if not isinstance(scene.structure, Model):
+        kind = type(scene.structure).__name__
+        raise ModelError([f"{kind} says nothing about shapes, so there are no pictures of it"])
+    from scm_world.backends.mujoco.drawing import drawn
+
+    return drawn(scene)
 
 
 def solid_bodies(scene: Scene) -> Bodies:

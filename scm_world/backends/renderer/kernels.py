@@ -97,19 +97,19 @@ def _rectangle(
 
 
 @njit(cache=True, error_model="numpy")
-def _to_body(bodies: Bodies, n: int, rays: Floats, scale: Floats) -> Floats:
-    """Express the rays in the frame of a body, in units of ``scale``, shape (6, 3)."""
+def to_frame(center: Floats, rotation: Floats, rays: Floats, scale: Floats) -> Floats:
+    """Express rays in a frame of the world, in units of ``scale``, shape (6, 3)."""
     local = np.zeros((6, 3))
     for i in range(3):
         for j in range(3):
             for row in range(6):
-                x = rays[row, i] - (bodies.centers[n, i] if row == 0 else 0.0)
-                local[row, j] += bodies.rotations[n, i, j] * x / scale[j]
+                x = rays[row, i] - (center[i] if row == 0 else 0.0)
+                local[row, j] += rotation[i, j] * x / scale[j]
     return local
 
 
 @njit(cache=True, error_model="numpy")
-def _ray(rays: Floats, row: int, u: float, v: float) -> Triple:
+def ray(rays: Floats, row: int, u: float, v: float) -> Triple:
     """Give the origin (row 0) or the direction (row 3) of the ray of a pixel."""
     return (
         rays[row, 0] + u * rays[row + 1, 0] + v * rays[row + 2, 0],
@@ -138,7 +138,7 @@ def _round_span(rays: Floats, v: int, third: float, left: int, right: int) -> tu
         left: First column of the rectangle.
         right: Last column of the rectangle plus one.
     """
-    o, d = _ray(rays, 0, 0.0, v), _ray(rays, 3, 0.0, v)
+    o, d = ray(rays, 0, 0.0, v), ray(rays, 3, 0.0, v)
     step_o, step_d = (rays[1, 0], rays[1, 1], rays[1, 2]), (rays[4, 0], rays[4, 1], rays[4, 2])
     a0, a1, a2 = _dot(d, d, third), 2.0 * _dot(d, step_d, third), _dot(step_d, step_d, third)
     b0, b1 = _dot(o, d, third), _dot(o, step_d, third) + _dot(step_o, d, third)
@@ -229,7 +229,7 @@ def _scale(bodies: Bodies, n: int) -> tuple[Floats, float]:
 
 
 @njit(cache=True, error_model="numpy")
-def _turned(rotation: Floats, vector: Floats) -> Triple:
+def turned(rotation: Floats, vector: Floats) -> Triple:
     """Express a direction of the world in the frame of a body."""
     x = rotation[0, 0] * vector[0] + rotation[1, 0] * vector[1] + rotation[2, 0] * vector[2]
     y = rotation[0, 1] * vector[0] + rotation[1, 1] * vector[1] + rotation[2, 1] * vector[2]
@@ -254,7 +254,7 @@ def _cosine(shape: int, n: Triple, scale: Floats, lamp: Triple) -> float:
 @njit(cache=True, error_model="numpy")
 def _along_row(rays: Floats, v: int) -> tuple[Triple, Triple, Triple, Triple]:
     """Give origin and direction of the first ray of a row, and how they grow per column."""
-    o, d = _ray(rays, 0, 0.0, v), _ray(rays, 3, 0.0, v)
+    o, d = ray(rays, 0, 0.0, v), ray(rays, 3, 0.0, v)
     return o, d, (rays[1, 0], rays[1, 1], rays[1, 2]), (rays[4, 0], rays[4, 1], rays[4, 2])
 
 
@@ -322,8 +322,8 @@ def _draw_body(
     color = (255.0 * tint[0], 255.0 * tint[1], 255.0 * tint[2])
     solid, behind = alpha == 1.0, 0.0 if alpha == 1.0 else TIE
     colored, owned = rgb.shape[1] > 0, solid and owners.shape[0] > 0
-    lamp = _turned(bodies.rotations[n], light)
-    rays = _to_body(bodies, n, view.rays, scale)
+    lamp = turned(bodies.rotations[n], light)
+    rays = to_frame(bodies.centers[n], bodies.rotations[n], view.rays, scale)
     hits = np.empty((depth.shape[1], 4))
     for v in range(top, bottom):
         start, stop = _span(shape, rays, v, left, right)
@@ -337,7 +337,7 @@ def _draw_body(
                 cosine = _cosine(shape, normal, scale, lamp)
                 paint = alpha
                 if not solid:
-                    point = _at(_ray(rays, 0, u, v), _ray(rays, 3, u, v), t)
+                    point = _at(ray(rays, 0, u, v), ray(rays, 3, u, v), t)
                     paint = min(paint * _opacity(shape, facets, point, normal), 1.0)
                 blend(rgb, v, u, color, brightness(cosine, light[3]), paint)
             if solid:

@@ -12,11 +12,16 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.renderer.kernels import (
     SHADOW,
     Canvas,
+    Depths,
     View,
     blend,
     brightness,
+    ray,
     shade_at,
+    to_frame,
+    turned,
 )
+from scm_world.backends.renderer.rays import Triple
 
 
 class Triangles(NamedTuple):
@@ -84,12 +89,57 @@ def _projected(mesh: Triangles, view: View) -> Floats:
 
 
 @njit(cache=True, error_model="numpy")
-def _between(a: float, b: float, c: float, size: int) -> tuple[int, int]:
-    """Give the first whole number from the least of three on, and the last plus one, in range."""
-    first, last = max(min(a, b, c), 0.0), min(max(a, b, c), size - 1.0)
-    if first > last:
-        return 0, 0
-    return math.ceil(first), int(last) + 1
+def _include(box: Floats, u: float, v: float) -> None:
+    """Let a box (least and greatest column, least and greatest row) hold a pixel."""
+    box[0], box[1] = min(box[0], u), max(box[1], u)
+    box[2], box[3] = min(box[2], v), max(box[3], v)
+
+
+@njit(cache=True, error_model="numpy")
+def _rectangle(corners: Floats, near: float, box: Floats) -> None:
+    """Bound the pixels that a triangle can cover, of what is beyond ``near``.
+
+    Args:
+        corners: Homogeneous pixels, shape (3, 3).
+        near: Smallest depth that is seen.
+        box: Written, shape (4,): least and greatest column, least and greatest row.
+    """
+    box[0] = box[2] = math.inf
+    box[1] = box[3] = -math.inf
+    for i in range(3):
+        u, v, w = corners[i]
+        if w > near:
+            _include(box, u / w, v / w)
+        p, q, r = corners[(i + 1) % 3]
+        if (w > near) != (r > near):
+            share, w = (near - w) / (r - w), max(near, 1e-300)
+            _include(box, (u + share * (p - u)) / w, (v + share * (q - v)) / w)
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest(t: np.float32, alpha: float, depth: Depths, v: int, u: int) -> bool:
+    """Tell whether something at a depth is to be seen, and note that; see ``draw_mesh``."""
+    if alpha == 1.0:
+        if not t < depth[v, u]:
+            return False
+        depth[v, u] = t
+        return True
+    if t != depth[v, u]:
+        return False
+    depth[v, u] = -math.inf
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _edges(corners: Floats, edges: Floats) -> float:
+    """Write b × c, c × a and a × b of the corners a, b and c, shape (3, 3); give a · (b × c)."""
+    for i in range(3):
+        a0, a1, a2 = corners[(i + 1) % 3]
+        b0, b1, b2 = corners[(i + 2) % 3]
+        edges[i] = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    x, y, z = corners[0]
+    volume: float = x * edges[0, 0] + y * edges[0, 1] + z * edges[0, 2]
+    return volume
 
 
 @njit(cache=True, error_model="numpy")
@@ -113,68 +163,78 @@ def draw_mesh(mesh: Triangles, view: View, light: Floats, alpha: float, canvas: 
         Olano and Greer, *Triangle scan conversion using 2D homogeneous coordinates*, 1997.
     """
     depth, owners, rgb = canvas
-    height, width = depth.shape
     colored, owned = rgb.shape[1] > 0, alpha == 1.0 and owners.shape[0] > 0
     color = (255.0 * mesh.color[0], 255.0 * mesh.color[1], 255.0 * mesh.color[2])
-    rotation = mesh.rotation
-    lx = rotation[0, 0] * light[0] + rotation[1, 0] * light[1] + rotation[2, 0] * light[2]
-    ly = rotation[0, 1] * light[0] + rotation[1, 1] * light[1] + rotation[2, 1] * light[2]
-    lz = rotation[0, 2] * light[0] + rotation[1, 2] * light[1] + rotation[2, 2] * light[2]
+    lamp = turned(mesh.rotation, light)
     pixels, near = _projected(mesh, view), view.near
+    corners, edges, box = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
     for f in range(len(mesh.faces)):
-        a0, a1, a2 = pixels[mesh.faces[f, 0]]
-        b0, b1, b2 = pixels[mesh.faces[f, 1]]
-        c0, c1, c2 = pixels[mesh.faces[f, 2]]
-        if a2 > near and b2 > near and c2 > near:
-            left, right = _between(a0 / a2, b0 / b2, c0 / c2, width)
-            top, bottom = _between(a1 / a2, b1 / b2, c1 / c2, height)
-            if left >= right or top >= bottom:
-                continue
-        elif a2 > near or b2 > near or c2 > near:
-            left, right, top, bottom = 0, width, 0, height
-        else:
+        for i in range(3):
+            corners[i] = pixels[mesh.faces[f, i]]
+        _rectangle(corners, near, box)
+        left, right = math.ceil(max(box[0], 0.0)), int(min(box[1], depth.shape[1] - 1.0)) + 1
+        top, bottom = math.ceil(max(box[2], 0.0)), int(min(box[3], depth.shape[0] - 1.0)) + 1
+        if left >= right or top >= bottom:
             continue
-        u0, u1, u2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
-        v0, v1, v2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
-        w0, w1, w2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-        volume = a0 * u0 + a1 * u1 + a2 * u2
-        if volume == 0.0:
-            continue
+        volume = _edges(corners, edges)
         side = 1.0 if volume > 0.0 else -1.0
         for v in range(top, bottom):
             for u in range(left, right):
-                first = side * (u * u0 + v * u1 + u2)
-                second = side * (u * v0 + v * v1 + v2)
-                third = side * (u * w0 + v * w1 + w2)
-                if first < 0.0 or second < 0.0 or third < 0.0:
+                a = side * (u * edges[0, 0] + v * edges[0, 1] + edges[0, 2])
+                b = side * (u * edges[1, 0] + v * edges[1, 1] + edges[1, 2])
+                c = side * (u * edges[2, 0] + v * edges[2, 1] + edges[2, 2])
+                if not min(a, b, c) >= 0.0:
                     continue
-                t = np.float32(side * volume / (first + second + third))
-                if not t >= near:
+                t = np.float32(side * volume / (a + b + c))
+                if not (t >= near and _nearest(t, alpha, depth, v, u)):
                     continue
-                if alpha < 1.0:
-                    if t != depth[v, u]:
-                        continue
-                    depth[v, u] = -math.inf
-                else:
-                    if not t < depth[v, u]:
-                        continue
-                    depth[v, u] = t
                 if colored:
-                    n = mesh.normals[f]
-                    x = first * n[0, 0] + second * n[1, 0] + third * n[2, 0]
-                    y = first * n[0, 1] + second * n[1, 1] + third * n[2, 1]
-                    z = first * n[0, 2] + second * n[1, 2] + third * n[2, 2]
-                    length = math.sqrt(x * x + y * y + z * z)
-                    cosine = -side * (x * lx + y * ly + z * lz) / max(length, 1e-300)
+                    cosine = -side * _cosine(mesh.normals[f], (a, b, c), lamp)
                     blend(rgb, v, u, color, brightness(cosine, light[3]), alpha)
                 if owned:
                     owners[v, u] = mesh.owner
 
 
 @njit(cache=True, error_model="numpy")
-def draw_ground(
-    ground: Ground, view: View, light: Floats, alpha: float, canvas: Canvas
-) -> None:
+def _cosine(normals: Floats, weights: Triple, lamp: Triple) -> float:
+    """Give the cosine between the light and the weighted mean of the normals at three corners."""
+    a, b, c = weights
+    x = a * normals[0, 0] + b * normals[1, 0] + c * normals[2, 0]
+    y = a * normals[0, 1] + b * normals[1, 1] + c * normals[2, 1]
+    z = a * normals[0, 2] + b * normals[1, 2] + c * normals[2, 2]
+    length = max(math.sqrt(x * x + y * y + z * z), 1e-300)
+    cosine: float = (x * lamp[0] + y * lamp[1] + z * lamp[2]) / length
+    return cosine
+
+
+@njit(cache=True, error_model="numpy")
+def _tint(ground: Ground, x: float, y: float, spread: float) -> Triple:
+    """Give the color, 255 where it is full, of a point of a plane that a pixel spreads over."""
+    left = -ground.halves[0] if ground.halves[0] < math.inf else 0.0
+    back = ground.halves[1] if ground.halves[1] < math.inf else 0.0
+    tiles, one, two = ground.tiles, ground.colors[0], ground.colors[1]
+    odd = (math.floor((x - left) / tiles[0]) + math.floor((back - y) / tiles[1])) % 2.0
+    clear = max(1.0 - spread / min(tiles[0], tiles[1]), 0.0)
+    share = 0.5 + clear * (odd - 0.5)
+    return (
+        255.0 * (one[0] + share * (two[0] - one[0])),
+        255.0 * (one[1] + share * (two[1] - one[1])),
+        255.0 * (one[2] + share * (two[2] - one[2])),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _shadow_at(ground: Ground, x: float, y: float) -> float:
+    """Read the shadow map of a plane; there are no shadows beside its square."""
+    x, y, half = x - ground.square[0], y - ground.square[1], ground.square[2]
+    if abs(x) < half and abs(y) < half:
+        shade: float = shade_at(ground.shadow, half, x, y)
+        return shade
+    return 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def draw_ground(ground: Ground, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
     """Draw a plane over what is there, where it is nearer.
 
     Tiles fade into one color where they are smaller than a pixel.
@@ -189,46 +249,24 @@ def draw_ground(
     depth, owners, rgb = canvas
     colored, solid = rgb.shape[1] > 0, alpha == 1.0
     owned = solid and owners.shape[0] > 0
-    local, turn = np.zeros((6, 3)), ground.rotation
-    for row in range(6):
-        for i in range(3):
-            x = view.rays[row, i] - (ground.position[i] if row == 0 else 0.0)
-            for j in range(3):
-                local[row, j] += turn[i, j] * x
-    top = brightness(turn[0, 2] * light[0] + turn[1, 2] * light[1] + turn[2, 2] * light[2], light[3])
+    rays = to_frame(ground.position, ground.rotation, view.rays, np.ones(3))
+    top = brightness(turned(ground.rotation, light)[2], light[3])
     dark = SHADOW * (1.0 - light[3])
-    ox, oy, oz = local[0]
-    pixel = math.sqrt(local[4, 0] ** 2 + local[4, 1] ** 2 + local[4, 2] ** 2)
-    halves, tiles, square = ground.halves, ground.tiles, ground.square
+    pixel = math.sqrt(rays[4, 0] ** 2 + rays[4, 1] ** 2 + rays[4, 2] ** 2)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
-            dz = local[3, 2] + u * local[4, 2] + v * local[5, 2]
-            if not oz > 0.0 > dz:
+            dx, dy, dz = ray(rays, 3, u, v)
+            if not rays[0, 2] > 0.0 > dz:
                 continue
-            t = -oz / dz
-            if not view.near <= t < depth[v, u]:
-                continue
-            dx = local[3, 0] + u * local[4, 0] + v * local[5, 0]
-            dy = local[3, 1] + u * local[4, 1] + v * local[5, 1]
-            x, y = ox + t * dx, oy + t * dy
-            if abs(x) > halves[0] or abs(y) > halves[1]:
+            t = -rays[0, 2] / dz
+            x, y = rays[0, 0] + t * dx, rays[0, 1] + t * dy
+            inside = abs(x) <= ground.halves[0] and abs(y) <= ground.halves[1]
+            if not (inside and view.near <= t < depth[v, u]):
                 continue
             if colored:
                 spread = t * pixel * math.sqrt(dx * dx + dy * dy + dz * dz) / -dz
-                odd = (math.floor(x / tiles[0]) + math.floor(y / tiles[1])) % 2.0
-                clear = max(1.0 - spread / min(tiles[0], tiles[1]), 0.0)
-                other = 0.5 + clear * (odd - 0.5)
-                a, b = ground.colors[0], ground.colors[1]
-                color = (
-                    255.0 * (a[0] + other * (b[0] - a[0])),
-                    255.0 * (a[1] + other * (b[1] - a[1])),
-                    255.0 * (a[2] + other * (b[2] - a[2])),
-                )
-                shade = top
-                x, y = x - square[0], y - square[1]
-                if abs(x) < square[2] and abs(y) < square[2]:
-                    shade *= 1.0 - dark * shade_at(ground.shadow, square[2], x, y)
-                blend(rgb, v, u, color, shade, alpha)
+                shade = top * (1.0 - dark * _shadow_at(ground, x, y))
+                blend(rgb, v, u, _tint(ground, x, y, spread), shade, alpha)
             if solid:
                 depth[v, u] = t
             if owned:

@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
 from scm_world.backends.renderer.arena import (
+    BACKGROUND,
     lamp,
     paint_arena,
     palette,
     shadow_map,
     trace_arena,
 )
-from scm_world.backends.renderer.bodies import Bodies, body_names, goal_bodies, solid_bodies
+from scm_world.backends.renderer.bodies import (
+    Bodies,
+    body_names,
+    goal_bodies,
+    model_camera,
+    model_shapes,
+    solid_bodies,
+)
 from scm_world.backends.renderer.kernels import Canvas, draw
+from scm_world.backends.renderer.shapes import (
+    AUTOMATIC,
+    GOAL_OPACITY,
+    draw_shapes,
+    following,
+    framing,
+    goal_shapes,
+)
 from scm_world.backends.renderer.views import camera_view
-from scm_world.errors import UnknownOption
+from scm_world.errors import EngineError, UnknownOption
 from scm_world.models.scene import Scene
-from scm_world.scene.camera import Camera
+from scm_world.scene.camera import CAMERAS, OVERVIEW, Camera
+from scm_world.scene.scene import Structure
 
-GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
+RENDERERS = ("software", "mujoco")
 
 
 @final
@@ -39,8 +55,8 @@ class RenderedImage:
         segmentation: Which body a pixel shows, shape (h, w): an index into ``names``, or -1 where
             there is nothing. Goals are no bodies: they color pixels, but have neither depth nor
             number.
-        names: ``"floor"``, ``"stage"``, ``"robot"`` (its hub), the links, the blocks and the
-            obstacles.
+        names: Of the bodies; of the TriFinger ``"floor"``, ``"stage"``, ``"robot"`` (its hub), the
+            links, the blocks and the obstacles.
     """
 
     rgb: NDArray[np.uint8]
@@ -61,11 +77,11 @@ class RenderedImage:
 
 
 def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
-    """Take a picture of a scene.
+    """Take a picture of a scene with the software renderer; ``picture`` can do with less.
 
     The wall of the ring is seen from within only, so that a camera outside looks through it. A
     camera inside a body sees its inside. Light comes from one direction, that of the scene;
-    shadows fall on the floor only.
+    shadows fall on floors only.
 
     Args:
         scene: What to show: everything is taken from its parameters, state, goals
@@ -76,6 +92,7 @@ def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
 
     Raises:
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
+        ModelError: The structure says nothing about shapes.
 
     Example:
         >>> from scm_world.scene import Structure, default_scene
@@ -93,17 +110,137 @@ def render_views(
     """Take pictures of a scene with several cameras; see ``render``."""
     if samples < 1:
         raise ValueError(f"samples: expected a positive number, got {samples}")
-    bodies = solid_bodies(scene)
-    shadow = shadow_map(bodies, scene.light)
+    draw_once, names = _painter(scene)
     pictures = []
     for camera in cameras:
-        picture = _render(scene, bodies, shadow, camera, 1)
-        if samples > 1:
-            fine = _render(scene, bodies, shadow, camera, samples).rgb
-            rgb = _average(fine, samples)
-            picture = RenderedImage(rgb, picture.depth, picture.segmentation, picture.names)
-        pictures.append(picture)
+        canvas = draw_once(camera, 1)
+        rgb = canvas.rgb if samples == 1 else draw_once(camera, samples).rgb
+        shown = _average(np.ascontiguousarray(rgb.transpose(1, 2, 0)), samples)
+        pictures.append(RenderedImage(shown, canvas.depth, canvas.owners, names))
     return tuple(pictures)
+
+
+def picture(
+    scene: Scene,
+    camera: Camera | str | None = None,
+    size: tuple[int, int] | None = None,
+    renderer: str | None = None,
+    *,
+    samples: int = 1,
+) -> NDArray[np.uint8]:
+    """Take a picture for people, of any scene that has shapes. No screen is needed.
+
+    Args:
+        scene: What to show.
+        camera: Where from: see ``scene_camera``.
+        size: Height and width [pixels]; if not given, those of the camera.
+        renderer: ``"mujoco"`` for MuJoCo's own, which needs EGL or OSMesa and draws models only;
+            ``"software"`` for ours, whose pictures are the same on all machines. If not given,
+            models are drawn by MuJoCo's where that works, and all else by ours.
+        samples: How many samples per pixel and axis colors are averaged over. MuJoCo's renderer
+            takes two at least.
+
+    Returns:
+        Red, green and blue, shape (h, w, 3).
+
+    Raises:
+        UnknownOption: There is no such camera, or no such renderer for this scene.
+        EngineError: MuJoCo's renderer was asked for, and cannot draw here.
+        ModelError: The structure says nothing about shapes.
+        ValueError: ``samples`` is not positive, or the camera has no optical axis.
+
+    Example:
+        >>> from scm_world.scene import Structure, default_scene
+        >>> picture(default_scene(Structure()), size=(60, 80)).shape
+        (60, 80, 3)
+    """
+    if samples < 1:
+        raise ValueError(f"samples: expected a positive number, got {samples}")
+    modeled = not isinstance(scene.structure, Structure)
+    known = RENDERERS if modeled else RENDERERS[:1]
+    if renderer not in (None, *known):
+        raise UnknownOption("renderer", renderer, known)
+    camera = scene_camera(scene, camera, size)
+    library = None
+    if modeled and renderer != "software":
+        from scm_world.backends.mujoco.opengl import draw_scene as draw_by_mujoco
+        from scm_world.backends.mujoco.opengl import opengl
+
+        library = opengl()
+    if library is None:
+        if renderer == "mujoco":
+            raise EngineError(
+                "MuJoCo cannot draw here: neither EGL nor OSMesa works (or MUJOCO_GL forbids it); "
+                "install libegl1 or libosmesa6, or use renderer='software'",
+                "mujoco",
+            )
+        return render(scene, camera, samples=samples).rgb
+    samples = max(samples, 2)
+    fine = replace(camera, height=camera.height * samples, width=camera.width * samples)
+    return _average(draw_by_mujoco(scene, fine, BACKGROUND, library), samples)
+
+
+def scene_camera(
+    scene: Scene, camera: Camera | str | None = None, size: tuple[int, int] | None = None
+) -> Camera:
+    """Find a camera for a picture of a scene.
+
+    Args:
+        scene: What is to be seen.
+        camera: Any camera, or the name of one: of the TriFinger ``"overview"``, ``"60"``,
+            ``"120"`` or ``"300"``; of a model one that its file names, where it stands now, or
+            ``"automatic"``: see ``automatic_camera``. If not given, ``"overview"`` or
+            ``"automatic"``.
+        size: Height and width of the picture [pixels]; if not given, those of the camera that was
+            given, or 480 and 640.
+
+    Raises:
+        UnknownOption: There is no such camera.
+        ModelError: The structure says nothing about shapes.
+    """
+    height, width = size or (OVERVIEW.height, OVERVIEW.width)
+    if isinstance(camera, Camera):
+        return camera if size is None else replace(camera, height=height, width=width)
+    if isinstance(scene.structure, Structure):
+        known = {one.name: one for one in (OVERVIEW, *CAMERAS)}
+        if camera not in (None, *known):
+            raise UnknownOption("camera", camera, known)
+        return replace(known[camera or OVERVIEW.name], height=height, width=width)
+    if camera in (None, AUTOMATIC):
+        return automatic_camera(scene, size=(height, width))
+    return model_camera(scene, str(camera), (height, width))
+
+
+def automatic_camera(*scenes: Scene, size: tuple[int, int] = (480, 640)) -> Camera:
+    """Place a camera so that it sees, in all of some scenes, everything that moves.
+
+    It looks from the front, from the right and from above. Planes do not count; where nothing
+    moves, it sees all there is.
+
+    Args:
+        scenes: Of models: one or more.
+        size: Height and width of the picture [pixels].
+
+    Raises:
+        ModelError: The structure says nothing about shapes.
+    """
+    return framing([shape for scene in scenes for shape in model_shapes(scene)[0]], size)
+
+
+def following_camera(camera: Camera, scene: Scene) -> Camera:
+    """Move a camera along with what moves in the scene of a model, for the next picture of a film.
+
+    It keeps its direction and its height, and stays where it is as long as the middle of what
+    moves is near the middle of the picture.
+
+    Args:
+        camera: That of the last picture.
+        scene: What the next one shows.
+
+    Raises:
+        ModelError: The structure says nothing about shapes.
+    """
+    return following(camera, model_shapes(scene)[0])
 
 
 def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:
@@ -113,15 +250,23 @@ def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:
     imsave(path, rgb, format="png")
 
 
-def _render(
-    scene: Scene, bodies: Bodies, shadow: Floats, camera: Camera, samples: int
-) -> RenderedImage:
-    view, canvas = camera_view(camera, samples), trace_arena(camera, samples)
-    rgb = paint_arena(canvas, view, scene.light, palette(scene), shadow)
-    canvas = canvas._replace(rgb=rgb)
-    draw_scene(scene, bodies, camera, samples, canvas)
-    shown = np.ascontiguousarray(rgb.transpose(1, 2, 0))
-    return RenderedImage(shown, canvas.depth, canvas.owners, body_names(scene.structure))
+def _painter(scene: Scene) -> tuple[Callable[[Camera, int], Canvas], tuple[str, ...]]:
+    """Give what draws a scene for a camera and a number of samples, and the names of bodies."""
+    if not isinstance(scene.structure, Structure):
+        shapes, names = model_shapes(scene)
+        shapes += goal_shapes(scene.goals)
+        return lambda camera, n: draw_shapes(shapes, camera, scene.light, samples=n), names
+    bodies = solid_bodies(scene)
+    shadow = shadow_map(bodies, scene.light)
+
+    def draw_once(camera: Camera, samples: int) -> Canvas:
+        view, canvas = camera_view(camera, samples), trace_arena(camera, samples)
+        rgb = paint_arena(canvas, view, scene.light, palette(scene), shadow)
+        canvas = canvas._replace(rgb=rgb)
+        draw_scene(scene, bodies, camera, samples, canvas)
+        return canvas
+
+    return draw_once, body_names(scene.structure)
 
 
 def draw_scene(scene: Scene, bodies: Bodies, camera: Camera, samples: int, canvas: Canvas) -> None:
@@ -134,6 +279,8 @@ def draw_scene(scene: Scene, bodies: Bodies, camera: Camera, samples: int, canva
 
 def _average(fine: NDArray[np.uint8], samples: int) -> NDArray[np.uint8]:
     """Average the samples of every pixel."""
+    if samples == 1:
+        return fine
     height, width = fine.shape[0] // samples, fine.shape[1] // samples
     blocks = fine.reshape(height, samples, width, samples, 3).astype(np.float64)
     average: NDArray[np.uint8] = np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)

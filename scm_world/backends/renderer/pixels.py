@@ -17,12 +17,15 @@ from scm_world.backends.renderer.arena import (
     lit_arena,
     palette,
 )
-from scm_world.backends.renderer.bodies import Bodies, solid_bodies
+from scm_world.backends.renderer.bodies import Bodies, model_shapes, solid_bodies
 from scm_world.backends.renderer.kernels import Canvas, Colors, draw
 from scm_world.backends.renderer.picture import draw_scene
+from scm_world.backends.renderer.shapes import draw_shapes, goal_shapes
 from scm_world.backends.renderer.views import camera_view
 from scm_world.models.scene import Scene
+from scm_world.models.shapes import Shape
 from scm_world.scene.camera import Camera
+from scm_world.scene.scene import Structure
 from scm_world.scene.state import PhysicalState
 from scm_world.scene.trifinger import JOINT_LOW
 
@@ -83,7 +86,8 @@ def now_pixels(
         >>> out[0, :, 127, 64].tolist()  # the floor
         [74, 65, 60]
     """
-    _draw_all(scene.with_(goals=()), cameras, out, convention)
+    scene = scene.with_(goals=())
+    _draw_all(scene, _content(scene), cameras, out, convention)
 
 
 def goal_pixels(
@@ -93,7 +97,7 @@ def goal_pixels(
 
     The robot is parked at the lower limits of its joints. So the pictures depend on goals,
     colors, light, obstacles and the height of the robot only: they can be kept as long as those
-    stay.
+    stay. Of a model they show nothing that moves.
 
     Args:
         scene: Whose goals to show; the state does not matter.
@@ -107,7 +111,12 @@ def goal_pixels(
     Source:
         CausalWorld 1.2, ``envs/causalworld.py``: its goal world.
     """
-    _draw_all(_parked(scene, obstacles=convention.goal_obstacles), cameras, out, convention)
+    if isinstance(scene.structure, Structure):
+        scene = _parked(scene, obstacles=convention.goal_obstacles)
+    content = _content(scene)
+    if not isinstance(content, Bodies):
+        content = [shape for shape in content if not shape.moves]
+    _draw_all(scene, content, cameras, out, convention)
 
 
 def pixels(
@@ -170,13 +179,17 @@ def depth_and_segmentation(
     """
     if len({(camera.height, camera.width) for camera in cameras}) != 1:
         raise ValueError("cameras: there must be at least one, and all with pictures of one size")
-    bodies, light = solid_bodies(scene), lamp(scene.light)
+    content, light = _content(scene.with_(goals=())), lamp(scene.light)
     shape = len(cameras), cameras[0].height, cameras[0].width
     depths, owners = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int32)
     for i, camera in enumerate(cameras):
+        if not isinstance(content, Bodies):
+            drawn = draw_shapes(content, camera, scene.light, shadows=False, colors=False)
+            depths[i], owners[i] = drawn.depth, drawn.owners
+            continue
         empty = empty_arena(camera)
         depths[i], owners[i] = empty.depth, empty.owners
-        draw(bodies, camera_view(camera, 1), light, 1.0, Canvas(depths[i], owners[i], NO_COLORS))
+        draw(content, camera_view(camera, 1), light, 1.0, Canvas(depths[i], owners[i], NO_COLORS))
     return _rows(depths, convention), _rows(owners, convention)
 
 
@@ -198,25 +211,40 @@ def _parked(scene: Scene, *, obstacles: bool) -> Scene:
     return scene.with_(structure=structure, state=state)
 
 
-def _draw_all(scene: Scene, cameras: Sequence[Camera], out: Colors, convention: Convention) -> None:
+def _content(scene: Scene) -> Bodies | list[Shape]:
+    """List what a scene shows: the TriFinger's bodies, or the shapes and goals of a model."""
+    if isinstance(scene.structure, Structure):
+        return solid_bodies(scene)
+    return model_shapes(scene)[0] + goal_shapes(scene.goals)
+
+
+def _draw_all(
+    scene: Scene,
+    content: Bodies | list[Shape],
+    cameras: Sequence[Camera],
+    out: Colors,
+    convention: Convention,
+) -> None:
     """Draw a scene with all cameras in the layout that is asked for."""
     if out.dtype != np.uint8:
         raise ValueError(f"out: expected dtype uint8, got {out.dtype}")
     for shape in {convention.shape(camera) for camera in cameras} or {(0, 0, 0)}:
         if out.shape != (len(cameras), *shape):
             raise ValueError(f"out: expected shape {(len(cameras), *shape)}, got {out.shape}")
-    bodies = solid_bodies(scene)
     direct = out.flags.c_contiguous and not (convention.flipped or convention.channels_last)
     for picture, camera in zip(out, cameras, strict=True):
         rgb = picture if direct else np.empty((3, camera.height, camera.width), dtype=np.uint8)
-        _draw_one(scene, bodies, camera, rgb)
+        _draw_one(scene, content, camera, rgb)
         if not direct:
             rows = rgb[:, ::-1] if convention.flipped else rgb
             picture[:] = rows.transpose(1, 2, 0) if convention.channels_last else rows
 
 
-def _draw_one(scene: Scene, bodies: Bodies, camera: Camera, rgb: Colors) -> None:
+def _draw_one(scene: Scene, content: Bodies | list[Shape], camera: Camera, rgb: Colors) -> None:
     """Draw a scene into a picture of shape (3, h, w)."""
+    if not isinstance(content, Bodies):
+        rgb[:] = draw_shapes(content, camera, scene.light, shadows=False).rgb
+        return
     rgb[:] = lit_arena(camera, scene.light, palette(scene))
     depth = empty_arena(camera).depth.copy()
-    draw_scene(scene, bodies, camera, 1, Canvas(depth, NO_OWNERS, rgb))
+    draw_scene(scene, content, camera, 1, Canvas(depth, NO_OWNERS, rgb))

@@ -1,0 +1,174 @@
+"""MuJoCo's own renderer, without a screen."""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import math
+import os
+import subprocess
+import sys
+import threading
+from functools import lru_cache
+from typing import final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.backends.mujoco.drawing import Drawing, draw_goals, drawn
+from scm_world.models.scene import Light, Scene
+from scm_world.scene.camera import Camera
+
+LIBRARIES = ("egl", "osmesa")
+"""What OpenGL can draw with where there is no screen."""
+
+FORBIDDEN = ("disable", "disabled", "off", "false", "0")
+"""Values of ``MUJOCO_GL`` with which MuJoCo does not draw."""
+
+_TRIAL = """
+import importlib, sys, mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+context = importlib.import_module("mujoco." + sys.argv[1]).GLContext(8, 8)
+context.make_current()
+mujoco.MjrContext(model, 100).free()
+context.free()
+"""
+
+
+@lru_cache(maxsize=1)
+def opengl() -> str | None:
+    """Name the library with which MuJoCo can draw here without a screen; None if none can.
+
+    They are tried once, in another process, since a driver that fails can end its process. The
+    environment variable ``MUJOCO_GL`` can name one of them, or forbid all with ``disabled``.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if wanted in FORBIDDEN:
+        return None
+    return next(filter(_works, [wanted] if wanted in LIBRARIES else LIBRARIES), None)
+
+
+def _works(library: str) -> bool:
+    """Make a context of a library in another process, and free it."""
+    try:
+        trial = subprocess.run(  # noqa: S603 # our own interpreter, our own code
+            [sys.executable, "-c", _TRIAL, library],
+            env={**os.environ, "MUJOCO_GL": library, "PYOPENGL_PLATFORM": library},
+            capture_output=True,
+            timeout=60.0,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return trial.returncode == 0
+
+
+def draw_scene(
+    scene: Scene, camera: Camera, sky: tuple[float, float, float], library: str
+) -> NDArray[np.uint8]:
+    """Let MuJoCo draw the scene of a ``Model``, shape (h, w, 3).
+
+    Args:
+        scene: What to show. Its light shines if the model has none; the headlight always does.
+        camera: Where from.
+        sky: Shown where there is nothing, unless the model has a sky; red, green, blue in [0, 1].
+        library: One of ``LIBRARIES`` that works here; see ``opengl``.
+    """
+    drawing, data = drawn(scene)
+    abstract = drawing.scene(data)
+    draw_goals(abstract, scene.goals)
+    _aim(abstract, camera)
+    if drawing.model.nlight == 0:
+        _light(abstract, scene.light, camera, float(drawing.model.stat.extent))
+    rgb, there = _canvas(drawing, (camera.height, camera.width), library).picture(abstract)
+    if not (drawing.model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any():
+        rgb[~there] = np.rint(255.0 * np.array(sky)).astype(np.uint8)
+    return rgb
+
+
+def _aim(abstract: mujoco.MjvScene, camera: Camera) -> None:
+    """Look with a camera; the headlight goes with it."""
+    _, up, back = camera.axes()
+    top = camera.near * math.tan(math.radians(camera.field_of_view) / 2.0)
+    for eye in abstract.camera:
+        eye.pos[:], eye.forward[:], eye.up[:] = camera.eye, -back, up
+        eye.frustum_near, eye.frustum_far = camera.near, camera.far
+        eye.frustum_top, eye.frustum_bottom = top, -top
+        eye.frustum_center = eye.frustum_width = 0.0
+        eye.orthographic = 0
+    for lamp in abstract.lights[: abstract.nlight]:
+        if lamp.headlight:
+            lamp.pos[:], lamp.dir[:] = camera.eye, -back
+
+
+def _light(abstract: mujoco.MjvScene, light: Light, camera: Camera, extent: float) -> None:
+    """Let a light shine from one direction, with shadows around what the camera looks at."""
+    towards = np.divide(light.direction, math.hypot(*light.direction))
+    lamp = abstract.lights[abstract.nlight]
+    lamp.id, lamp.texid, lamp.headlight, lamp.castshadow = -1, -1, 0, 1
+    lamp.type = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    lamp.pos[:], lamp.dir[:] = camera.target + extent * towards, -towards
+    lamp.attenuation[:], lamp.cutoff, lamp.exponent = (1.0, 0.0, 0.0), 45.0, 0.0
+    lamp.ambient[:], lamp.diffuse[:], lamp.specular[:] = light.ambient / 2.0, 0.5, 0.2
+    abstract.nlight += 1
+
+
+@final
+class _Canvas:
+    """An OpenGL context with the meshes and textures of a model."""
+
+    def __init__(self, drawing: Drawing, size: tuple[int, int], library: str) -> None:
+        self._of, self._process = (drawing, size, library), os.getpid()
+        height, width = size
+        self._place = mujoco.MjrRect(0, 0, width, height)
+        self._context = importlib.import_module(f"mujoco.{library}").GLContext(width, height)
+        self._context.make_current()
+        drawing.model.vis.quality.offsamples = 0  # edges would be mixed with black, not the sky
+        self._renderer = mujoco.MjrContext(drawing.model, int(mujoco.mjtFontScale.mjFONTSCALE_100))
+        mujoco.mjr_resizeOffscreen(width, height, self._renderer)
+        mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._renderer)
+
+    def fits(self, drawing: Drawing, size: tuple[int, int], library: str) -> bool:
+        """Tell whether it was made for this, and by this process."""
+        mine, *rest = self._of
+        return mine is drawing and rest == [size, library] and self._process == os.getpid()
+
+    def picture(self, scene: mujoco.MjvScene) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Draw a scene; give the colors (h, w, 3), and where there is something (h, w)."""
+        rgb = np.empty((self._place.height, self._place.width, 3), dtype=np.uint8)
+        depth = np.empty(rgb.shape[:2], dtype=np.float32)
+        self._context.make_current()
+        mujoco.mjr_render(self._place, scene, self._renderer)
+        mujoco.mjr_readPixels(rgb, depth, self._place, self._renderer)
+        return rgb[::-1].copy(), depth[::-1] < 1.0
+
+    def close(self) -> None:
+        """Free all of it, unless it belongs to the process that this one was forked from."""
+        if self._process == os.getpid():
+            self._context.make_current()
+            self._renderer.free()
+            self._context.free()
+
+
+_local = threading.local()
+"""The canvas of each thread: an OpenGL context belongs to one."""
+
+
+def _canvas(drawing: Drawing, size: tuple[int, int], library: str) -> _Canvas:
+    """Give the canvas of this thread, a new one if the last one does not fit."""
+    canvas: _Canvas | None = getattr(_local, "canvas", None)
+    if canvas is None or not canvas.fits(drawing, size, library):
+        _close()
+        canvas = _local.canvas = _Canvas(drawing, size, library)
+        atexit.unregister(_close)
+        atexit.register(_close)  # runs before what the library registered when it was imported
+    return canvas
+
+
+def _close() -> None:
+    """Free the canvas of this thread."""
+    canvas: _Canvas | None = getattr(_local, "canvas", None)
+    _local.canvas = None
+    if canvas is not None:
+        canvas.close()
