@@ -63,6 +63,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "own_learner": (),
     "own_rl_learner": ("3",),
     "own_task": ("2",),
+    "predator_prey": ("10",),
     "recording": (),
     "sim_to_sim": ("sweep", "pushing", "2"),
     "train_and_evaluate": ("4096", "", "1"),
@@ -71,6 +72,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
 }
 SHORT = (
     *("augmentation", "own_backend", "own_curriculum", "own_rl_learner", "own_task"),
+    "predator_prey",
     *("sim_to_sim", "train_and_evaluate", "transfer_a_to_b"),
 )
 LEARNING = {"train_and_evaluate"}  # they need the extra "train", which few machines have

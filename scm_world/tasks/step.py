@@ -169,6 +169,7 @@ class StepTask(Task):
         shapes = {state.name: state.shape for state in self.states}
         shapes = {name: shapes.get(name, _shape(given)) for name, given in self.noise.items()}
         self._drawn = ProcessNoise(self.noise, shapes) if self.noise else None
+        self.generated_graph = any(not _lagged(state) for state in self.states)
         self.weights = {REWARD: 1.0} if self.reward is not None else {}
         self.system = StepModel(
             self.name,
@@ -286,9 +287,8 @@ class StepTask(Task):
 
     def _state(self, state: Measured, given: Iterable[str]) -> Iterable[Variable]:
         """Complete the declaration of a state, and declare what its beginning is drawn as."""
-        lagged = [Parent(p.name, 1, p.when) for p in state.parents if p.when != "set"]
         causes = (
-            *(lagged or [Parent(name, 1) for name in given]),
+            *(_lagged(state) or (Parent(name, 1) for name in given)),
             *(p for p in state.parents if p.when == "set"),
         )
         default = _spread(0.0 if state.default is None else state.default, state.shape)
@@ -299,6 +299,11 @@ class StepTask(Task):
         """List what a policy observes."""
         names = self.system.layout.names if self.observe is None else tuple(self.observe)
         return [Observed(name, (-np.inf, np.inf)) for name in names]
+
+
+def _lagged(state: Measured) -> tuple[Parent, ...]:
+    """List the declared causes of a state in the step before."""
+    return tuple(Parent(p.name, 1, p.when) for p in state.parents if p.when != "set")
 
 
 def _quantity(variable: Any) -> Quantity:
