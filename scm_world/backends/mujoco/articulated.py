@@ -12,31 +12,25 @@ from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.realization import Realization, Rows
 from scm_world.backends.mujoco.state import read_rows, read_vector, write_vector
 from scm_world.models.model import Model
-from scm_world.models.scene import ControlMode, Parameters
+from scm_world.models.scene import ControlMode
 
 
 @final
 class Articulated(Realization):
-    """A ``Model``. Its state vector is a permutation of MuJoCo's numbers.
-
-    Args:
-        structure: The model.
-        parameters: Those among them that are compiled into it are.
-    """
+    """A ``Model``. Its state vector is a permutation of MuJoCo's numbers."""
 
     modes = (ControlMode.CONTROLS,)
 
-    def __init__(self, structure: Model, parameters: Parameters) -> None:
+    def __init__(self, structure: Model) -> None:
         model = reading.compiled(structure)
-        names = tuple(model.body(i).name or f"body_{i}" for i in range(model.nbody))
         super().__init__(
             structure,
             model,
-            lambda model: fields.slots(model, structure),
-            names,
-            tuple(names[body] for body in model.geom_bodyid),
+            lambda model, data: fields.slots(model, structure, data),
+            reading.body_names(model),
+            reading.contact_bodies(model),
         )
-        self._places = np.concatenate(reading.permutation(self.model)).astype(np.int64)
+        self._places = np.concatenate(reading.permutation(model)).astype(np.int64)
 
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (nq + nv + na,)."""

@@ -16,8 +16,9 @@ from scm_world.backends.base import (
     EngineBatch,
     EngineSnapshot,
 )
+from scm_world.backends.mujoco.articulated import Articulated
 from scm_world.backends.mujoco.batch import MujocoBatch, Seat
-from scm_world.backends.mujoco.contacts import Touches, touches
+from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.trifinger.realization import TriFinger
 from scm_world.errors import EngineFailure, SnapshotMismatch
@@ -57,19 +58,14 @@ class Payload:
 def realize(structure: Any, parameters: Parameters) -> Realization:
     """Compile a structure, and write all parameters."""
     fresh: Realization
-    if isinstance(structure, Model):
-        from scm_world.backends.mujoco.articulated import Articulated
-
-        fresh = Articulated(structure, parameters)
-    else:
-        fresh = TriFinger(structure)
+    fresh = Articulated(structure) if isinstance(structure, Model) else TriFinger(structure)
     fresh.edit(parameters)
     return fresh
 
 
 @final
 class MujocoBackend(Backend):
-    """MuJoCo, with one compiled model per structure and nearly everything else edited in place."""
+    """MuJoCo, with one compiled model per structure and everything else edited in place."""
 
     name: ClassVar[str] = "mujoco"
     capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
@@ -110,18 +106,18 @@ class MujocoBackend(Backend):
         """
         self._return()
         now, structure = self._now, difference.structure
-        if structure is not None:
-            scene = Scene(now.structure, now.kept, self.state())
-            difference = complete(scene, structure, difference)
-        if structure is None and not now.outdated(difference.parameters):
+        if now.began is not None and (difference.parameters or structure is not None):
+            self._last_touches()  # later, this would be another step
+        if structure is None:
             now.edit(difference.parameters)
         else:
             record = self._last_touches()
-            parameters = {**({} if structure else now.kept), **difference.parameters}
-            fresh = self._realized(structure or now.structure, parameters)
-            if fresh is not now:
-                fresh.follow(now)
-            self._now, self._touches = fresh, record
+            scene = Scene(now.structure, now.kept, self.state())
+            difference = complete(scene, structure, difference)
+            self._now = self._realized(structure, difference.parameters)
+            if self._now is not now:
+                self._now.follow(now)
+            self._touches = record
         if difference.state is not None:
             self._now.place(difference.state.vector)
 
@@ -161,6 +157,8 @@ class MujocoBackend(Backend):
             now.switch(mode)
         now.command[:] = command
         now.forget()
+        if now.staged and substeps == 1:
+            now.began = now.numbers()
         self._touches = None
         try:
             mujoco.mj_step(now.model, now.data, substeps)
@@ -172,7 +170,11 @@ class MujocoBackend(Backend):
             raise EngineFailure(problem, self.name)
 
     def contacts(self) -> tuple[Contact, ...]:
-        """List the contact points of the last physics step."""
+        """List the contact points of the last physics step.
+
+        MuJoCo keeps those of the last stage of a Runge-Kutta step. After a call of ``step`` with
+        one physics step, pairs that touched in an earlier stage alone are listed, too.
+        """
         return self._last_touches().contacts()
 
     def snapshot(self) -> EngineSnapshot:
@@ -227,7 +229,7 @@ class MujocoBackend(Backend):
     def _return(self) -> None:
         """Take the state back from where it is stepped."""
         if self._seat is not None:
-            self._seat.give_back(self._now.data)
+            self._seat.give_back(self._now)
             self._seat = None
 
     def close(self) -> None:
@@ -238,7 +240,7 @@ class MujocoBackend(Backend):
     def _realized(self, structure: Any, parameters: Parameters) -> Realization:
         """Give a structure with these parameters: the present one edited, or a new one."""
         now: Realization | None = vars(self).get("_now")
-        if now is None or structure != now.structure or now.outdated(parameters):
+        if now is None or structure != now.structure:
             return realize(structure, parameters)
         now.edit(parameters)
         return now
@@ -246,5 +248,5 @@ class MujocoBackend(Backend):
     def _last_touches(self) -> Touches:
         if self._touches is None:
             self._return()
-            self._touches = touches(self._now.data, self._now.owners)
+            self._touches = self._now.touches()
         return self._touches

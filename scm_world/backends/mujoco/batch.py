@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol, final
 
 import mujoco
@@ -17,7 +17,7 @@ from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode
 
 KEPT = 4
-"""Kinds of models whose simulations are kept although no scene is in them at the moment."""
+"""Structures whose simulations are kept although no scene is in them at the moment."""
 
 _STRANDED: list[_Room] = []
 """Simulations whose threads were left behind by a fork."""
@@ -52,14 +52,15 @@ class Seat:
         """Take over the state of a scene."""
         mujoco.mj_getState(scene.model, scene.data, self.room.batch.state[self.index], STATE)
 
-    def give_back(self, data: mujoco.MjData) -> None:
+    def give_back(self, scene: Realization) -> None:
         """Copy everything that the last step left."""
-        self.room.batch.get_data(self.index, data)
+        self.room.batch.get_data(self.index, scene.data)
+        scene.began = self.room.began[self.index]
 
 
 @final
 class _Room:
-    """The simulations of all scenes whose compiled models have equal sizes.
+    """The simulations of all scenes of one structure.
 
     Args:
         scene: Any of them.
@@ -68,25 +69,26 @@ class _Room:
     """
 
     def __init__(self, scene: Realization, n: int, threads: int) -> None:
-        self.key = scene.key
+        self.structure = scene.structure
         # An MjData for each scene: contacts of the last step can be asked for.
         self.batch: Any = Batch(scene.model, n, threads, persistent=True)
         self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
         self.seats = [Seat(self, index) for index in range(n)]
         self.models: list[mujoco.MjModel] = [scene.model] * n
         self.read = scene.rows(self.batch)
+        self.began: list[Floats | None] = [None] * n  # see ``Realization``
+        self._staged = scene.staged
         self._width = len(scene.command)
         self._commands = self.batch.bind("ctrl")
 
     def step(self, which: Integers, commands: Floats, substeps: int) -> None:
         """Hold commands, shape (n, at least n_commands), in some of the simulations."""
-        width = self._width
-        if len(which) == len(self.seats):
-            self._commands[:, :width] = commands[:, :width]
-            self.batch.step(nstep=substeps)
-        else:
-            self._commands[which, :width] = commands[which, :width]
-            self.batch.step(ids=which, nstep=substeps)
+        width, everyone = self._width, len(which) == len(self.seats)
+        rows = slice(None) if everyone else which
+        self._commands[rows, :width] = commands[rows, :width]
+        for index in which.tolist() if self._staged else ():
+            self.began[index] = self.batch.state[index].copy() if substeps == 1 else None
+        self.batch.step(ids=None if everyone else which, nstep=substeps)
 
 
 @final
@@ -104,7 +106,7 @@ class MujocoBatch(EngineBatch):
     def __init__(self, guests: Sequence[Guest], threads: int) -> None:
         self._guests = tuple(guests)
         self._threads = max(1, min(threads, len(self._guests)))
-        self._rooms: dict[Hashable, _Room] = {}
+        self._rooms: dict[Any, _Room] = {}
         self._seats: list[Seat | None] = [None] * len(self._guests)
         self._process = os.getpid()
 
@@ -138,18 +140,19 @@ class MujocoBatch(EngineBatch):
             raise EngineFailure("; ".join(problems), "mujoco")
 
     def _seat(self, index: int) -> Seat:
-        """Give the seat of a scene in the room for models like its own."""
+        """Give the seat of a scene in the room of its structure."""
         scene, seat = self._guests[index].realization, self._seats[index]
-        if seat is None or seat.room.key != scene.key:
+        if seat is None or seat.room.structure != scene.structure:
             self._seats[index] = None
             seat = self._seats[index] = self._room(scene).seats[index]
         return seat
 
     def _room(self, scene: Realization) -> _Room:
-        found = self._rooms.get(scene.key)
+        found = self._rooms.get(scene.structure)
         if found is None:
             self._leave_unused()
-            found = self._rooms[scene.key] = _Room(scene, len(self._guests), self._threads)
+            found = _Room(scene, len(self._guests), self._threads)
+            self._rooms[scene.structure] = found
         return found
 
     def _leave_threads(self) -> None:

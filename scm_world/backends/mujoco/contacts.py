@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import final
 
@@ -11,6 +12,10 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import Contact
 
+_RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_PYRAMID = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
 
 @final
 @dataclass(frozen=True)
@@ -18,7 +23,7 @@ class Touches:
     """Contact points as arrays, before they get names.
 
     Attributes:
-        owners: Name of the body of each shape.
+        owners: Name of the body of each shape: the geoms, then the flexes.
         shapes: Shape (k, 2).
         positions: Shape (k, 3) [m].
         normals: From the first shape to the second, shape (k, 3).
@@ -46,17 +51,79 @@ class Touches:
             for i, (first, second) in enumerate(self.shapes)
         )
 
+    def extended(self, other: Touches) -> Touches:
+        """Add the contacts of such pairs of shapes as touch in the other alone."""
+        pairs = {(first, second) for first, second in self.shapes.tolist()}
+        new = [i for i, pair in enumerate(other.shapes.tolist()) if tuple(pair) not in pairs]
+        if not new:
+            return self
+        return Touches(
+            self.owners,
+            np.concatenate([self.shapes, other.shapes[new]]),
+            np.concatenate([self.positions, other.positions[new]]),
+            np.concatenate([self.normals, other.normals[new]]),
+            np.concatenate([self.distances, other.distances[new]]),
+            np.concatenate([self.forces, other.forces[new]]),
+        )
 
-def touches(data: mujoco.MjData, owners: tuple[str, ...]) -> Touches:
+
+def touches(model: mujoco.MjModel, data: mujoco.MjData, owners: tuple[str, ...]) -> Touches:
     """Copy the contacts of the last physics step."""
-    contact, address = data.contact, data.contact.efc_address
-    forces = np.zeros(len(address))
-    forces[address >= 0] = data.efc_force[address[address >= 0]]
+    contact, forces = data.contact, _normal_forces(model, data)
+    shapes = contact.geom.astype(np.int64)
+    if model.nflex:
+        shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
     return Touches(
         owners,
-        contact.geom.astype(np.int64),
+        shapes,
         contact.pos.copy(),
         contact.frame[:, :3].copy(),
         contact.dist.copy(),
         forces,
     )
+
+
+def _normal_forces(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
+    """Add the forces on the edges of a pyramid; of an elliptic cone, the first is the normal one.
+
+    Contacts within a gap have no force.
+    """
+    address, size = data.contact.efc_address, data.contact.dim
+    forces, listed = np.zeros(len(address)), address >= 0
+    forces[listed] = data.efc_force[address[listed]]
+    if model.opt.cone == _PYRAMID:
+        for i in np.flatnonzero(listed & (size > 1)).tolist():
+            forces[i] = data.efc_force[address[i] : address[i] + 2 * (size[i] - 1)].sum()
+    return forces
+
+
+def has_stages(model: mujoco.MjModel) -> bool:
+    """Tell whether a physics step looks for contacts in several places (Runge-Kutta)."""
+    return int(model.opt.integrator) == _RK4
+
+
+def earlier_stages(
+    model: mujoco.MjModel, numbers: Floats, owners: tuple[str, ...]
+) -> Iterator[Touches]:
+    """Find the contacts of the first three stages of a Runge-Kutta step; MuJoCo keeps the last.
+
+    Args:
+        model: As it was in that step.
+        numbers: ``mjSTATE_INTEGRATION`` before it.
+        owners: Name of the body of each shape.
+
+    Source:
+        ``mj_RungeKutta`` in MuJoCo's ``engine_forward.c``.
+    """
+    data, half = mujoco.MjData(model), 0.5 * model.opt.timestep
+    data.warning.number[:] = 1  # so that MuJoCo prints none
+    mujoco.mj_setState(model, data, numbers, _STATE)
+    position, velocity, activation = data.qpos.copy(), data.qvel.copy(), data.act.copy()
+    for _ in range(3):
+        mujoco.mj_forward(model, data)
+        yield touches(model, data, owners)
+        rate = data.qvel.copy()
+        data.qpos[:] = position
+        mujoco.mj_integratePos(model, data.qpos, rate, half)
+        data.qvel[:] = velocity + half * data.qacc
+        data.act[:] = activation + half * data.act_dot

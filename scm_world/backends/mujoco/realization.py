@@ -1,14 +1,14 @@
 """A structure as MuJoCo realizes it: one class for each kind of structure.
 
-``Realization`` holds a compiled model with its parameters, ``ModelRealization`` is that of a
-``Model``; the one of the TriFinger is in the folder ``trifinger``.
+``Realization`` holds a compiled model with its parameters and its state. ``articulated`` has the
+one of any ``Model``, ``trifinger.realization`` that of the TriFinger.
 """
 
 from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 import mujoco
@@ -16,6 +16,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from scm_world._types import Floats
+from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.state import sensible, sound
 from scm_world.errors import Infeasible, UnknownOption
@@ -40,7 +41,7 @@ class Realization(ABC):
     Args:
         structure: What was compiled.
         compiled: The result, which is copied and not changed.
-        slots: Finds the places of all parameters in a model.
+        slots: Finds the places of all parameters in a model and its data.
         bodies: Name of each body.
         owners: Name of the body of each shape: the geoms, then the flexes.
 
@@ -48,11 +49,12 @@ class Realization(ABC):
         structure: What was compiled.
         model: With the present parameters.
         data: With the present state.
-        owners: Name of the body of each shape.
         kept: The parameters in force; at first, none has been written.
         mode: What a command means.
         command: Where it is written, shape (n_commands,).
         edited: Whether the model has changed since someone last cleared this.
+        staged: Whether a physics step has stages, each with contacts of its own.
+        began: ``mjSTATE_INTEGRATION`` before the last step, if it had stages and was taken alone.
     """
 
     modes: ClassVar[tuple[ControlMode, ...]]
@@ -61,7 +63,7 @@ class Realization(ABC):
         self,
         structure: Any,
         compiled: mujoco.MjModel,
-        slots: Callable[[mujoco.MjModel], Mapping[ParameterKey, Slot]],
+        slots: Callable[[mujoco.MjModel, mujoco.MjData], Mapping[ParameterKey, Slot]],
         bodies: tuple[str, ...],
         owners: tuple[str, ...],
     ) -> None:
@@ -69,12 +71,14 @@ class Realization(ABC):
         self.model = model = copy.copy(compiled)
         self.data = data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
-        self._slots = slots(model)
+        self._slots = slots(model, data)
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
-        self._bodies, self.owners = bodies, owners
+        self._bodies, self._owners = bodies, owners
         self.kept: dict[ParameterKey, Floats] = {}
         self.mode = self.modes[0]
         self.edited = True
+        self.staged = has_stages(model)
+        self.began: Floats | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
         self._counts = data.warning.number
@@ -104,12 +108,17 @@ class Realization(ABC):
         """Give what reads states of such models out of a batch."""
 
     def reset(self) -> None:
-        """Forget every step."""
-        mujoco.mj_resetData(self.model, self.data)
+        """Forget every step; parameters stay."""
+        data = self.data
+        places, turns = data.mocap_pos.copy(), data.mocap_quat.copy()
+        mujoco.mj_resetData(self.model, data)
+        data.mocap_pos[:], data.mocap_quat[:] = places, turns
+        self.began = None
         self._counts[:] = 1
 
-    def forget(self) -> None:  # noqa: B027 # most have nothing to forget
+    def forget(self) -> None:
         """Forget what was before a step that is made now."""
+        self.began = None
 
     def problem(self) -> str:
         """Say what is wrong with what a step left, or nothing."""
@@ -126,6 +135,14 @@ class Realization(ABC):
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
 
+    def touches(self) -> Touches:
+        """Copy the contacts of the last physics step, with those of earlier stages where known."""
+        found = touches(self.model, self.data, self._owners)
+        if self.began is not None:
+            for earlier in earlier_stages(self.model, self.began, self._owners):
+                found = found.extended(earlier)
+        return found
+
     def numbers(self) -> Floats:
         """Copy ``mjSTATE_INTEGRATION``."""
         numbers = np.empty(self._size)
@@ -140,6 +157,7 @@ class Realization(ABC):
         """Go on from what was remembered."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
+        self.began = None
 
     def follow(self, before: Realization) -> None:
         """Go on after the last step of another realization; then the state is written."""
@@ -156,16 +174,6 @@ class Realization(ABC):
         self.mode = mode
 
     # --- model ---------------------------------------------------------------------------------
-
-    @property
-    def key(self) -> Hashable:
-        """What decides the sizes of arrays: the structure, and what was compiled into it."""
-        found: Hashable = self.structure
-        return found
-
-    def outdated(self, parameters: Parameters) -> bool:
-        """Tell whether these parameters need another compilation."""
-        return False
 
     def inertia(self, body: str) -> Floats:
         """Copy the principal moments of inertia of a body, shape (3,) [kg m²]."""

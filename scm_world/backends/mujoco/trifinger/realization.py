@@ -44,7 +44,7 @@ class TriFinger(Realization):
         super().__init__(
             structure,
             model,
-            lambda model: slots(model, structure),
+            lambda model, _: slots(model, structure),
             tuple(model.body(i).name for i in range(model.nbody)),
             tuple(owners[model.geom(i).name] for i in range(model.ngeom)),
         )
