@@ -188,7 +188,7 @@ def _summary(found: Iterable[Found]) -> Table:
                 report.task,
                 report.backend,
                 str(report.probes),
-                f"{len(report.fired)} of {report.declared}",
+                f"{len(report.fired)} of {len(report.declared)}",
                 str(len(report.undeclared)),
                 f"{report.floor:g}",
                 f"{report.seconds:.1f}",

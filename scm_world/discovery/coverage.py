@@ -67,8 +67,9 @@ def _coverage(ax: Axes, reports: Iterable[Verification]) -> None:
 
     lowest = 1.0
     for found, shade in zip(reports, SHADES, strict=False):
-        share = [count / found.declared if found.declared else 1.0 for count in found.coverage]
-        label = f"{found.backend}: {len(found.fired)} of {found.declared}"
+        declared = len(found.declared)
+        share = [count / declared if declared else 1.0 for count in found.coverage]
+        label = f"{found.backend}: {len(found.fired)} of {declared}"
         numbers = range(1, len(share) + 1)
         ax.step(numbers, share, where="mid", color=shade, lw=2.2, label=label, alpha=0.85)
         lowest = min(lowest, *share)

@@ -127,7 +127,7 @@ class Agreement(Report):
         """List edges that were seen on one engine only, by its name."""
         if len(self.verifications) < 2:
             return {}
-        one, other = (set(found.seen) for found in self.verifications)
+        one, other = (set(found.found) for found in self.verifications)
         first, second = self.backends
         return {first: tuple(sorted(one - other)), second: tuple(sorted(other - one))}
 

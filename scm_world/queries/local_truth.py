@@ -15,7 +15,9 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Contact
+from scm_world.errors import UnknownOption
 from scm_world.scene import ControlMode, ParameterKey, PhysicalState, Scene, trifinger
+from scm_world.tasks import TriFingerTask
 from scm_world.variables import Noise
 from scm_world.world import World
 
@@ -32,8 +34,20 @@ SHARE = 1e-3  # of a parameter, by which it is changed
 DIRECTIONS = 2  # each with both signs
 
 
+def has_local_graphs(world: World) -> bool:
+    """Tell whether a world is one of fingers and blocks, between which local graphs are."""
+    return isinstance(world.task, TriFingerTask)
+
+
 def movers(world: World) -> tuple[str, ...]:
-    """Name the bodies that can move: the fingers, then the blocks."""
+    """Name the bodies that can move: the fingers, then the blocks.
+
+    Raises:
+        UnknownOption: It is a world of something else.
+    """
+    if not has_local_graphs(world):
+        allowed = ("a world of the block-building robot",)
+        raise UnknownOption("world of local graphs", world.task.name, allowed)
     return (*FINGERS, *world.composition.blocks)
 
 

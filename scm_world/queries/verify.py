@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, final
 
 from scm_world.errors import UnknownOption
@@ -15,6 +15,7 @@ from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.series import Series, checked_count
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import local_report
+from scm_world.queries.local_truth import has_local_graphs
 from scm_world.queries.policies import Random
 from scm_world.queries.progress import Progress
 from scm_world.queries.signs import compare_signs
@@ -30,28 +31,42 @@ PRESSING = "pressing"
 """The rule of local graphs: contacts with force."""
 
 MOST, LEAST = 200, 16
-"""How many probe states there are at most, and how many even if every edge was seen before."""
+"""How many probe states there are at most, and how many even if every edge was seen before.
+
+Of a generated graph there are as many as at least, since some of its edges may never be seen.
+"""
+
+HELD_OUT = 8
+"""How many further ones there are for what a generated graph leaves open."""
+
+OTHER = 1_000_003
+"""What is added to the seed for these."""
 
 
 def verify(
     system: World | Task | str,
     *,
-    probes: int = MOST,
+    probes: int | None = None,
     least: int = LEAST,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Any,
 ) -> Verification:
-    """Check the declared graph of a task against the physics that realises it.
+    """Check the declared graph of a world against the physics that realises it.
 
     From many probe states one variable at a time is changed, everything else kept, and whatever
     differs afterwards is held against the declared edges. It ends when every declared edge was
     seen. It may be interrupted (Ctrl-C); the report then covers the probe states that were
     finished.
 
+    A graph that was generated from a model says what can act on what; some of its edges may never
+    show. What was never seen, or seen without an edge, is looked for again in probe states of
+    another seed.
+
     Args:
-        system: A world, a task, or the name of one.
-        probes: How many states to experiment in at most.
+        system: A world, a task, the name of one, or a model file.
+        probes: How many states to experiment in at most; 200, or ``least`` of a generated graph,
+            if None.
         least: How many even if every declared edge has been seen before.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
@@ -66,7 +81,7 @@ def verify(
         >>> found.floor, found.undeclared, found.passed  # without physics nothing moves
         (0.0, (), False)
     """
-    checked_count("number of probes", probes)
+    checked_count("number of probes", 1 if probes is None else probes)
     checked_count("least number of probes", least)
     if isinstance(system, World):
         if options:
@@ -83,7 +98,7 @@ def verify_engines(
     task: Task | str,
     *,
     backends: tuple[str, str] = ("mujoco", "bullet"),
-    probes: int = MOST,
+    probes: int | None = None,
     least: int = LEAST,
     seed: int = 0,
     progress: Callable[[str], Progress | None] | None = None,
@@ -117,7 +132,7 @@ def verify_engines(
     def told(name: str) -> Progress | None:
         return None if progress is None else progress(name)
 
-    compared = min(least, probes)
+    compared = least if probes is None else min(least, probes)
     limits: dict[str, Any] = {"probes": probes, "least": least, "seed": seed}
     reports: list[Verification] = []
     for name in backends:
@@ -161,9 +176,11 @@ class _Watch:
 
 
 def _verified(
-    world: World, probes: int, least: int, seed: int, progress: Progress | None
+    world: World, most: int | None, least: int, seed: int, progress: Progress | None
 ) -> Verification:
     started = time.perf_counter()
+    generated = world.task.generated_graph
+    probes = (least if generated else MOST) if most is None else most
     declared = tuple(edge.key for edge in world.model.edges)
     measured = {v.name for v in world.model.variables if isinstance(v, Measured)}
     watch, paired = _Watch(declared, least), Paired(world, seed)
@@ -171,15 +188,23 @@ def _verified(
     series.run(probe_states(world, probes, seed), watch)
     effects, done = series.effects, series.done
     found = effects.found(effects.threshold)
-    colors = {edge for edge in {*found, *declared} if _is_color(edge[0]) and edge[1] in measured}
     interrupted = done < probes and (bool(watch.missing) or done < least)
+    left = {*found, *declared} - (found & set(declared))
+    again: set[EdgeKey] = set()
+    held_out = 0
+    if generated and left and not interrupted:
+        again, held_out = _held_out(world, left, seed, effects, watch, done)
+        found, interrupted = found | again, held_out < HELD_OUT
+    colors = {edge for edge in {*found, *declared} if _is_color(edge[0]) and edge[1] in measured}
     local = None if interrupted else _local(world, seed)
     return Verification(
         task=world.task.name,
         backend=world.backend.name,
         preset=world.options.preset,
         seed=seed,
+        generated=generated,
         probes=done,
+        held_out=held_out,
         planned=probes,
         interrupted=interrupted,
         rollouts=effects.rollouts,
@@ -189,7 +214,10 @@ def _verified(
         untried=tuple(sorted(set(paired.targets) - effects.undone)),
         fired=tuple(_fired(key, effects, watch) for key in sorted(found & set(declared))),
         never_fired=tuple(sorted(set(declared) - found)),
-        undeclared=tuple(_undeclared(key, effects) for key in sorted(found - set(declared))),
+        undeclared=tuple(
+            _undeclared(key, effects, key in again if held_out else None)
+            for key in sorted(found - set(declared))
+        ),
         colors=tuple(sorted(colors)),
         local=local,
         seconds=time.perf_counter() - started,
@@ -197,9 +225,44 @@ def _verified(
     )
 
 
+def _held_out(
+    world: World,
+    left: Collection[EdgeKey],
+    seed: int,
+    effects: Effects,
+    watch: _Watch,
+    done: int,
+) -> tuple[set[EdgeKey], int]:
+    """Look again for what was left open, in probe states of another seed.
+
+    Args:
+        world: To experiment with.
+        left: Declared edges that were never seen, and others that were.
+        seed: Of the first probe states.
+        effects: What was seen in these; what is new is added.
+        watch: Is told of the edges that are seen now.
+        done: How many probe states there were.
+
+    Returns:
+        The edges that were seen now, of all causes that were experimented with, and the number
+        of probe states.
+    """
+    causes = {cause for cause, _, _ in left}
+    series = Series(Paired(world, seed + OTHER, causes=causes), HELD_OUT)
+
+    def told(new: Effects, count: int) -> bool:
+        watch(new, done + count)
+        return False
+
+    with contextlib.suppress(KeyboardInterrupt):
+        series.run(probe_states(world, HELD_OUT, seed + OTHER), told)
+    effects.take(series.effects, done)
+    return series.effects.found(effects.threshold), series.done
+
+
 def _local(world: World, seed: int) -> LocalShare | None:
     """Hold local graphs against paired experiments while the robot moves at random."""
-    if not world.backend.capabilities.physics:
+    if not has_local_graphs(world) or not world.backend.capabilities.physics:
         return None
     with contextlib.suppress(KeyboardInterrupt):
         world.reset(seed=seed)
@@ -223,10 +286,11 @@ def _fired(key: EdgeKey, effects: Effects, watch: _Watch) -> Fired:
         lag=lag,
         after=watch.after[key],
         largest=effects.largest[key],
+        states=effects.states[key],
     )
 
 
-def _undeclared(key: EdgeKey, effects: Effects) -> Undeclared:
+def _undeclared(key: EdgeKey, effects: Effects, again: bool | None) -> Undeclared:
     (cause, effect, lag), setting = key, effects.settings[key]
     change = () if setting.change is None else tuple(setting.change.tolist())
     return Undeclared(
@@ -237,4 +301,5 @@ def _undeclared(key: EdgeKey, effects: Effects) -> Undeclared:
         probe=setting.probe,
         kind=setting.kind,
         change=change,
+        again=again,
     )

@@ -110,6 +110,24 @@ class Effects:
         if setting is not None and setting.change is not None:
             responses[key, setting.probe] = Response(setting.change, after - before, before)
 
+    def take(self, other: Effects, done: int) -> None:
+        """Add what was seen elsewhere.
+
+        Args:
+            other: Effects in other probe states.
+            done: How many probe states came before those, so that they can be numbered on.
+        """
+        for key, size in other.largest.items():
+            if size > self.largest.get(key, -1.0):
+                self.largest[key] = size
+                if key in other.settings:
+                    found = other.settings[key]
+                    self.settings[key] = replace(found, probe=done + found.probe)
+            self.states[key] = self.states.get(key, 0) + other.states.get(key, 0)
+        self.floor = max(self.floor, other.floor)
+        self.undone |= other.undone
+        self.rollouts += other.rollouts
+
     @property
     def threshold(self) -> float:
         """What an effect must exceed, given the floor."""
