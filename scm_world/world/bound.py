@@ -27,9 +27,9 @@ _Step = tuple[str, Callable[..., Any], Callable[[Now], Iterable[Any]], tuple[Any
 class Bound:
     """Some mechanisms in causal order, with their arguments.
 
-    A state is a view of the vector that physics writes, and a parameter the same object until an
-    intervention: such arguments are looked up once. Only computed numbers are looked up in every
-    step.
+    A state is a view of the vector that physics writes, an action one of what is commanded, and a
+    parameter the same object until an intervention: such arguments are looked up once. Only
+    computed numbers are looked up in every step.
 
     Args:
         model: That declares the mechanisms.
@@ -41,7 +41,6 @@ class Bound:
         self._now = now
         rules = [_Rule(model, name) for name in names]
         replaced = {rule.name for rule in rules}
-        replaced |= {v.name for v in model.variables if isinstance(v, Action)}
         self._keys = tuple({k: None for rule in rules for k in rule.keys if k not in replaced})
         lasting, self._once = set(self._keys), list[_Rule]()
         self._steps: list[_Step] = []
@@ -98,7 +97,9 @@ class _Rule:
         self.keys = tuple(map(key, parents))
         self._function, self._constants = positional(variable.mechanism.bind(), len(parents))
         self.writes = hasattr(self._function, "into")
-        self._moves = [k not in model or isinstance(model.declared(k), Measured) for k in self.keys]
+        self._moves = [
+            k not in model or isinstance(model.declared(k), Measured | Action) for k in self.keys
+        ]
         self._numbers = all(_is_number(model.declared(p.name)) for p in parents)
 
     def step(self) -> _Step:

@@ -87,9 +87,8 @@ class Stepped(Declared):
         return self._translates
 
     def _act(self, command: Floats) -> None:
-        """Remember the action."""
-        self._action = command
-        self._now.update(self.declaration.split(command))
+        """Remember the action; present values are views of it, which stay the same objects."""
+        self._action[:] = command
 
     def decided(self, command: Floats) -> Floats:
         """Give the action that is taken: the command, where no action has a mechanism."""

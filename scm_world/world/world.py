@@ -320,7 +320,7 @@ class World(Stepped):
         if self._action.shape != (declaration.n_actions,):
             self._action = np.zeros(declaration.n_actions)
         self._now: dict[str, Value] = {CONTROL_INDEX: self._clock}
-        self._act(self._action)
+        self._now.update(declaration.split(self._action))
         self._before: dict[str, Value] = {}
         self._state = declaration.empty_state()
         self._now.update(declaration.states(self._state))
@@ -364,7 +364,7 @@ class World(Stepped):
         self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
         declaration = self.family.declaration(snapshot.plan)
         held = declaration.model.with_interventions(snapshot.interventions)
-        self._act(np.array(snapshot.action))
+        self._act(snapshot.action)
         self.adopt(declaration, held, snapshot.static, snapshot.index)
         for name, value in snapshot.previous.items():
             self._before[name][...] = value
