@@ -129,7 +129,8 @@ def _noise(episode: Episode) -> set[str]:
     drawn = {
         name for _, plan in episode.layers for name, act in plan.acts() if isinstance(act, Draw)
     }
-    return drawn | {name for name in NOISY if np.any(episode[name])}
+    there = set(episode.names)
+    return drawn | {name for name in NOISY if name in there and np.any(episode[name])}
 
 
 @final

@@ -21,7 +21,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.policies import Sequence as Given
 from scm_world.queries.stages import Stage, stage_of
 from scm_world.queries.traces import Trace, begin, run
-from scm_world.tasks import make_task, tasks
+from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import World
 
@@ -50,8 +50,8 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
         path: Of the file; it gets the ending ``.npz`` if it has another one.
 
     Raises:
-        ModelError: A plan has a function without a name, or the task arguments that are no
-            numbers and texts.
+        ModelError: A plan has a function without a name, or a registered task arguments that are
+            no numbers and texts. Other tasks and models are given again as a world on reading.
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
     trace = episode.trace
@@ -74,20 +74,13 @@ def _about(episode: Episode) -> dict[str, Any]:
     task, options = episode.stage.task, dict(episode.stage.options)
     if isinstance(options.get("variables_space"), Subset):
         options["variables_space"] = options["variables_space"].model_dump(mode="json")
-    if not task.is_named:
-        raise ModelError(
-            [f"give the arguments of {task.name!r} by name, so that they can be saved"]
-        )
     with episode.stage.twin() as world:
         engine = world.engine
-    try:
-        arguments = json.loads(json.dumps(_plain(task.given), allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise ModelError([f"an argument of {task.name!r} cannot be written: {error}"]) from None
     return {
         "format": FORMAT,
         "task": task.name,
-        "arguments": arguments,
+        "arguments": _arguments(task),
+        "model": task.system.digest if isinstance(task, ModelTask) else None,
         "options": options,
         "seed": episode.seed,
         "number": episode.number,
@@ -96,6 +89,25 @@ def _about(episode: Episode) -> dict[str, Any]:
         "parameters": _digest(episode.trace),
         "versions": versions(engine),
     }
+
+
+def _arguments(task: Task) -> dict[str, Any] | None:
+    """Write down what a task was made with; None where it can only be given again as a world.
+
+    Raises:
+        ModelError: It is a registered task, and what it was made with cannot be written.
+    """
+    registered = task.name in tasks()
+    problem = f"give the arguments of {task.name!r} by name, so that they can be saved"
+    if task.is_named:
+        try:
+            found: dict[str, Any] = json.loads(json.dumps(_plain(task.given), allow_nan=False))
+            return found
+        except (TypeError, ValueError) as error:
+            problem = f"an argument of {task.name!r} cannot be written: {error}"
+    if registered:
+        raise ModelError([problem])
+    return None
 
 
 def _digest(trace: Trace) -> str:
@@ -127,17 +139,21 @@ def load_episode(
 
     Args:
         path: Of the file.
-        world: Where it happens, for a task that is not registered; made from the file if None.
+        world: Where it happens, for a task that is not registered, or a model that was given as
+            an object, or with spaces or functions; made from the file if None.
         trusted: Packages whose functions may be mechanisms of its plans.
 
     Raises:
         UnreadableFile: It is no episode.
         UnknownOption: Its task is not registered, and no world is given.
-        SnapshotMismatch: It did not happen again bit for bit: another version, say.
+        SnapshotMismatch: It did not happen again bit for bit: another version or model, say.
     """
     file = Path(path)
     about, actions, states, lengths = _read(file)
     stage = stage_of(world) if world is not None else _stage(about)
+    model = stage.task.system.digest if isinstance(stage.task, ModelTask) else None
+    if about.get("model") != model:
+        raise SnapshotMismatch(f"{file} happened in another model, or one that was changed since")
     layers = [
         (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
     ]
@@ -172,9 +188,14 @@ def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
 
 
 def _stage(about: dict[str, Any]) -> Stage:
-    if about["task"] not in tasks():
+    given = about["arguments"] or {}
+    if about["task"] in tasks():
+        task = make_task(about["task"], **given)
+    elif about.get("model") is not None and "model" in given:
+        task = ModelTask(**given)
+    else:
         raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))
-    return Stage(World(make_task(about["task"], **about["arguments"]), **about["options"]))
+    return Stage(World(task, **about["options"]))
 
 
 def _compare(trace: Trace, states: list[Any], file: Path, made: dict[str, str]) -> None:

@@ -15,6 +15,7 @@ from scm_world.queries import estimates, samples
 from scm_world.queries.courses import Course, Key
 from scm_world.queries.episodes import Episode, rollout
 from scm_world.queries.estimates import Effect
+from scm_world.queries.outcomes import usual_outcomes
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Samples, Setting
@@ -254,8 +255,9 @@ class World(Simulated):
         """Let an episode happen, and remember it whole.
 
         Args:
-            policy: A function of the world that gives an action, shape (9,); actions of shape
-                (9,) or (steps, 9); ``"random"``; or None: the robot stays where it begins.
+            policy: A function of the world that gives an action, shape (n_actions,); actions of
+                shape (n_actions,) or (steps, n_actions); ``"random"``; or None: the action that
+                lets the system be. See ``as_policy`` for others that have a name.
             seed: Of the noise.
             episode: Number of the episode within that noise.
             do: Interventions, with or without a time.
@@ -275,7 +277,7 @@ class World(Simulated):
         self,
         n: int,
         *,
-        outcomes: Iterable[Any] = ("fractional_success",),
+        outcomes: Iterable[Any] | None = None,
         progress: Progress | None = None,
         **setting: Any,
     ) -> Samples:
@@ -287,7 +289,7 @@ class World(Simulated):
         do: Mapping[str, Any],
         n: int,
         *,
-        outcomes: Iterable[Any] = ("fractional_success",),
+        outcomes: Iterable[Any] | None = None,
         first: int = 0,
         progress: Progress | None = None,
         **setting: Any,
@@ -298,7 +300,7 @@ class World(Simulated):
             do: What is done in each of them.
             n: How many.
             outcomes: Names of variables (their final values), ``Outcome`` or functions of the
-                episode.
+                episode; see ``usual_outcomes`` if None.
             first: Number of the first one; unit i is the same in every question with one seed.
             progress: Told after each episode how many are done, and how many there will be.
             setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
@@ -311,7 +313,7 @@ class World(Simulated):
             self,
             self._with(do),
             n,
-            outcomes=outcomes,
+            outcomes=usual_outcomes(self) if outcomes is None else outcomes,
             setting=Setting(**setting),
             first=first,
             progress=progress,

@@ -9,7 +9,9 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
+from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
+from scm_world.world import World
 
 HOWS = ("final", "mean", "max", "min", "sum", "first", "change")
 Given = "str | Outcome | Callable[[Episode], Any]"
@@ -80,6 +82,24 @@ def as_outcome(given: Any) -> Any:
         given,
         ("the name of a variable", "Outcome(name, how)", "a function of the episode"),
     )
+
+
+def usual_outcomes(world: World) -> tuple[str, ...]:
+    """Name what is read off episodes if nothing else is asked for.
+
+    That is the fractional success of the robot's tasks, and of any other system everything that
+    is computed from its states: readouts, outcomes, reward and success.
+
+    Raises:
+        UnknownOption: Nothing is computed from the states.
+    """
+    if FRACTION in world.model:
+        return (FRACTION,)
+    found: tuple[str, ...] = world.declaration.computed
+    if not found:
+        allowed = ("names of variables, such as " + repr(next(iter(world.declaration.slices))),)
+        raise UnknownOption("outcomes", None, allowed)
+    return found
 
 
 def watched(outcome: Any) -> tuple[str, ...]:

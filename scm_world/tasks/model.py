@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Self, final
 
@@ -149,6 +150,9 @@ class ModelTask(Task):
         source = self.model if model is None else model
         if source is None:
             raise UnknownOption("model", None, ("a path, XML text, an MjSpec or an MjModel",))
+        if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
+            found = os.path.abspath(source) if os.path.exists(source) else str(source)
+            self.given, self.is_named = {"model": found, **settings}, True
         self.system = self._read(source)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep

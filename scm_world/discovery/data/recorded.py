@@ -19,7 +19,9 @@ from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode
 from scm_world.queries.outcomes import Outcome, column
-from scm_world.tasks import Building
+from scm_world.tasks import Building, TriFingerTask
+from scm_world.tasks.model import REWARD
+from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Exogenous, Variable
 from scm_world.variables.catalogue import PRESET
 from scm_world.world import World
@@ -29,8 +31,6 @@ NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRES
 
 MEASURES = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
 """States of a block, in the order in which they are listed."""
-
-ACTION = "action"
 
 
 def default_causes(world: World) -> tuple[str, ...]:
@@ -61,16 +61,22 @@ def default_causes(world: World) -> tuple[str, ...]:
 
 
 def default_outcomes(world: World, *, every_step: bool = False) -> tuple[Outcome, ...]:
-    """List what is measured, if nothing else is asked for: the blocks that move, and success.
+    """List what is measured, if nothing else is asked for.
+
+    Of the robot's tasks these are the blocks that move, and success; of any other system all
+    states, and what counts in it.
 
     Args:
         world: That is measured.
         every_step: Whether it is measured at every instant; then the joints are listed, too, since
             the robot is what moves the blocks.
     """
+    if not isinstance(world.task, TriFingerTask):
+        counted = (name for name in (REWARD, SUCCESS) if name in world.model)
+        return tuple(map(Outcome, (*world.declaration.slices, *counted)))
     joints = ("joint_positions", "joint_velocities") if every_step else ()
     states = [f"{block}.{measure}" for block in _tools(world) for measure in MEASURES]
-    names = (*joints, *states, "fractional_success")
+    names = (*joints, *states, FRACTION)
     return tuple(Outcome(name) for name in names if name in world.model)
 
 
@@ -90,7 +96,8 @@ def settable(world: World, patterns: Iterable[str]) -> tuple[str, ...]:
         UnknownVariable: A pattern names nothing that can be set.
     """
     model = world.model
-    names = [n for n in model if model.declared(model.target(n)).settable and n != ACTION]
+    actions = world.declaration.actions
+    names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
     for pattern in given:
         if not any(fnmatchcase(name, pattern) for name in names):
@@ -229,8 +236,8 @@ class Instants:
 
     @property
     def watched(self) -> tuple[str, ...]:
-        """Variables to write down on the way; the action is always one of them."""
-        return tuple(dict.fromkeys((*self.names, ACTION)))
+        """Variables to write down on the way; the actions are always among them."""
+        return tuple(dict.fromkeys((*self.names, *self.world.declaration.actions)))
 
     def targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
         """Name what is set in the row of a control step: a state is at the first one only."""
@@ -242,7 +249,7 @@ class Instants:
         parts = [
             # At an instant the world still has the action of the step before.
             np.asarray(episode[name], float)[1:]
-            if name == ACTION
+            if name in self.world.declaration.actions
             else sensors.instants(episode, name)[:-1]
             for name in self.watched
         ]

@@ -37,7 +37,8 @@ class Sensors:
     """
 
     def __init__(self, world: World, names: Iterable[str]) -> None:
-        self._half = {name: half_range(world, name) for name in names}
+        sensed = tuple(names) if SENSOR_NOISE in world.model else ()
+        self._half = {name: half_range(world, name) for name in sensed}
 
     def read(self, episode: Episode, outcome: Outcome) -> Floats:
         """Read what an episode came to."""
@@ -62,7 +63,8 @@ class Sensors:
         return self._sensed(episode, name, range(episode.steps + 1))
 
     def _is_noisy(self, episode: Episode, name: str) -> bool:
-        return bool(self._half[name].any()) and bool(np.any(episode[SENSOR_NOISE]))
+        half = self._half.get(name)
+        return half is not None and bool(half.any()) and bool(np.any(episode[SENSOR_NOISE]))
 
     def _sensed(self, episode: Episode, name: str, steps: Iterable[int]) -> Floats:
         """Add noise at some instants; the same whatever else is read, and when."""
