@@ -379,10 +379,15 @@ class InMemory(Backend, ABC):
 
 @final
 class StepFunction(InMemory):
-    """Realises a ``StepModel``."""
+    """Realises a ``StepModel``.
+
+    Attributes:
+        numbers: The parameters in the order of declaration, flat, shape (p,).
+    """
 
     name: ClassVar[str] = "step"
     capabilities: ClassVar[Capabilities] = Capabilities(batch=True)
+    numbers: Floats
     _asked: StepModel | None = None
 
     def build(self, scene: Scene) -> None:
@@ -417,20 +422,18 @@ class StepFunction(InMemory):
                 question, which is tried in the first step. The state is as before.
         """
         _require_controls(mode)
-        now = self.numbers[None], self._state.vector[None], np.atleast_2d(command)
+        parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
         if self._asked is not self._structure:
-            _refuse_memory(self._structure, *now)
+            _refuse_memory(self._structure, parameters, states, commands)
             self._asked = self._structure
-        parameters, states, commands = now
         for _ in range(substeps):
             states = self._structure.advance(parameters, states, commands)
         self._state.vector[:] = states[0]
 
-    @property
-    def numbers(self) -> Floats:
-        """The parameters in the order of declaration, flat, shape (p,)."""
+    def _keep(self, parameters: Parameters) -> None:
+        super()._keep(parameters)
         parts = [self._parameters[quantity.key].ravel() for quantity in self._structure.parameters]
-        return np.concatenate([*parts, np.empty(0)])
+        self.numbers = np.concatenate([*parts, np.empty(0)])
 
     @classmethod
     def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
