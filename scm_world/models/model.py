@@ -14,6 +14,8 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from scm_world.errors import ModelError
+from scm_world.models.bodies import Bodies
 from scm_world.models.scene import ParameterKey, Scene
 from scm_world.models.state import State, StateLayout
 
@@ -131,6 +133,8 @@ class Model:
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
         notes: What acts without having a variable (plugins, flex), one sentence each.
+        describe: Gives the ``Bodies`` of the model, for engines that do not read its source. It
+            can be pickled.
     """
 
     name: str
@@ -144,12 +148,16 @@ class Model:
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
+    describe: Callable[[Model], Bodies] | None = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @property
     def n_commands(self) -> int:
@@ -166,6 +174,17 @@ class Model:
             sizes,
             tuple(np.concatenate([*start, np.empty(0)]).tolist()),
         )
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """The bodies in plain words.
+
+        Raises:
+            ModelError: Nobody can describe them.
+        """
+        if self.describe is None:
+            raise ModelError([f"the bodies of {self.name!r} are not described; read it from a file"])
+        return self.describe(self)
 
     def empty_state(self) -> State:
         """Give a state to read into."""

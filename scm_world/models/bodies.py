@@ -1,0 +1,260 @@
+"""The bodies of a model, for engines that do not read its file: what moves how, and is driven how.
+
+Frames, axes and joint coordinates are as in MJCF: bodies are given in the frame of their parent,
+with every joint at its reference; joints of one body act one after another, each in the frame
+that those before it have moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, NamedTuple, final
+
+from scm_world._types import Floats
+from scm_world.models.scene import ParameterKey
+
+Vector = tuple[float, float, float]
+Rotation = tuple[float, float, float, float]
+"""A unit quaternion (x, y, z, w)."""
+
+
+@final
+@dataclass(frozen=True)
+class Body:
+    """A rigid body.
+
+    Attributes:
+        name: As contacts and errors call it.
+        parent: Number of the body that carries it; the world is body 0 and its own parent.
+        position: Of its frame in that of the parent [m].
+        orientation: The same.
+        mass: [kg].
+        inertia: Principal moments [kg m²].
+        center: Center of mass in its frame [m].
+        axes: From the principal axes of inertia to its frame.
+    """
+
+    name: str
+    parent: int
+    position: Vector
+    orientation: Rotation
+    mass: float
+    inertia: Vector
+    center: Vector
+    axes: Rotation
+
+
+@final
+@dataclass(frozen=True)
+class Joint:
+    """What a body can do relative to its parent.
+
+    Attributes:
+        name: As errors call it.
+        kind: How it moves.
+        body: Number of the body.
+        start: Where its numbers begin in the state: first where it is, then its velocity. A
+            hinge or slide has one and one; a ball an orientation (4) and an angular velocity in
+            the frame of the body (3); a free body the position of its frame (3), orientation (4),
+            velocity of that frame's origin (3) and angular velocity in its own frame (3).
+        position: A point on its axis, in the frame of the body [m].
+        axis: Unit vector in that frame, of hinges and slides.
+        reference: Coordinate at which the body is where it is given [rad] or [m].
+        range: Lowest and highest coordinate; None where there is no limit.
+        damping: [N m s/rad] or [N s/m].
+        stiffness: Of the spring [N m/rad] or [N/m].
+        rest: Coordinate at which the spring is at rest.
+        friction: Loss to dry friction [N m] or [N].
+        armature: Inertia of the motor [kg m²] or [kg].
+        effort: Smallest and largest force that all actuators exert together; None if any.
+    """
+
+    name: str
+    kind: Literal["hinge", "slide", "ball", "free"]
+    body: int
+    start: int
+    position: Vector = (0.0, 0.0, 0.0)
+    axis: Vector = (0.0, 0.0, 1.0)
+    reference: float = 0.0
+    range: tuple[float, float] | None = None
+    damping: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    friction: float = 0.0
+    armature: float = 0.0
+    effort: tuple[float, float] | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Geom:
+    """A shape that bodies touch with. Shapes that touch nothing are left out.
+
+    Attributes:
+        name: As errors call it.
+        kind: Capsules and cylinders lie along the third axis; a plane is the half space below it.
+        body: Number of the body.
+        position: Of its frame in that of the body [m].
+        orientation: The same.
+        size: Half edges of a box; radius of a sphere; radius and half length of a capsule (of
+            its straight part) or cylinder [m]; nothing of a plane or mesh.
+        vertices: Corners of the convex hull of a mesh, shape (n, 3) [m].
+        friction: Sliding coefficient.
+        slippery: Whether it asks for contacts without friction.
+        priority: The shape with the higher one decides about the friction of a contact.
+    """
+
+    name: str
+    kind: Literal["plane", "sphere", "capsule", "cylinder", "box", "mesh"]
+    body: int
+    position: Vector
+    orientation: Rotation
+    size: tuple[float, ...] = ()
+    vertices: Floats | None = None
+    friction: float = 1.0
+    slippery: bool = False
+    priority: int = 0
+
+
+@final
+@dataclass(frozen=True)
+class Actuator:
+    """A force on one joint, from a number that is commanded.
+
+    With length ``l = gear * coordinate`` and its rate ``r``, the force is
+    ``(gain[0] + gain[1] l + gain[2] r) control + bias[0] + bias[1] l + bias[2] r``, and the
+    joint feels ``gear`` times as much.
+
+    Attributes:
+        name: As errors call it.
+        joint: Number of the joint.
+        control: Which component of the command it follows.
+        gear: One number; three for a ball, about the axes of the body.
+        gain: See above.
+        bias: See above; zeros for a ball.
+        control_range: To which commands are cut; None if they are not.
+        force_range: To which the force is cut; None if it is not.
+    """
+
+    name: str
+    joint: int
+    control: int
+    gear: tuple[float, ...] = (1.0,)
+    gain: Vector = (1.0, 0.0, 0.0)
+    bias: Vector = (0.0, 0.0, 0.0)
+    control_range: tuple[float, float] | None = None
+    force_range: tuple[float, float] | None = None
+
+
+class Part(NamedTuple):
+    """Where a number of a parameter stands in a row.
+
+    Attributes:
+        field: Of the row.
+        component: Which number of the field; None for all of it.
+        sign: 1, or -1 where the row has the opposite of the parameter.
+    """
+
+    field: str
+    component: int | None = None
+    sign: float = 1.0
+
+
+class Place(NamedTuple):
+    """Where a parameter stands in the description.
+
+    Attributes:
+        table: ``"bodies"``, ``"joints"``, ``"geoms"`` or ``"actuators"``; ``""`` for what all
+            bodies share.
+        row: Number in that table.
+        parts: What it is there.
+    """
+
+    table: str
+    row: int
+    parts: tuple[Part, ...]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """All of a model that an engine needs to build and to drive it.
+
+    Attributes:
+        bodies: In an order in which parents come before their children; the world first.
+        joints: In the order in which they act.
+        geoms: What can touch something.
+        actuators: What follows commands.
+        touching: The pairs of geoms that may touch each other, in ascending order.
+        gravity: [m/s²].
+        timestep: Physics step [s].
+        places: Where the parameters of the model stand in here; those that are missing have no
+            meaning to this description.
+        missing: What acts in the model and has no words here, one sentence each.
+        notes: What is left out because it matters little, one sentence each.
+    """
+
+    bodies: tuple[Body, ...]
+    joints: tuple[Joint, ...]
+    geoms: tuple[Geom, ...]
+    actuators: tuple[Actuator, ...]
+    touching: tuple[tuple[int, int], ...]
+    gravity: Vector
+    timestep: float
+    places: Mapping[ParameterKey, Place] = field(default_factory=dict, repr=False)
+    missing: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def with_parameters(self, values: Mapping[ParameterKey, Any]) -> Bodies:
+        """Give the same bodies with other values of some parameters, which have a place here.
+
+        Args:
+            values: Numbers, or sequences of them.
+        """
+        tables = {
+            table.name: list(getattr(self, table.name))
+            for table in fields(self)
+            if table.name in ("bodies", "joints", "geoms", "actuators")
+        }
+        shared: dict[str, Any] = {}
+        for key, value in values.items():
+            table, row, parts = self.places[key]
+            plain = tuple(value) if isinstance(value, Sequence) else float(value)
+            if not table:
+                shared[parts[0].field] = plain
+                continue
+            changes: dict[str, Any] = {}
+            for part in parts:
+                changes[part.field] = _with_part(tables[table][row], part, plain)
+                tables[table][row] = replace(tables[table][row], **changes)
+        return replace(self, **{name: tuple(rows) for name, rows in tables.items()}, **shared)
+
+    def moving(self) -> tuple[int, ...]:
+        """Give for each body the one at the root of all that moves with it; 0 if it is fixed."""
+        jointed = {joint.body for joint in self.joints}
+        roots = [0]
+        for number, body in enumerate(self.bodies[1:], start=1):
+            roots.append(roots[body.parent] or (number if number in jointed else 0))
+        return tuple(roots)
+
+    def joints_of(self, body: int) -> Iterator[int]:
+        """List the joints between a body and its parent."""
+        return (number for number, joint in enumerate(self.joints) if joint.body == body)
+
+    def friction(self, first: int, second: int) -> float:
+        """Give the sliding coefficient of contacts between two geoms."""
+        one, other = self.geoms[first], self.geoms[second]
+        if one.priority != other.priority:
+            decides = one if one.priority > other.priority else other
+            return 0.0 if decides.slippery else decides.friction
+        return 0.0 if one.slippery and other.slippery else max(one.friction, other.friction)
+
+
+def _with_part(row: Any, part: Part, value: Any) -> Any:
+    """Give a field of a row with another value, or with one other number in it."""
+    if part.component is None:
+        return value
+    numbers = list(getattr(row, part.field))
+    numbers[part.component] = part.sign * value
+    return tuple(numbers)
