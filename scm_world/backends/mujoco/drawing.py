@@ -17,6 +17,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.backend import MujocoBackend
+from scm_world.backends.mujoco.reading import body_names
 from scm_world.geometry import rotation_matrix
 from scm_world.models.scene import Goal, Scene
 from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, mesh_of
@@ -56,7 +57,7 @@ class Drawing:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = model
-        self.names = tuple(model.body(i).name or f"body_{i}" for i in range(model.nbody))
+        self.names = body_names(model)
         _hide_what_collides(model)
         self._scene = mujoco.MjvScene(model, MOST_SHAPES)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()

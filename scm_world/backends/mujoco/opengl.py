@@ -36,11 +36,10 @@ context.free()
 """
 
 
-@lru_cache(maxsize=1)
 def opengl() -> str | None:
     """Name the library with which MuJoCo can draw here without a screen; None if none can.
 
-    They are tried once, in another process, since a driver that fails can end its process. The
+    Each is tried once, in another process, since a driver that fails can end its process. The
     environment variable ``MUJOCO_GL`` can name one of them, or forbid all with ``disabled``.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
@@ -49,6 +48,7 @@ def opengl() -> str | None:
     return next(filter(_works, [wanted] if wanted in LIBRARIES else LIBRARIES), None)
 
 
+@lru_cache(maxsize=len(LIBRARIES))
 def _works(library: str) -> bool:
     """Make a context of a library in another process, and free it."""
     try:

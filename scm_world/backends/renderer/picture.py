@@ -230,8 +230,8 @@ def automatic_camera(*scenes: Scene, size: tuple[int, int] = (480, 640)) -> Came
 def following_camera(camera: Camera, scene: Scene) -> Camera:
     """Move a camera along with what moves in the scene of a model, for the next picture of a film.
 
-    It keeps its direction and its height, and stays where it is as long as the middle of what
-    moves is near the middle of the picture.
+    It keeps its direction, and stays where it is as long as the middle of what moves is near the
+    middle of the picture.
 
     Args:
         camera: That of the last picture.

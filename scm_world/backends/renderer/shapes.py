@@ -52,11 +52,9 @@ AUTOMATIC = "automatic"
 """The name of a camera that is placed here."""
 
 FIELD_OF_VIEW = 40.0  # [deg] of an automatic camera
-MARGIN = 1.2  # how much more an automatic camera sees than it has to
+MARGIN = 1.3  # how much more an automatic camera sees than it has to
 AROUND = 2.0  # how much larger the square of a shadow is than that of what moves
-STILL = (
-    0.25  # [1] of the distance: how far what moves may leave the middle of a camera that follows
-)
+STILL = 0.05  # of the distance: how far from the middle of a picture is near it
 
 
 def draw_shapes(
@@ -225,28 +223,20 @@ def framing(
 
 
 def following(camera: Camera, shapes: Sequence[Shape]) -> Camera:
-    """Move a camera along with what moves, once that is far from the middle of the picture.
-
-    It moves in the horizontal only, and keeps its direction.
+    """Move a camera along with what moves, once that is away from the middle of the picture.
 
     Args:
-        camera: Where the last picture was taken from.
+        camera: That of the last picture; it keeps its direction.
         shapes: What there is now.
     """
     points = _corners_of_what_moves(shapes)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    away = (middle - camera.target)[:2]
-    free = STILL * float(np.linalg.norm(np.subtract(camera.eye, camera.target)))
-    off = float(np.linalg.norm(away))
+    eye, target = np.array(camera.eye), np.array(camera.target)
+    away = (points.min(axis=0) + points.max(axis=0)) / 2.0 - target
+    free, off = STILL * np.linalg.norm(eye - target), np.linalg.norm(away)
     if off <= free:
         return camera
-    x, y = away * (1.0 - free / off)
-    eye, target = camera.eye, camera.target
-    return replace(
-        camera,
-        eye=(eye[0] + x, eye[1] + y, eye[2]),
-        target=(target[0] + x, target[1] + y, target[2]),
-    )
+    step = away * (1.0 - free / off)
+    return replace(camera, eye=tuple((eye + step).tolist()), target=tuple((target + step).tolist()))
 
 
 def _looking(name: str, at: Floats, offset: Floats, size: tuple[int, int]) -> Camera:
