@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-import pickle
 import runpy
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +30,8 @@ from scm_world.errors import (
     OutOfBounds,
     UnknownOption,
 )
+from scm_world.testing import model
 from scm_world.variables import Affine, Categories, Integers, Normal
-from scm_world.world import Batch
 
 N, DT = 5, 0.1
 WIDE = Box(-5.0, 5.0)
@@ -167,23 +166,6 @@ def test_a_counterfactual_reaches_only_who_is_near() -> None:
         assert moved[0] == reached
 
 
-def test_a_batch_is_like_single_worlds() -> None:
-    """Worlds with different parameters that are stepped together do what each does alone."""
-    alone, many = [chain_world() for _ in range(4)], [chain_world() for _ in range(4)]
-    for seed, world in itertools.chain(enumerate(alone), enumerate(many)):
-        world.reset(seed=seed, do={"mass2.mass": 0.6 + 0.2 * seed})
-    batch = Batch(many)
-    draws = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 4, 1))
-    for actions in draws:
-        batch.advance(actions)
-        for world, action in zip(alone, actions, strict=True):
-            world.step(action)
-    for index, world in enumerate(alone):
-        there = batch.world(index)
-        for name, value in world.values().items():
-            np.testing.assert_array_equal(there[name], value)
-
-
 def test_the_example_declares_its_graph_rightly() -> None:
     """Predator and prey: every edge of the equations is found, and no other one."""
     example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "predator_prey.py"))
@@ -237,7 +219,7 @@ def shop_world(**options: Any) -> World:
         "control_dt": 1.0,
         "noise": {"customers": Integers(0, 4)},
         "outcomes": [Measured(name="full", parents=("stock",), mechanism=np.sum)],
-        "reward": (lambda full, price: full * price, "full", "price"),
+        "reward": (np.multiply, "full", "price"),
     }
     return World.from_step(shop, **{**given, **options})
 
@@ -305,38 +287,35 @@ def test_what_is_refused_changes_nothing(request_: dict[str, Any], error: type[E
     }
 
 
-def test_undoing_leaves_no_trace() -> None:
-    """Everything that can be set is set and set back: later steps are the same to the bit."""
-    world, twin = shop_world(), shop_world()
-    others = {"season": 1, "taste": [2.0, 0.5], "stock": [3.0, 4.0], "customers": 9}
-    for one in (world, twin):
-        one.reset(seed=4)
-        one.step([1.0, 1.0, 1.0])
-    for name, value in others.items():
-        before = world[name]
-        world.do({name: value})
-        world.do({name: before})
-    for _ in range(10):
-        for one in (world, twin):
-            one.step([1.5, 0.5, 1.0])
-        assert world["stock"].tolist() == twin["stock"].tolist()
-        assert world["customers"] == twin["customers"]
+# --- what holds for every world -------------------------------------------------------------------
 
 
-def test_snapshots_and_copies_continue_bit_for_bit() -> None:
-    """A world that is restored goes on as it did."""
-    world = chain_world()
-    world.reset(seed=5, do={"mass1.mass": 0.7})
-    world.step([0.3])
-    saved = pickle.loads(pickle.dumps(world.snapshot()))  # noqa: S301 # our own
-    copy = pickle.loads(pickle.dumps(world))  # noqa: S301 # our own
-    other = chain_world()
-    other.restore(saved)
-    for _ in range(5):
-        for one in (world, other, copy):
-            one.step([-0.4])
-    for name, value in world.values().items():
-        assert value.tobytes() == other[name].tobytes() == copy[name].tobytes()
+@pytest.mark.parametrize("make", [chain_world, shop_world])
+class TestEveryWorld:
+    """The promises of a world, kept by one with noise and one with whole numbers."""
+
+    def test_undo_is_exact(self, make: Callable[[], World]) -> None:
+        """Every variable is set and set back: later steps are the same to the bit."""
+        world = make()
+        assert model.check_undo(world) == (len(model.settable(world)), 0.0)
+
+    def test_refusals_and_counterfactuals(self, make: Callable[[], World]) -> None:
+        """A refusal leaves no trace, and a counterfactual of nothing is what happened."""
+        assert model.check_refusal(make()) > 0
+        model.check_counterfactual(make())
+
+    def test_elsewhere(self, make: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+        """A pickled world and its snapshot go on alike in another process."""
+        monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        model.check_snapshot_elsewhere(make())
+
+    def test_batches(self, make: Callable[[], World]) -> None:
+        """Worlds that are stepped together are like single ones."""
+        model.check_batch(make, n=5)
+
+    def test_endurance(self, make: Callable[[], World]) -> None:
+        """Random actions and interventions are survived."""
+        assert model.check_endurance(make(), steps=300) == (300, "")
 
 
 # --- chance ---------------------------------------------------------------------------------------
