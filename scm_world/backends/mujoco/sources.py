@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
-from xml.etree import ElementTree
+from xml.sax.saxutils import escape
 
 import mujoco
 import numpy as np
@@ -55,12 +57,13 @@ class Source:
         """Compile it, with the options that were asked for.
 
         Raises:
-            ValueError: MuJoCo refuses it.
+            ModelError: MuJoCo refuses it.
         """
-        if self.binary:
-            mj = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": self.binary})
-        else:
-            mj = mujoco.MjSpec.from_string(self.text, assets=dict(self.assets)).compile()
+        with understood("the model"):
+            if self.binary:
+                mj = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": self.binary})
+            else:
+                mj = mujoco.MjSpec.from_string(self.text, assets=dict(self.assets)).compile()
         for name, value in self.options:
             setattr(mj.opt, name, type(getattr(mj.opt, name))(value))
         return mj
@@ -91,15 +94,16 @@ def read_source(
         name = source.names.split(b"\0", 1)[0].decode()
         return _sealed("", {}, binary.tobytes(), chosen), name, "the MjModel"
     if isinstance(source, mujoco.MjSpec):
-        spec, where = source.copy(), "the MjSpec"
-        folder, given = source.modelfiledir, dict(source.assets)
-    elif _is_text(source):
-        spec, where = _parsed(str(source), None, fixed_base), "the XML text"
-        folder, given = "", {}
+        where, folder, stem = "the MjSpec", Path(source.modelfiledir), ""
+        spec, urdf = source.copy(), False
+    elif isinstance(source, str) and source.lstrip().startswith("<"):
+        where, folder, stem = "the XML text", Path(), ""
+        spec, urdf = _parsed(source, where), _root_tag(source) == "robot"
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
-        spec, where = _parsed(_contents(path), path, fixed_base), str(path)
-        folder, given = str(path.parent), {}
+        where, folder, stem = str(path), path.parent, path.stem
+        text = _contents(path)
+        spec, urdf = _parsed(text, where, path), _root_tag(text) == "robot"
     else:
         raise ModelError(
             [
@@ -107,13 +111,15 @@ def read_source(
                 "a mujoco.MjSpec or a mujoco.MjModel"
             ]
         )
-    name = spec.modelname or (Path(where).stem if isinstance(source, str | os.PathLike) else "")
-    assets = _collected(spec, folder, given, where)
-    return _sealed(_written(spec, where), assets, b"", chosen), name, where
-
-
-def _is_text(source: Any) -> bool:
-    return isinstance(source, str) and source.lstrip().startswith("<")
+    name = spec.modelname or stem
+    if not fixed_base and urdf:
+        for body in spec.worldbody.bodies:  # MuJoCo fixes the root link to the world
+            if not body.joints:
+                body.add_freejoint()
+    files = _located(spec, folder, where)
+    if urdf:
+        _repair(spec, where)
+    return _sealed(*_written(spec, files, where), b"", chosen), name, where
 
 
 def _contents(path: Path) -> str:
@@ -125,186 +131,157 @@ def _contents(path: Path) -> str:
     advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
     try:
         return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or f"it is no text ({error})"
-        raise UnreadableFile(str(path), reason, advice) from error
+    except OSError as error:
+        raise UnreadableFile(str(path), (error.strerror or "?").lower(), advice) from error
+    except UnicodeDecodeError as error:
+        raise UnreadableFile(str(path), "it is no text", advice) from error
 
 
-def _parsed(text: str, path: Path | None, fixed_base: bool) -> mujoco.MjSpec:
+def _root_tag(text: str) -> str:
+    """Give the outermost tag of an XML text; ``""`` if there is none."""
+    plain = re.sub(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", "", text, flags=re.DOTALL)
+    found = re.search(r"<\s*([\w:.-]+)", plain)
+    return found[1] if found else ""
+
+
+def _parsed(text: str, where: str, path: Path | None = None) -> mujoco.MjSpec:
     """Parse MJCF or URDF.
 
     Raises:
         ModelError: It is neither, or MuJoCo does not understand it.
     """
-    where = "the XML text" if path is None else str(path)
-    try:
-        root = ElementTree.fromstring(text)  # noqa: S314 # only its outermost tags are looked at
-    except ElementTree.ParseError as error:
-        raise ModelError([f"{where} is not well-formed XML: {error}; correct it there"]) from error
-    if root.tag == "robot":
-        return _urdf(root, path, fixed_base, where)
-    if root.tag != "mujoco":
-        raise ModelError([f"{where} begins with <{root.tag}>, not with <mujoco> or <robot>"])
-    try:
-        if path is not None:
+    tag = _root_tag(text)
+    if tag not in ("mujoco", "robot"):
+        raise ModelError(
+            [
+                f"{where} begins with <{tag}>: give MJCF, which begins with <mujoco>, or URDF, "
+                "which begins with <robot>"
+            ]
+        )
+    with understood(where):
+        if path is not None and path.suffix.lower() in (".xml", ".urdf"):
             return mujoco.MjSpec.from_file(str(path))
-        return mujoco.MjSpec.from_string(text)
-    except (ValueError, mujoco.FatalError) as error:
-        raise _refused(where, error) from error
+        included = {} if path is None else dict(_included(text, path.parent))
+        return mujoco.MjSpec.from_string(text, include=included)
 
 
-def _refused(where: str, error: Exception) -> ModelError:
-    said = " ".join(str(error).split())
-    hint = "correct the file"
-    if "opening file" in said or "not found" in said.lower():
-        hint = "put the file there, or correct the path to it (meshdir, texturedir, include)"
-    return ModelError([f"MuJoCo cannot read {where}: {said}; {hint}"])
+def _included(text: str, folder: Path) -> Iterator[tuple[str, bytes]]:
+    """Read the files that an MJCF text includes, and those that they include."""
+    for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", text):
+        path = folder / name
+        if path.is_file():
+            content = path.read_bytes()
+            yield name, content
+            yield from _included(content.decode(errors="replace"), folder)
 
 
-# --- URDF --------------------------------------------------------------------------------------
+@contextmanager
+def understood(where: str) -> Iterator[None]:
+    """Turn MuJoCo's complaints about a model into one error, and keep its warnings.
 
-
-def _urdf(
-    root: ElementTree.Element, path: Path | None, fixed_base: bool, where: str
-) -> mujoco.MjSpec:
-    """Parse a URDF with the paths of its meshes relative to the file.
-
-    Inertias that no body can have are balanced, and masses that are missing bounded, as MuJoCo's
-    compiler does when it is asked to.
+    Raises:
+        ModelError: With what MuJoCo said.
     """
-    folder = Path() if path is None else path.parent
-    problems = []
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        found = _mesh_path(name, folder)
-        if found is None:
-            problems.append(
-                f"{where} names the mesh {name!r}, which is not there; put it beside the file, or "
-                "write its path relative to the file"
-            )
-        else:
-            mesh.set("filename", str(found.resolve()))
-    if problems:
-        raise ModelError(list(dict.fromkeys(problems)))
-    extension = root.find("mujoco")
-    if extension is None:
-        extension = ElementTree.SubElement(root, "mujoco")
-    compiler = extension.find("compiler")
-    if compiler is None:
-        compiler = ElementTree.SubElement(extension, "compiler")
-    compiler.set("strippath", "false")
-    for name in ("meshdir", "texturedir"):
-        compiler.attrib.pop(name, None)
-    compiler.attrib.setdefault("balanceinertia", "true")
     try:
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-        if not fixed_base:
-            for body in spec.worldbody.bodies:  # MuJoCo fixes the root link to the world
-                if not body.joints:
-                    body.add_freejoint()
-        _bound_masses(spec)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
     except (ValueError, mujoco.FatalError) as error:
-        raise _refused(where, error) from error
-    return spec
-
-
-def _mesh_path(name: str, folder: Path) -> Path | None:
-    """Find a mesh: where it is said to be, or below a folder above the file."""
-    plain = re.sub(r"^(package|model|file)://", "", name)
-    candidates = [folder / plain]
-    candidates += [above / plain for above in (folder, *folder.resolve().parents)]
-    if plain != name:  # a package is often the folder that the file is in
-        inside = Path(*Path(plain).parts[1:])
-        candidates += [above / inside for above in (folder, *folder.resolve().parents)]
-    candidates.append(folder / Path(plain).name)
-    return next((path for path in candidates if path.is_file()), None)
-
-
-def _bound_masses(spec: mujoco.MjSpec) -> None:
-    """Give links without mass a small one, if the model cannot be compiled without."""
-    try:
-        spec.copy().compile()
-    except ValueError as error:
-        if "mass and inertia" not in str(error):
+        if isinstance(error, ModelError):
             raise
-        spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
+        said = " ".join(str(error).split())
+        lost = "opening file" in said or "decoder" in said
+        remedy = "put the file there, or correct the path to it" if lost else "correct the model"
+        raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
 
 
-# --- sealing -----------------------------------------------------------------------------------
+# --- files -------------------------------------------------------------------------------------
 
 
-def _collected(
-    spec: mujoco.MjSpec, folder: str, given: Mapping[str, bytes], where: str
-) -> dict[str, bytes]:
-    """Read the files that a specification names, and let it name them without folders.
+def _located(spec: mujoco.MjSpec, folder: Path, where: str) -> dict[str, str]:
+    """Find the files that a specification names, and let it name them by absolute paths.
+
+    Returns:
+        A short name for each path. Files that a specification was given in memory keep theirs.
 
     Raises:
         ModelError: Some are not there.
     """
-    found: dict[str, bytes] = {}
-    numbers: dict[str, str] = {}
+    found: dict[str, str] = {}
     problems = []
 
-    def keep(name: str, directory: str) -> str:
-        if not name:
+    def locate(name: str, directory: str) -> str:
+        inner = os.path.join(directory, name)
+        if not name or name in spec.assets or inner in spec.assets:
+            return inner if inner in spec.assets else name
+        path = _path(name, directory, folder)
+        if path is None:
+            problems.append(
+                f"{where} names the file {name!r}, which is not in {str(folder / directory)!r}; "
+                "put it there, or correct the path"
+            )
             return name
-        full = os.path.join(folder, directory, name)
-        if full not in numbers:
-            base = os.path.basename(name)
-            numbers[full] = f"{len(numbers)}_{base}"
-            content = _content(name, directory, full, given)
-            if content is None:
-                problems.append(
-                    f"{where} names the file {name!r}, which is not at {full!r}; put it there, or "
-                    "correct the path (meshdir, texturedir)"
-                )
-            else:
-                found[numbers[full]] = content
-        return numbers[full]
+        full = str(path.resolve())
+        found.setdefault(full, f"{len(found)}_{path.name}")
+        return full
 
-    for element, directory in _with_files(spec):
-        element.file = keep(element.file, directory)
+    for element in (*spec.meshes, *spec.hfields, *spec.skins):
+        element.file = locate(element.file, spec.meshdir)
     for texture in spec.textures:
-        files = list(texture.cubefiles)
-        if any(files):
-            for i, name in enumerate(files):
-                texture.cubefiles[i] = keep(name, spec.texturedir)
+        texture.file = locate(texture.file, spec.texturedir)
+        for i, name in enumerate(texture.cubefiles):
+            if name:
+                texture.cubefiles[i] = locate(name, spec.texturedir)
     if problems:
-        raise ModelError(problems)
+        raise ModelError(list(dict.fromkeys(problems)))
     spec.meshdir = spec.texturedir = ""
     return found
 
 
-def _with_files(spec: mujoco.MjSpec) -> Iterator[tuple[Any, str]]:
-    """List what may be read from a file, and the folder in which that is."""
-    for element in (*spec.meshes, *spec.hfields, *spec.skins):
-        yield element, spec.meshdir
-    for texture in spec.textures:
-        yield texture, spec.texturedir
+def _path(name: str, directory: str, folder: Path) -> Path | None:
+    """Find a file; one in a package beside the model, or in a folder above it."""
+    plain = re.sub(r"^(package|model|file)://", "", name)
+    candidates = [folder / directory / plain]
+    if plain != name:
+        above = [folder, *folder.resolve().parents]
+        inside = Path(*Path(plain).parts[1:])
+        candidates += [root / part for part in (plain, inside) for root in above]
+    return next((path for path in candidates if path.is_file()), None)
 
 
-def _content(name: str, directory: str, full: str, given: Mapping[str, bytes]) -> bytes | None:
-    for key in (name, os.path.join(directory, name), os.path.basename(name)):
-        if key in given:
-            return given[key]
+def _repair(spec: mujoco.MjSpec, where: str) -> None:
+    """Let the compiler balance and bound the inertias of a URDF, where it needs to."""
+    spec.compiler.balanceinertia = True
     try:
-        return Path(full).read_bytes()
-    except OSError:
-        return None
+        with understood(where):
+            spec.copy().compile()
+    except ModelError as error:
+        if "inertia" not in str(error):
+            raise
+        spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
 
 
-def _written(spec: mujoco.MjSpec, where: str) -> str:
-    """Write a specification as MJCF that compiles to the same model, to the last bit."""
+def _written(
+    spec: mujoco.MjSpec, files: Mapping[str, str], where: str
+) -> tuple[str, dict[str, bytes]]:
+    """Write a specification as MJCF that compiles to the same model, to the last bit.
+
+    Returns:
+        The text, and the contents of the files it names.
+    """
     if hasattr(spec.compiler, "savecompiled"):
         spec.compiler.savecompiled = False
-    try:
+    with understood(where):
         try:
-            return str(spec.to_xml())
-        except (ValueError, mujoco.FatalError):  # it has to be compiled before it is written
+            text = str(spec.to_xml())
+        except (ValueError, mujoco.FatalError):  # some have to be compiled before
             spec.compile()
-            return str(spec.to_xml())
-    except (ValueError, mujoco.FatalError) as error:
-        raise _refused(where, error) from error
+            text = str(spec.to_xml())
+    assets = dict(spec.assets)
+    for path, name in files.items():
+        text = text.replace(f'"{escape(path)}"', f'"{name}"')
+        assets[name] = Path(path).read_bytes()
+    return text, assets
 
 
 def _sealed(
@@ -332,14 +309,13 @@ def _options(given: Mapping[str, Any]) -> tuple[tuple[str, float], ...]:
     found = []
     for name, value in sorted(given.items()):
         if name in _CHOICES:
-            prefix = {"integrator": "mjINT_", "solver": "mjSOL_", "cone": "mjCONE_"}
             words = {
-                member.removeprefix(prefix.get(name, "mjJAC_")).lower(): int(kind)
+                member.partition("_")[2].lower(): float(int(kind))
                 for member, kind in _CHOICES[name].__members__.items()
             }
             if str(value).lower() not in words:
                 raise UnknownOption(name, value, words)
-            found.append((name, float(words[str(value).lower()])))
+            found.append((name, words[str(value).lower()]))
         elif name in _NUMBERS:
             found.append((name, float(value)))
         else:

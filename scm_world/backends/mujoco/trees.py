@@ -190,7 +190,7 @@ class Couplings:
         return found
 
     @cached_property
-    def _touches(self) -> NDArray[np.bool_]:
+    def touches(self) -> NDArray[np.bool_]:
         """Which shapes may touch, by their masks or because a pair says so."""
         found: NDArray[np.bool_] = self._dynamic.copy()
         if self._contacts_on:
@@ -200,7 +200,7 @@ class Couplings:
 
     def _touched(self, geom: int) -> Trees:
         """Give the trees that feel a shape: its own, or those that touch it if it is static."""
-        others = self._mj.geom_bodyid[np.flatnonzero(self._touches[geom])]
+        others = self._mj.geom_bodyid[np.flatnonzero(self.touches[geom])]
         body = int(self._mj.geom_bodyid[geom])
         meets = self._flexes_at(geom)
         if not (len(others) or meets):
@@ -224,7 +224,7 @@ class Couplings:
         mj = self._mj
         links: list[Iterable[int]] = [*self._couplings()]
         tree = np.where(self._moves, self._tree, -1)[mj.geom_bodyid]
-        for first, second in np.argwhere(np.triu(self._touches)):
+        for first, second in np.argwhere(np.triu(self.touches)):
             if tree[first] >= 0 and tree[second] >= 0 and tree[first] != tree[second]:
                 links.append((int(tree[first]), int(tree[second])))
         for flex in range(mj.nflex if self._contacts_on else 0):
