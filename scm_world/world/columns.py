@@ -68,7 +68,7 @@ class Table:
         parents = [p for name in self.computed for p in model.declared(name).all_parents]
         present = [p.name for p in parents if p.lag == 0]
         self._action = self._columns(None)
-        for name, part in self.declaration.actions.items():
+        for name, part in self.declaration.commanded.items():
             first = self._action.start
             self.where[name] = slice(first + part.start, first + part.stop)
         for name in (CONTROL_INDEX, *self.names, *self.computed, *present):
@@ -108,7 +108,8 @@ class Table:
         for name, place in self._still:
             numbers[place] = np.ravel(now[name])
         numbers[self.where[CONTROL_INDEX]] = world.index
-        self.act(row, np.concatenate([np.ravel(now[n]) for n in self.declaration.actions]))
+        parts = [np.ravel(now[name]) for name in self.declaration.actions]
+        self.act(row, np.concatenate([np.empty(0), *parts]))
         for name in self.lagged:
             numbers[self.where[name]] = np.ravel(now[name])
         for bound in self._equations:
