@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scm_world.backends import make_backend, read_model
+from scm_world.backends import EngineSnapshot, make_backend, read_model
 from scm_world.backends.mujoco import MujocoBackend
 from scm_world.errors import EngineFailure, Infeasible, UnknownOption
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
@@ -25,6 +25,7 @@ from scm_world.models import (
     Parameter,
     ParameterKey,
     Parameters,
+    Scene,
 )
 from scm_world.scene import Structure, default_scene
 
@@ -243,41 +244,48 @@ def test_what_cannot_move_is_refused_without_a_trace(
 # --- snapshots, processes, structures ----------------------------------------------------------
 
 CHILD = """
-import pickle, sys, numpy as np
+import pickle, sys
 sys.path.insert(0, sys.argv[1])
-from test_mujoco_models import MujocoBackend, play
-snapshot, scene = pickle.load(sys.stdin.buffer)
-backend = MujocoBackend()
-backend.restore(snapshot)
-found = [play(backend, 20)]
-backend.build(scene)
-found.append(play(backend, 20))
+from test_mujoco_models import futures
+found = [futures(*given) for given in pickle.load(sys.stdin.buffer)]
 sys.stdout.buffer.write(pickle.dumps(found))
 """
 
 
-@pytest.mark.parametrize("name", ["pile", "ball_in_cup", "reacher"])
-def test_another_process_continues_alike(name: str) -> None:
-    """A snapshot with changed parameters, and a scene, go on elsewhere bit for bit."""
-    backend, model = built(name), described(name)
-    rows = model.parameters[:: max(1, len(model.parameters) // 5)]
-    values = backend.parameters([row.key for row in rows])
-    new = {row.key: other_value(row, values[row.key]) for row in rows}
-    backend.apply(Difference(parameters=new))
-    play(backend, 2)
-    snapshot, default = backend.snapshot(), model.default_scene()
-    scene = default.with_(parameters={**default.parameters, **new}, state=backend.state())
-    here = [play(backend, 20)]
+def futures(snapshot: EngineSnapshot, scene: Scene) -> list[Floats]:
+    """Go on from a snapshot, and from a scene."""
+    backend = MujocoBackend()
+    backend.restore(snapshot)
+    first = play(backend, 20)
     backend.build(scene)
-    here.append(play(backend, 20))
+    return [first, play(backend, 20)]
+
+
+def test_another_process_continues_alike() -> None:
+    """Snapshots with changed parameters, and scenes, go on elsewhere bit for bit."""
+    given = []
+    for name in ("pile", "ball_in_cup", "reacher"):
+        backend, model = built(name), described(name)
+        rows = model.parameters[:: max(1, len(model.parameters) // 5)]
+        values = backend.parameters([row.key for row in rows])
+        new = {row.key: other_value(row, values[row.key]) for row in rows}
+        backend.apply(Difference(parameters=new))
+        play(backend, 2)
+        default = model.default_scene()
+        parameters = {**default.parameters, **new}
+        given.append(
+            (backend.snapshot(), default.with_(parameters=parameters, state=backend.state()))
+        )
     child = subprocess.run(  # noqa: S603 # our own interpreter, our own code
         [sys.executable, "-c", CHILD, str(Path(__file__).parent)],
-        input=pickle.dumps((snapshot, scene)),
+        input=pickle.dumps(given),
         capture_output=True,
         check=True,
     )
     there = pickle.loads(child.stdout)  # noqa: S301 # our own
-    assert all(np.array_equal(one, other) for one, other in zip(here, there, strict=True))
+    for pair, elsewhere in zip(given, there, strict=True):
+        for one, other in zip(futures(*pair), elsewhere, strict=True):
+            assert np.array_equal(one, other)
 
 
 def test_a_snapshot_restores_everything(name: str) -> None:
