@@ -205,24 +205,32 @@ def check_batch(make: Any, n: int = 16, steps: int = 10, threads: int = 2) -> No
         threads: Of the engine.
     """
 
-    def begun(index: int) -> World:
+    def begun(index: int, *, changed: bool) -> World:
         world: World = make()
         world.reset(seed=index)
         found = list(requests(world, seed=index))
         name, value = found[index % len(found)]
-        try:
-            world.do({name: value})
-        except InterventionError:
-            return world
+        if changed:
+            with contextlib.suppress(InterventionError):
+                world.do({name: value})
         return world
 
-    taken = np.stack([actions(begun(0), steps, seed) for seed in range(n)], axis=1)
-    singles = []
+    first = begun(0, changed=False)
+    taken = np.stack([actions(first, steps, seed) for seed in range(n)], axis=1)
+    first.close()
+    singles, stable = [], []
     for index in range(n):
-        world = begun(index)
-        singles.append(trajectory(world, taken[:, index])[-1])
+        world = begun(index, changed=True)
+        try:
+            singles.append(trajectory(world, taken[:, index])[-1])
+            stable.append(True)
+        except EngineFailure:  # the physics of this change explodes: then without it
+            world.close()
+            world = begun(index, changed=False)
+            singles.append(trajectory(world, taken[:, index])[-1])
+            stable.append(False)
         world.close()
-    batch = Batch([begun(index) for index in range(n)], threads=threads)
+    batch = Batch([begun(i, changed=stable[i]) for i in range(n)], threads=threads)
     for step in range(steps):
         batch.advance(taken[step])
     for index in range(n):
