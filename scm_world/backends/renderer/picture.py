@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.backends.renderer.arena import (
-    BACKGROUND,
     lamp,
     paint_arena,
     palette,
@@ -30,6 +29,7 @@ from scm_world.backends.renderer.kernels import Canvas, draw
 from scm_world.backends.renderer.shapes import (
     AUTOMATIC,
     GOAL_OPACITY,
+    SKY,
     draw_shapes,
     following,
     framing,
@@ -177,7 +177,7 @@ def picture(
         return render(scene, camera, samples=samples).rgb
     samples = max(samples, 2)
     fine = replace(camera, height=camera.height * samples, width=camera.width * samples)
-    return _average(draw_by_mujoco(scene, fine, BACKGROUND, library), samples)
+    return _average(draw_by_mujoco(scene, fine, SKY, library), samples)
 
 
 def scene_camera(
