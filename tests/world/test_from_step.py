@@ -235,6 +235,13 @@ def test_several_actions_are_one_command() -> None:
     assert world["reward"] == world["full"] * 2.0
 
 
+def test_every_kind_of_edge_is_seen() -> None:
+    """Categories, vectors, whole numbers, and an action that the reward depends on at once."""
+    report = verify(shop_world(), probes=16, least=4)
+    assert report.passed
+    assert ("price", "reward", 0) in report.found
+
+
 def test_integers_stay_integers_and_are_drawn_as_such() -> None:
     """A whole number is counted, set, read back and remembered as one."""
     world = shop_world()

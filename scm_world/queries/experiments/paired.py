@@ -340,6 +340,11 @@ class Paired:
         except EngineFailure:
             return
         self._compare_later(name, after, memory)
+        self._see_memory(name, {name: after[name]})
+        for reader, causes in self._readers[0].items():
+            if name in causes:
+                value = self._evaluate(reader, {**self._later, name: after[name]}, self._memory)
+                self.effects.see(name, reader, 0, value, self._later[reader])
 
     def _vary_readout(self, cause: str) -> None:
         """Give a readout another value, seen elsewhere, and watch what is computed from it.
