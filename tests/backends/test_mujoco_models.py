@@ -135,14 +135,21 @@ def others(model: Model, values: Parameters) -> dict[ParameterKey, Floats]:
     return {row.key: other_value(row, values[row.key]) for row in model.parameters}
 
 
+@cache
+def numeric(kind: type) -> tuple[str, ...]:
+    """Name the attributes that are properties of a compiled model or of a part of it."""
+    names = (name for name in dir(kind) if not name.startswith("_"))
+    return tuple(name for name in names if isinstance(getattr(kind, name), property))
+
+
 def arrays(model: mujoco.MjModel) -> dict[str, bytes]:
     """Copy every number of a compiled model."""
     found = {}
-    for name, part in (("", model), ("opt.", model.opt), ("stat.", model.stat)):
-        for key in dir(part):
+    for part in (model, model.opt, model.stat):
+        for key in numeric(type(part)):
             value = getattr(part, key)
-            if not key.startswith("_") and isinstance(value, (np.ndarray, float, int)):
-                found[name + key] = np.asarray(value).tobytes()
+            if isinstance(value, np.ndarray | float | int):
+                found[f"{type(part).__name__}.{key}"] = np.asarray(value).tobytes()
     return found
 
 
