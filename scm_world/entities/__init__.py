@@ -5,7 +5,7 @@ from scm_world.entities.blocks import ToolBlock, block_mass, block_size
 from scm_world.entities.goals import GoalBlock, GoalSphere, goal_orientation, goal_position
 from scm_world.entities.looks import Looks, cameras
 from scm_world.entities.obstacles import Obstacle
-from scm_world.entities.robot import ACTIONS, ACTUATOR_NOISE, Robot
+from scm_world.entities.robot import ACTIONS, ACTUATOR_NOISE, RESOLUTIONS, Robot
 from scm_world.entities.stage import CONTROL_INDEX, SENSOR_NOISE, Clock, Stage
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "ACTUATOR_NOISE",
     "CONTROL_INDEX",
     "PRESET_NAMES",
+    "RESOLUTIONS",
     "SENSOR_NOISE",
     "BlockWorld",
     "Clock",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
@@ -14,9 +15,19 @@ from scm_world.entities.blocks import color
 from scm_world.geometry.scalars import scalar
 from scm_world.graph import Moment
 from scm_world.scene import ControllerSpec, ParameterKey, trifinger
-from scm_world.scene.kinematics import forward_kernel, inverse_kernel
-from scm_world.scene.trifinger import N_JOINTS
-from scm_world.variables import Action, Box, Exogenous, Measured, Normal, Variable
+from scm_world.scene.kinematics import forward_kernel, inverse_kernel, tip_kernel
+from scm_world.scene.trifinger import FINGERS, N_JOINTS
+from scm_world.variables import (
+    Action,
+    Box,
+    Exogenous,
+    Function,
+    Measured,
+    Normal,
+    Variable,
+    bundle,
+    part_of,
+)
 from scm_world.variables import catalogue as numbers
 
 END_EFFECTORS = Box((-0.5, -0.5, 0.0) * 3, (0.5, 0.5, 0.5) * 3)  # [m] what an action may ask for
@@ -84,8 +95,108 @@ def tips(joint_positions: Floats, robot_height: Value) -> Floats:
     return found
 
 
-_tips: Any = tips
-_tips.into = tips_into  # a loop that keeps the array calls this instead
+@njit(cache=True)
+def finger_tip_into(
+    joint_positions: Floats, robot_height: Value, finger: float, out: Floats
+) -> None:
+    """Write the tip of one finger, shape (3,) [m]."""
+    q0, q1, q2 = joint_positions[0], joint_positions[1], joint_positions[2]
+    tip_kernel(int(finger), q0, q1, q2, scalar(robot_height), out, 0)
+
+
+@njit(cache=True)
+def finger_tip(joint_positions: Floats, robot_height: Value, finger: float) -> Floats:
+    """Compute the tip of one finger from its three joints, shape (3,) [m]."""
+    found = np.empty(3)
+    finger_tip_into(joint_positions, robot_height, finger, found)
+    return found
+
+
+@njit(cache=True)
+def joints_tip_into(
+    q0: Value, q1: Value, q2: Value, robot_height: Value, finger: float, out: Floats
+) -> None:
+    """Write the tip of one finger, shape (3,) [m]."""
+    tip_kernel(int(finger), scalar(q0), scalar(q1), scalar(q2), scalar(robot_height), out, 0)
+
+
+@njit(cache=True)
+def joints_tip(q0: Value, q1: Value, q2: Value, robot_height: Value, finger: float) -> Floats:
+    """Compute the tip of one finger from the angle of each joint, shape (3,) [m]."""
+    found = np.empty(3)
+    joints_tip_into(q0, q1, q2, robot_height, finger, found)
+    return found
+
+
+_functions: Any = ((tips, tips_into), (finger_tip, finger_tip_into), (joints_tip, joints_tip_into))
+for _function, _into in _functions:
+    _function.into = _into  # a loop that keeps the array calls this instead
+
+
+RESOLUTIONS = ("vector", "finger", "joint")
+"""Whether all joints, those of a finger, or each are a variable; the first is the default."""
+
+QUANTITIES = ("joint_positions", "joint_velocities", "joint_torques")
+"""What moves, in the order of the state vector, by its names for the whole robot."""
+
+
+@final
+@dataclass(frozen=True)
+class Joints:
+    """Some joints that are variables together.
+
+    Attributes:
+        where: Their places among the nine.
+        fingers: Those that they belong to.
+        names: Of ``QUANTITIES``.
+        action: Name of their action.
+        of: What they are joints of, for sentences.
+    """
+
+    where: slice
+    fingers: tuple[str, ...]
+    names: tuple[str, ...]
+    action: str
+    of: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of each of their variables."""
+        n = self.where.stop - self.where.start
+        return (n,) if n > 1 else ()
+
+    def cut(self, box: Box) -> Box:
+        """Give their part of a box of all nine."""
+        return box if self.shape == (N_JOINTS,) else part_of(box, self.where, N_JOINTS, self.shape)
+
+
+def joints_of(resolution: str) -> tuple[Joints, ...]:
+    """Cut the nine joints into those that are variables together, in their order.
+
+    Args:
+        resolution: One of ``RESOLUTIONS``.
+
+    Example:
+        >>> [joints.names[0] for joints in joints_of("finger")]
+        ['finger_60.joint_positions', 'finger_120.joint_positions', 'finger_300.joint_positions']
+        >>> joints_of("joint")[8].action
+        'finger_300_joint_2.action'
+    """
+    if resolution == "vector":
+        return (Joints(slice(0, N_JOINTS), FINGERS, QUANTITIES, "action", "all fingers"),)
+    found = []
+    for index, finger in enumerate(FINGERS):
+        if resolution == "finger":
+            name, where = f"finger_{finger}", slice(3 * index, 3 * index + 3)
+            names = tuple(f"{name}.{quantity}" for quantity in QUANTITIES)
+            found.append(Joints(where, (finger,), names, f"{name}.action", f"finger {finger}"))
+            continue
+        for joint in range(3):
+            name, place = f"finger_{finger}_joint_{joint}", 3 * index + joint
+            names = tuple(f"{name}.{what}" for what in ("position", "velocity", "torque"))
+            of = f"joint {joint} of finger {finger}"
+            found.append(Joints(slice(place, place + 1), (finger,), names, f"{name}.action", of))
+    return tuple(found)
 
 
 STREAM = "actuators"
@@ -130,24 +241,29 @@ class Robot(Entity):
     Args:
         action_mode: One of ``ACTIONS``.
         start: Joint positions at the start, shape (9,) [rad].
+        resolution: One of ``RESOLUTIONS``. What is finer than ``"vector"`` is put together again
+            in bundles under the names of the whole robot.
     """
 
     name = "robot"
 
-    def __init__(self, action_mode: str, start: tuple[float, ...] = trifinger.REST) -> None:
+    def __init__(
+        self,
+        action_mode: str,
+        start: tuple[float, ...] = trifinger.REST,
+        resolution: str = RESOLUTIONS[0],
+    ) -> None:
         self.action_mode = action_mode
         self._start = start
+        self._by_tips = action_mode == "end_effector_positions"
+        self._joints = joints_of(resolution)
+        by_joint = resolution == "joint"
+        # A tip is a point: its three coordinates are those of no single joint.
+        self._acting = joints_of("finger") if by_joint and self._by_tips else self._joints
 
     def variables(self) -> Iterable[Variable]:
         """Declare the action, the height, the links and the fingertips."""
-        unit, bounds = ACTIONS[self.action_mode]
-        yield Action(
-            name="action",
-            unit=unit,
-            shape=(9,),
-            bounds=bounds,
-            doc=f"What the policy commands: {self.action_mode}.",
-        )
+        yield from self._actions()
         yield Exogenous(
             name="robot_height",
             unit="m",
@@ -157,18 +273,63 @@ class Robot(Entity):
             default=trifinger.NOMINAL_HEIGHT,
             doc="Height of the robot's base above a plane 0.011 m below the table top.",
         )
-        for finger in trifinger.FINGERS:
+        for finger in FINGERS:
             yield from self._links(finger)
         yield from self._hidden()
-        yield Measured(
-            name="end_effector_positions",
-            unit="m",
-            shape=(9,),
-            bounds=Box(-1.0, 1.0),
-            parents=("joint_positions", "robot_height"),
-            mechanism=tips,
-            doc="The three fingertips.",
-        )
+        if len(self._joints) > 1:
+            yield from self._bundles()
+        yield from self._tips()
+
+    def _actions(self) -> Iterable[Variable]:
+        unit, bounds = ACTIONS[self.action_mode]
+        actions = [
+            Action(
+                name=joints.action,
+                unit=unit,
+                shape=joints.shape,
+                bounds=joints.cut(bounds),
+                doc=f"What the policy commands of {joints.of}: {self.action_mode}.",
+            )
+            for joints in self._acting
+        ]
+        yield from actions
+        if len(actions) > 1:
+            yield bundle("action", actions, bounds=bounds, doc="What the policy commands.")
+
+    def _bundles(self) -> Iterable[Variable]:
+        """Put together what moves, under the names of the whole robot."""
+        parts = [list(self._quantities(joints)) for joints in self._joints]
+        for index, whole in enumerate(Robot(self.action_mode, self._start).states()):
+            states = [quantities[index].declare(()) for quantities in parts]
+            fields = {"bounds": whole.bounds, "a": whole.a, "b": whole.b, "doc": whole.doc}
+            yield bundle(whole.name, states, **fields)
+
+    def _tips(self) -> Iterable[Variable]:
+        """Declare the fingertips, and the three of them together."""
+        name, doc = "end_effector_positions", "The three fingertips."
+        fields: dict[str, Any] = {"unit": "m", "bounds": Box(-1.0, 1.0)}
+        if len(self._joints) == 1:
+            parents = ("joint_positions", "robot_height")
+            yield Measured(
+                name=name, shape=(9,), parents=parents, mechanism=tips, doc=doc, **fields
+            )
+            return
+        found = []
+        for index, finger in enumerate(FINGERS):
+            angles = [joints.names[0] for joints in self._joints if finger in joints.fingers]
+            function = finger_tip if len(angles) == 1 else joints_tip
+            found.append(
+                Measured(
+                    name=f"finger_{finger}.end_effector_position",
+                    shape=(3,),
+                    parents=(*angles, "robot_height"),
+                    mechanism=Function(function, constants={"finger": float(index)}),
+                    doc=f"The tip of finger {finger}.",
+                    **fields,
+                )
+            )
+        yield from found
+        yield bundle(name, found, doc=doc, **fields)
 
     def _links(self, finger: str) -> Iterable[Variable]:
         for index, mass in enumerate(trifinger.LINK_MASS):
@@ -227,47 +388,80 @@ class Robot(Entity):
 
     def states(self) -> Iterable[State]:
         """Declare joint positions, velocities and the torques the engine reports."""
-        moving = (n for n in self.inputs() if n not in ("robot_height", "finger_friction"))
-        always = (*moving, "gravity", numbers.PRESET)
+        of_each = [list(self._quantities(joints)) for joints in self._joints]
+        yield from (states[index] for index in range(len(QUANTITIES)) for states in of_each)
+
+    def _quantities(self, joints: Joints) -> Iterable[State]:
+        """Declare what moves of some joints: position, velocity and torque."""
+        always = self._always(joints)
+        start = self._start[joints.where]
+        still = (0.0,) * len(start)
+        position, velocity, torque = joints.names
         yield State(
-            "joint_positions",
+            position,
             "rad",
-            (9,),
-            numbers.JOINT_BOUNDS,
-            self._start,
-            "Angles of the joints, finger by finger.",
+            joints.shape,
+            joints.cut(numbers.JOINT_BOUNDS),
+            start if joints.shape else start[0],
+            f"Angles of the joints of {joints.of}." if joints.shape else f"Angle of {joints.of}.",
             always=always,
-            a=numbers.JOINTS_A,
-            b=numbers.JOINTS_B,
+            a=joints.cut(numbers.JOINTS_A),
+            b=joints.cut(numbers.JOINTS_B),
         )
         yield State(
-            "joint_velocities",
+            velocity,
             "rad/s",
-            (9,),
+            joints.shape,
             numbers.JOINT_VELOCITY_BOUNDS,
-            (0.0,) * 9,
+            still if joints.shape else 0.0,
             "Angular velocities of the joints.",
             always=always,
         )
         yield State(
-            "joint_torques",
+            torque,
             "N m",
-            (9,),
+            joints.shape,
             Box(-1.0, 1.0),
-            (0.0,) * 9,
+            still if joints.shape else 0.0,
             "Torques of the last physics step.",
             always=always,
             settable=False,
         )
 
+    def _always(self, joints: Joints) -> tuple[str, ...]:
+        """Name what acts on some joints in every control step.
+
+        Other fingers are other kinematic trees: they act by contact only.
+        """
+        others = {
+            name
+            for finger in FINGERS
+            if finger not in joints.fingers
+            for name in self._of_finger(finger)
+        }
+        by_contact = {"finger_friction"} if self._by_tips else {"finger_friction", "robot_height"}
+        acting = (name for name in self.inputs() if name not in others | by_contact)
+        return (*acting, "gravity", numbers.PRESET)
+
+    def _of_finger(self, finger: str) -> Iterable[str]:
+        """Name what belongs to one finger and acts on how it moves."""
+        for joints in self._joints:
+            yield from joints.names[:2] if joints.fingers == (finger,) else ()
+        for joints in self._acting:
+            yield from (joints.action,) if joints.fingers == (finger,) else ()
+        yield from (f"{trifinger.link_name(finger, index)}.mass" for index in (1, 2, 3))
+
     def inputs(self) -> Iterable[str]:
         """Everything but colors, the fixed finger bases and what is only read out."""
-        yield from ("joint_positions", "joint_velocities", "action", "robot_height")
+        yield from (joints.names[0] for joints in self._joints)
+        yield from (joints.names[1] for joints in self._joints)
+        yield from (joints.action for joints in self._acting)
+        yield "robot_height"
         yield from ("finger_friction", "joint_damping", "safety_damping", "torque_limit")
         if self.action_mode != "joint_torques":
             yield from ("position_gains", "velocity_gains")
         yield ACTUATOR_NOISE
-        for finger in trifinger.FINGERS:
+        for finger in FINGERS:
             yield from (f"{trifinger.link_name(finger, index)}.mass" for index in (1, 2, 3))
 
     def parameters(self) -> Mapping[str, ParameterKey]:
@@ -292,7 +486,7 @@ class Robot(Entity):
     def slices(self, block: int) -> Mapping[str, slice]:
         """Say where its states stand in the state vector."""
         return {
-            "joint_positions": slice(0, 9),
-            "joint_velocities": slice(9, 18),
-            "joint_torques": slice(18, 27),
+            name: slice(N_JOINTS * index + joints.where.start, N_JOINTS * index + joints.where.stop)
+            for joints in self._joints
+            for index, name in enumerate(joints.names)
         }

@@ -41,7 +41,8 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
             return value
         case Mechanism():
             _known(declared, (parent.name for parent in value.parents))
-            if any(parent.name == variable.name and not parent.lag for parent in value.parents):
+            own = (variable.name, *variable.parts)
+            if any(parent.name in own and not parent.lag for parent in value.parents):
                 raise InterventionError(
                     f"do({variable.name}): a variable cannot follow itself within an instant; "
                     "use Shift or Scale",

@@ -86,7 +86,13 @@ class Moment:
 @final
 @dataclass(frozen=True)
 class Act:
-    """An intervention on a variable, possibly given in other coordinates of it."""
+    """An intervention on a variable.
+
+    Attributes:
+        intervention: What is done.
+        requested: The variable that it says something about: the variable itself, other
+            coordinates of it, or a bundle that it is a part of.
+    """
 
     intervention: Intervention
     requested: Variable
@@ -129,8 +135,15 @@ class Evaluator:
         else:
             source, stream = source_of(act), getattr(act.intervention, "stream", None)
             value = moment.draw(source, requested.name, requested.shape, values, stream)
+        return self._given(requested, name, value)
+
+    def _given(self, requested: Variable, name: str, value: Value) -> Value:
+        """Give the value of a variable that a value of what was asked for stands for."""
         if requested.name == name:
-            return value
+            return np.asarray(value)
+        if requested.parts:
+            mechanism: Any = requested.mechanism  # type: ignore[attr-defined]
+            return np.asarray(mechanism.split(value)[requested.parts.index(name)])
         return np.asarray(self._bound(requested, inverse=True)(value))
 
     def evaluate(
@@ -156,9 +169,7 @@ class Evaluator:
         moved = there + by if isinstance(act.intervention, Shift) else there * by
         if requested.dtype != "real":
             moved = np.rint(moved).astype(np.int64)
-        if requested.name == name:
-            return np.asarray(moved)
-        return np.asarray(self._bound(requested, inverse=True)(moved))
+        return self._given(requested, name, moved)
 
     def _followed(
         self, name: str, act: Act, given: Mechanism, values: Values, previous: Values
@@ -174,9 +185,7 @@ class Evaluator:
                 raise WrongShape(name, given, requested.shape, value.shape) from None
         if requested.dtype != "real":
             value = np.rint(value).astype(np.int64)
-        if requested.name == name:
-            return value
-        return np.asarray(self._bound(requested, inverse=True)(value))
+        return self._given(requested, name, value)
 
     def _natural(
         self, variable: Variable, values: Values, previous: Values, moment: Moment | None

@@ -31,6 +31,8 @@ from scm_world.variables import (
     Natural,
     Noise,
     Variable,
+    divided,
+    whole_of,
 )
 
 
@@ -156,7 +158,7 @@ class SCM:
 
     @property
     def interventions(self) -> Mapping[str, Intervention]:
-        """What ``do`` has set, by requested name."""
+        """What ``do`` has set, by requested name; of a bundle, by the names of its parts."""
         return dict(self._interventions)
 
     @property
@@ -202,12 +204,19 @@ class SCM:
 
     # --- intervening --------------------------------------------------------------------------
 
-    def target(self, name: str) -> str:
-        """Name the variable that an intervention acts on: for coordinates, the quantity itself."""
+    def targets(self, name: str) -> tuple[str, ...]:
+        """Name the variables that an intervention acts on.
+
+        For coordinates it is the quantity itself, for a bundle it is all its parts.
+        """
         variable = self.declared(name)
         if isinstance(variable, Derived) and variable.inverse is not None:
-            return variable.parents[0].name
-        return name
+            return (variable.parents[0].name,)
+        return variable.parts or (name,)
+
+    def target(self, name: str) -> str:
+        """Name the variable that an intervention acts on; the first one of a bundle's parts."""
+        return self.targets(name)[0]
 
     def do(self, request: Mapping[str, Any]) -> SCM:
         """Intervene: return the mutilated model and leave this one as it is.
@@ -237,11 +246,12 @@ class SCM:
         targets: dict[str, str] = {}
         for name, value in flatten(request).items():
             try:
-                wanted[name] = self.accept(name, value, any_variable=any_variable)
-                target = self.target(name)
-                if target in targets:
-                    raise ConflictingTargets((targets[target], name), target)
-                targets[target] = name
+                act = self.accept(name, value, any_variable=any_variable)
+                for target in self.targets(name):
+                    if target in targets:
+                        raise ConflictingTargets((targets[target], name), target)
+                    targets[target] = name
+                wanted |= divided(self.declared(name), act)
             except InterventionError as problem:
                 problems.append(problem)
         raise_all(problems)
@@ -260,13 +270,14 @@ class SCM:
         model._acts = {**self._acts}
         for name, intervention in acts.items():
             target = self.target(name)
-            replaced = model._acts.get(target)
+            replaced = model._acts.pop(target, None)
             if replaced is not None:
-                model._interventions.pop(replaced.requested.name, None)
+                whole = replaced.requested.parts
+                model._interventions.pop(target if whole else replaced.requested.name, None)
             if isinstance(intervention, Natural):
-                model._acts.pop(target, None)
                 continue
-            model._acts[target] = Act(intervention, self._declared[name])
+            requested = self._declared[whole_of(intervention, name)]
+            model._acts[target] = Act(intervention, requested)
             model._interventions[name] = intervention
         model._structure = None if acts else self._structure
         # Cutting edges keeps every causal order valid.
@@ -280,12 +291,16 @@ class SCM:
         Raises:
             InterventionError: What is wrong with it.
         """
-        variable = self.declared(name)
         target = self.declared(self.target(name))
+        whole = whole_of(value, name)
+        if whole != name and name not in self.declared(whole).parts:
+            raise InterventionError(
+                f"do({name}): it is no part of the bundle {whole!r}", variable=name, value=value
+            )
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
             raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
-        return accepted(self._declared, variable, value)
+        return accepted(self._declared, self._declared[whole], value)
 
     # --- solving ------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
-from typing import final
+from typing import Any, final
 
 import networkx as nx
 
@@ -181,6 +181,16 @@ def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Ite
             yield f"{variable.name!r} are coordinates of {target.name!r}, which cannot be set"
 
 
+def _bundle_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
+    mechanism: Any = getattr(variable, "mechanism", None)
+    for index, name in enumerate(variable.parts):
+        part, shape = known.get(name), mechanism.shapes[index]
+        if part is not None and part.shape != shape:
+            yield f"the bundle {variable.name!r} has {name!r} as {shape}, not {part.shape}"
+        if part is not None and (part.parts or getattr(part, "inverse", None)):
+            yield f"{name!r} in the bundle {variable.name!r} is no quantity of its own"
+
+
 def checked(variables: Iterable[Variable]) -> dict[str, Variable]:
     """Index variables by name, or raise one error that lists everything that is wrong.
 
@@ -195,6 +205,7 @@ def checked(variables: Iterable[Variable]) -> dict[str, Variable]:
         by_name[variable.name] = variable
     for variable in by_name.values():
         problems.extend(_variable_problems(variable, by_name))
+        problems.extend(_bundle_problems(variable, by_name))
     known_edges = [
         Edge(parent.name, variable.name, parent.lag)
         for variable in by_name.values()

@@ -78,14 +78,23 @@ def _tip(q0: float, q1: float, q2: float) -> tuple[float, float, float]:
 
 
 @njit(cache=True)
+def tip_kernel(
+    finger: int, q0: float, q1: float, q2: float, height: float, out: Floats, i: int
+) -> None:
+    """Write the tip of one finger [m] into ``out[i : i + 3]``."""
+    x, y, z = _tip(q0, q1, q2)
+    out[i] = _COS[finger] * x - _SIN[finger] * y + _BASE_X[finger]
+    out[i + 1] = _SIN[finger] * x + _COS[finger] * y + _BASE_Y[finger]
+    out[i + 2] = z + height - _OFFSET
+
+
+@njit(cache=True)
 def forward_kernel(joint_positions: Floats, height: float, out: Floats) -> None:
     """Write the tips (9,) [m] that ``forward`` returns into ``out``."""
     for finger in range(N_FINGERS):
         i = 3 * finger
-        x, y, z = _tip(joint_positions[i], joint_positions[i + 1], joint_positions[i + 2])
-        out[i] = _COS[finger] * x - _SIN[finger] * y + _BASE_X[finger]
-        out[i + 1] = _SIN[finger] * x + _COS[finger] * y + _BASE_Y[finger]
-        out[i + 2] = z + height - _OFFSET
+        q0, q1, q2 = joint_positions[i], joint_positions[i + 1], joint_positions[i + 2]
+        tip_kernel(finger, q0, q1, q2, height, out, i)
 
 
 @njit(cache=True)

@@ -31,12 +31,14 @@ class Timing:
         preset: One of the task's ``presets``.
         control_period: Length of a control step [s].
         steps: Length of an episode in control steps.
+        resolution: One of the task's ``resolutions``.
     """
 
     action_mode: str
     preset: str
     control_period: float
     steps: int
+    resolution: str
 
 
 class Task(ABC):
@@ -51,6 +53,7 @@ class Task(ABC):
         name: Of the task.
         action_modes: How the system can be commanded; the first is the default.
         presets: Numerical settings to choose from; the first is the default.
+        resolutions: How finely its variables can be cut; the first is the default.
         time_unit: What ``frame_skip`` counts [s].
         frame_skip: Length of a control step, if none is asked for.
         seconds: Length of an episode [s].
@@ -71,6 +74,7 @@ class Task(ABC):
     name: str
     action_modes: tuple[str, ...]
     presets: tuple[str, ...]
+    resolutions: tuple[str, ...] = ("declared",)
     time_unit: float
     frame_skip: int
     seconds: Any

@@ -10,7 +10,17 @@ from typing import Any, ClassVar, Unpack
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.entities import ACTIONS, BlockWorld, Clock, Composition, Entity, Looks, Robot, Stage
+from scm_world.entities import (
+    ACTIONS,
+    RESOLUTIONS,
+    BlockWorld,
+    Clock,
+    Composition,
+    Entity,
+    Looks,
+    Robot,
+    Stage,
+)
 from scm_world.errors import UnknownOption
 from scm_world.models import ControlMode
 from scm_world.scene import PRESETS, TIMESTEP, trifinger
@@ -38,6 +48,7 @@ class TriFingerTask(Task):
 
     action_modes = tuple(ACTIONS)
     presets = tuple(PRESETS)
+    resolutions = RESOLUTIONS
     time_unit = TIMESTEP
     frame_skip = 10
 
@@ -94,7 +105,7 @@ class TriFingerTask(Task):
         torques = timing.action_mode == "joint_torques"
         mode = ControlMode.JOINT_TORQUES if torques else ControlMode.JOINT_POSITIONS
         entities: tuple[Entity, ...] = (
-            Robot(timing.action_mode, self.start),
+            Robot(timing.action_mode, self.start, timing.resolution),
             Stage(timing.preset),
             Looks(),
             Clock(timing.steps, timing.control_period),

@@ -214,9 +214,9 @@ def out_of_bounds(world: World) -> list[str]:
 def _declared(world: World) -> list[Variable]:
     """List the declarations as they were written down, duplicates included."""
     options, task = world.options, world.task
-    timing = Timing(
-        options.action_mode, options.preset, options.control_period, world.max_episode_length
-    )
+    mode, period = options.action_mode, options.control_period
+    length, fine = world.max_episode_length, options.resolution
+    timing = Timing(mode, options.preset, period, length, fine)
     return [
         *task.compose(timing)[1],
     ]

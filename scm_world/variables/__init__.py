@@ -1,5 +1,6 @@
 """Typed variables, their spaces, their noise, and what can be done to them."""
 
+from scm_world.variables.bundles import bundle, divided, part_of, whole_of
 from scm_world.variables.distributions import Cylinder, Distribution, Normal
 from scm_world.variables.interventions import (
     SOFT,
@@ -23,7 +24,7 @@ from scm_world.variables.kinds import (
     Variable,
     names,
 )
-from scm_world.variables.mechanisms import Equation, Function, Linear
+from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear
 from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import (
     Affine,
@@ -47,6 +48,7 @@ __all__ = [
     "B",
     "Box",
     "Categories",
+    "Concatenation",
     "Cylinder",
     "Derived",
     "Distribution",
@@ -74,5 +76,9 @@ __all__ = [
     "Subset",
     "Switch",
     "Variable",
+    "bundle",
+    "divided",
     "names",
+    "part_of",
+    "whole_of",
 ]

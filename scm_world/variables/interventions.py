@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from scm_world.errors import UnknownOption
 from scm_world.variables.distributions import Distribution
@@ -30,6 +30,11 @@ def _number(what: str, value: Any) -> Any:
     if given.dtype.kind not in "iufb":
         raise UnknownOption(what, value, ("a number", "an array of numbers"))
     return tuple(given.ravel().tolist()) if given.ndim else value
+
+
+def _without_bundle(data: dict[str, Any]) -> dict[str, Any]:
+    """Leave out of written data what is only there in parts of a bundle."""
+    return {name: value for name, value in data.items() if name != "of" or value is not None}
 
 
 @final
@@ -78,6 +83,8 @@ class Draw(Frozen):
         source: Where from.
         stream: Name of a noise of its own, so that it has nothing in common with other draws of
             the variable; None for the variable's own noise.
+        of: A bundle that is drawn as a whole; the variable gets its part of it. ``do`` on the
+            bundle gives this to each of its parts.
 
     Example:
         >>> Draw("A").source
@@ -87,12 +94,17 @@ class Draw(Frozen):
     kind: Literal["draw"] = "draw"
     source: SpaceName | Distribution
     stream: str | None = None
+    of: str | None = None
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Show the stream only if there is one."""
+        """Show stream and bundle only if there is one."""
         for name, value in super().__repr_args__():
-            if name != "stream" or value is not None:
+            if name not in ("stream", "of") or value is not None:
                 yield name, value
+
+    @model_serializer(mode="wrap")
+    def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return _without_bundle(handler(self))
 
     def __init__(self, source: Any, **fields: Any) -> None:
         if not isinstance(source, Frozen | dict) and source not in SPACES:
@@ -111,6 +123,7 @@ class Mechanism(Frozen):
     Attributes:
         function: Called with the values of the parents, in their order.
         parents: The causes; the graph then has these edges in place of the others.
+        of: A bundle that the function gives as a whole; the variable gets its part of it.
 
     Example:
         >>> tie = Mechanism(Function("numpy:mean"), ["floor_color"])
@@ -121,6 +134,11 @@ class Mechanism(Frozen):
     kind: Literal["mechanism"] = "mechanism"
     function: AsMechanism
     parents: AsParents
+    of: str | None = None
+
+    @model_serializer(mode="wrap")
+    def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return _without_bundle(handler(self))
 
     def __init__(self, function: Any, parents: Any = (), **fields: Any) -> None:
         named = (parents,) if isinstance(parents, str | Parent) else tuple(parents)

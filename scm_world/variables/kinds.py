@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.mechanisms import Equation, Function, Linear
+from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear
 from scm_world.variables.spaces import (
     Box,
     Categories,
@@ -121,6 +121,17 @@ class Variable(Frozen):
         return ()
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        """What a bundle is put together from, in order: its parents; nothing for other variables.
+
+        An intervention on a bundle is one on each of its parts.
+        """
+        mechanism = getattr(self, "mechanism", None)
+        if not isinstance(mechanism, Concatenation):
+            return ()
+        return tuple(parent.name for parent in self.all_parents)
+
+    @property
     def role(self) -> Role:
         """What an intervention on it means."""
         return "parameter"
@@ -176,6 +187,20 @@ class Variable(Frozen):
         for space in (self.bounds, self.a, self.b):
             if self.dtype != "real" and isinstance(space, Box | Rotations):
                 raise ValueError(f"{self.name}: {self.dtype} values need Integers or Categories")
+        return self
+
+    @model_validator(mode="after")
+    def _bundles_fit(self) -> Variable:
+        mechanism = getattr(self, "mechanism", None)
+        if isinstance(mechanism, Concatenation):
+            n = mechanism.slices[-1].stop if mechanism.slices else 0
+            if len(mechanism.shapes) != len(self.all_parents) or self.shape != (n,):
+                raise ValueError(
+                    f"{self.name}: a bundle has one shape for each part, and their numbers in one "
+                    f"row: {len(self.all_parents)} parts, {mechanism.shapes}, {self.shape}"
+                )
+            if any(parent.lag or parent.when for parent in self.all_parents):
+                raise ValueError(f"{self.name}: the parts of a bundle are present values")
         return self
 
     @model_validator(mode="after")
@@ -254,7 +279,7 @@ class Measured(Variable):
     """Something that physics decides, or a readout of it.
 
     A state (``mechanism`` None, ``settable_state`` True) can be set at an instant; physics
-    carries it on. A readout cannot be set.
+    carries it on. So can a bundle of states. A readout cannot be set.
 
     Attributes:
         parents: Its causes.

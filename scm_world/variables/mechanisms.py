@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable
-from functools import partial, update_wrapper
+from functools import cached_property, partial, update_wrapper
+from itertools import pairwise
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -176,4 +177,70 @@ class Linear(Frozen):
         return True
 
 
-Equation = Annotated[Function | Linear, Field(discriminator="kind")]
+@final
+class Concatenation(Frozen):
+    """The numbers of the parents one after another: what makes a variable a bundle of them.
+
+    Attributes:
+        shapes: Of the parents.
+
+    Example:
+        >>> both = Concatenation(shapes=((2,), ()))
+        >>> both.bind()(np.array([1.0, 2.0]), np.array(3.0))
+        array([1., 2., 3.])
+        >>> both.split(np.array([1.0, 2.0, 3.0]))
+        (array([1., 2.]), array(3.))
+    """
+
+    kind: Literal["concatenation"] = "concatenation"
+    shapes: tuple[tuple[int, ...], ...]
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Where the numbers of each parent stand."""
+        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)]).tolist()
+        return tuple(slice(first, last) for first, last in pairwise(ends))
+
+    def bind(self) -> Joined:
+        """Give the function of the parents."""
+        return Joined(self.shapes, self.slices)
+
+    def split(self, value: Value) -> tuple[Value, ...]:
+        """Give the values of the parents; the numbers are the last axis of the value."""
+        lead = np.shape(value)[:-1]
+        both = zip(self.shapes, self.slices, strict=True)
+        return tuple(np.asarray(value[..., at]).reshape((*lead, *shape)) for shape, at in both)
+
+    def is_portable(self) -> bool:
+        """Tell that shapes can always be written down."""
+        return True
+
+
+@final
+class Joined:
+    """The function of a bundle.
+
+    Args:
+        shapes: Of the parts.
+        slices: Where they stand in the bundle.
+    """
+
+    def __init__(self, shapes: tuple[tuple[int, ...], ...], slices: tuple[slice, ...]) -> None:
+        self._shapes, self._slices = shapes, slices
+
+    def __call__(self, *parts: Value) -> Value:
+        """Put values together, shape ``(..., n)``; leading axes broadcast."""
+        ends = [np.ndim(part) - len(s) for part, s in zip(parts, self._shapes, strict=True)]
+        leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
+        flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
+        whole = np.broadcast_shapes(*leads)
+        return np.concatenate([np.broadcast_to(f, (*whole, f.shape[-1])) for f in flat], axis=-1)
+
+    def into(self, *given: Value) -> None:
+        """Write values, all but the last, into the last, shape (n,)."""
+        *parts, out = given
+        for where, part in zip(self._slices, parts, strict=True):
+            out[where] = part.ravel()
+
+
+Equation = Annotated[Function | Linear | Concatenation, Field(discriminator="kind")]

@@ -126,9 +126,9 @@ def _immaterial(
     found = set()
     for name, act in request.items():
         if isinstance(act, Draw) and name not in world.family.head:
-            target = declaration.model.target(name)
-            followers = (target, *declaration.static_order((target,)))
-            is_state = declaration.model.declared(target).role == "state"
+            targets = declaration.model.targets(name)
+            followers = (*targets, *declaration.static_order(targets))
+            is_state = declaration.model.declared(targets[0]).role == "state"
             keys = (world.parameter_keys.get(follower) for follower in followers)
             moves = any(key and key[1] in _MOVES for key in keys)
             hides = buries and any(follower.endswith(_MOVES) for follower in followers)
@@ -142,7 +142,8 @@ def _buried(proposal: Proposal, request: Mapping[str, Any]) -> list[Overlap]:
     declaration = proposal.declaration
     if not declaration.composition.obstacles:
         return []
-    targets = [declaration.model.target(n) for n, act in request.items() if isinstance(act, Draw)]
+    draws = [name for name, act in request.items() if isinstance(act, Draw)]
+    targets = [target for name in draws for target in declaration.model.targets(name)]
     moved = {*targets, *declaration.static_order(targets)}
     scene = declaration.describe(proposal.static, proposal.state)
     return list(buried_goals(scene, {name.partition(".")[0] for name in moved}))
@@ -182,8 +183,8 @@ def _culprit(world: Declaration, names: Iterable[str], bodies: Iterable[str]) ->
     surfaces |= {name for name, key in world.parameter_keys.items() if key[1] in _MOVES}
 
     def blame(name: str) -> tuple[bool, bool]:
-        target = world.model.target(name)
-        moved = {target, *world.static_order([target])} & surfaces
+        targets = world.model.targets(name)
+        moved = {*targets, *world.static_order(targets)} & surfaces
         return bool({part.partition(".")[0] for part in moved} & {*bodies}), bool(moved)
 
     return max(names, key=blame)
@@ -241,7 +242,8 @@ def commit(
     before = dict(world.current()[0])
     moved_before = {}
     if change.state is not None:
-        moved_before = {name: np.array(before[name]) for name in world.slices}
+        states = (name for name in world.slices if not world.model.declared(name).parts)
+        moved_before = {name: np.array(before[name]) for name in states}
     declaration, index, state = world.declaration, world.index, world.current()[1].copy()
     model, static = world.graph, {name: before[name] for name in declaration.static_names}
     bodies = {*world.composition.blocks, *world.composition.obstacles}
@@ -323,6 +325,23 @@ def _outcome(world: World, proposal: Proposal, target: str) -> tuple[Value | Non
     return applied, None if key is None else world.backend.parameters([key])[key]
 
 
+def _asked(world: World, proposal: Proposal, name: str) -> tuple[Value | None, Value | None]:
+    """Give the same of what was asked for: a target, other coordinates of one, or a bundle."""
+    targets = world.model.targets(name)
+    outcomes = [_outcome(world, proposal, target) for target in targets]
+    if targets == (name,):
+        return outcomes[0]
+    values = [applied for applied, _ in outcomes if applied is not None]
+    reported = [back for _, back in outcomes if back is not None]
+    if len(values) < len(targets):
+        return None, None
+    applied = world.in_coordinates(name, *values)
+    if len(reported) < len(targets):
+        return applied, None
+    exact = all(map(same, reported, values))
+    return applied, applied if exact else world.in_coordinates(name, *reported)
+
+
 def _report(
     world: World,
     proposal: Proposal,
@@ -336,22 +355,20 @@ def _report(
     now = world.current()[0]
     entries = {}
     for name in proposal.asked:
-        applied, back = _outcome(world, proposal, world.model.target(name))
-        if applied is not None and name != world.model.target(name):
-            exact = back is not None and same(back, applied)
-            applied = world.in_coordinates(name, applied)
-            if back is not None:
-                back = applied if exact else world.in_coordinates(name, back)
+        applied, back = _asked(world, proposal, name)
         entries[name] = Applied(name, flat[name], applied, back)
+    parts = {target for name in entries for target in world.model.declared(name).parts}
     followed = {
         name: (before[name], value)
         for name, value in proposal.static.items()
         if value is not before.get(name, value)
         and name not in entries
+        and name not in parts
         and not _same(value, before[name])
     }
     for name, old in moved_before.items():
-        if name in now and name not in entries and not same(old, now[name]):
+        known = name in entries or name in parts
+        if name in now and not known and not same(old, now[name]):
             followed[name] = (old, np.array(now[name]))
     engine = {
         body: (old, world.backend.inertia(body.removesuffix(".inertia")))

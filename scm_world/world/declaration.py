@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, final
 
 import numpy as np
@@ -28,6 +29,7 @@ class Options:
     Attributes:
         preset: Numerical settings of the engine at the start of an episode.
         action_mode: How the system is commanded.
+        resolution: How finely the variables are cut.
         frame_skip: Length of a control step in units of the task.
         time_unit: The unit [s].
         given_length: Length of an episode in control steps, if one was given.
@@ -36,6 +38,7 @@ class Options:
 
     preset: str
     action_mode: str
+    resolution: str
     frame_skip: int
     time_unit: float
     given_length: int | None
@@ -48,6 +51,7 @@ class Options:
         *,
         preset: str | None,
         action_mode: str | None,
+        resolution: str | None,
         frame_skip: int | None,
         max_episode_length: int | None,
         conventions_name: str,
@@ -67,8 +71,11 @@ class Options:
         name = task.presets[0] if preset is None else preset
         if name not in task.presets:
             raise UnknownOption("preset", name, task.presets)
+        fine = task.resolutions[0] if resolution is None else resolution
+        if fine not in task.resolutions:
+            raise UnknownOption("resolution", fine, task.resolutions)
         kept = conventions(conventions_name)
-        return cls(name, mode, skip, task.time_unit, max_episode_length, kept)
+        return cls(name, mode, fine, skip, task.time_unit, max_episode_length, kept)
 
     @property
     def control_period(self) -> float:
@@ -88,9 +95,11 @@ class Declaration:
         task: As it was given.
         model: The causal model, without interventions.
         composition: What the variables mean to an engine.
-        slices: Where each state stands in the state vector.
+        slices: Where each state stands in the state vector, and each bundle of states that stand
+            there one after another.
         whole: States that are whole numbers.
         actions: Where each action stands in the vector of all actions.
+        commanded: The same, with the bundles of actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
         computed: Variables that are computed from what moves, causes before effects.
@@ -100,21 +109,24 @@ class Declaration:
 
     def __init__(self, task: Task, options: Options, steps: int) -> None:
         self.task = task
-        timing = Timing(options.action_mode, options.preset, options.control_period, steps)
+        mode, fine = options.action_mode, options.resolution
+        timing = Timing(mode, options.preset, options.control_period, steps, fine)
         self.composition, variables = task.compose(timing)
         self.model = SCM(options.conventions.adapt(variables))
-        self.slices = self.composition.slices()
         self.parameter_keys = self.composition.parameters()
+        self.actions: dict[str, slice] = {}
+        for action in (v for v in self.model.variables if isinstance(v, Action)):
+            first = self.n_actions
+            self.actions[action.name] = slice(first, first + int(np.prod(action.shape)))
+        self.commanded = {**self.actions, **_in_a_row(self.model, self.actions)}
+        states = self.composition.slices()
+        self.slices = {**states, **_in_a_row(self.model, states)}
         self._places = [
             (name, where, self.model.declared(name).shape) for name, where in self.slices.items()
         ]
         self.whole = tuple(
             name for name in self.slices if self.model.declared(name).dtype != "real"
         )
-        self.actions: dict[str, slice] = {}
-        for action in (v for v in self.model.variables if isinstance(v, Action)):
-            first = self.n_actions
-            self.actions[action.name] = slice(first, first + int(np.prod(action.shape)))
         ordered = map(self.model.declared, self.model.structure.order)
         self.carried = tuple(v for v in ordered if isinstance(v, Measured) and v.set_parents())
         self.computed = computed_order(self.model)
@@ -162,13 +174,9 @@ class Declaration:
 
     def split(self, action: Floats) -> dict[str, Value]:
         """Give every action variable its part of a vector of all, as views."""
-        if len(self.actions) == 1:
-            (name,) = self.actions
-            shape = self.model.declared(name).shape
-            return {name: action if shape else action.reshape(shape)}
         return {
             name: action[where].reshape(self.model.declared(name).shape)
-            for name, where in self.actions.items()
+            for name, where in self.commanded.items()
         }
 
     def structure(self, values: Values) -> Structure:
@@ -211,13 +219,13 @@ class Declaration:
         """Give one state, as a view of a vector."""
         return state.vector[self.slices[name]].reshape(self.model.declared(name).shape)
 
-    def in_coordinates(self, name: str, value: Value) -> Value:
-        """Give a value of a quantity in other coordinates of it."""
+    def in_coordinates(self, name: str, *values: Value) -> Value:
+        """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""
         function = self._coordinates.get(name)
         if function is None:
             variable: Any = self.model.declared(name)
             function = self._coordinates[name] = variable.mechanism.bind()
-        return np.asarray(function(value))
+        return np.asarray(function(*values))
 
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
@@ -229,3 +237,14 @@ class Declaration:
             parameters[key] = values[name]
         made = self.composition
         return Scene(structure, parameters, state, made.goals(values), made.light(values))
+
+
+def _in_a_row(model: SCM, places: Mapping[str, slice]) -> dict[str, slice]:
+    """Give the place of each bundle whose parts stand one after another in a vector."""
+    found: dict[str, slice] = {}
+    for variable in model.variables:
+        parts = [places[name] for name in variable.parts if name in places]
+        whole = bool(parts) and len(parts) == len(variable.parts)
+        if whole and all(one.stop == other.start for one, other in pairwise(parts)):
+            found[variable.name] = slice(parts[0].start, parts[-1].stop)
+    return found

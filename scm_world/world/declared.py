@@ -51,6 +51,8 @@ class Declared:
             "conventions": self.conventions.name,
             "variables_space": world.variables_space,
         }
+        if self.resolution != self.task.resolutions[0]:  # logs and files of before have none
+            options["resolution"] = self.resolution
         return _copied, (type(self), self.family.task, options, snapshot)
 
     @property
@@ -105,6 +107,11 @@ class Declared:
         return self.options.action_mode
 
     @property
+    def resolution(self) -> str:
+        """How finely the variables are cut."""
+        return self.options.resolution
+
+    @property
     def frame_skip(self) -> int:
         """Length of a control step in units of the task; 4 ms for the robot."""
         return self.options.frame_skip
@@ -139,7 +146,8 @@ class Declared:
         """What two worlds have in common if one can take up a snapshot of the other."""
         numbers = (self.frame_skip, self.max_episode_length)
         options = (self.options.preset, self.action_mode, self.conventions.name)
-        return (self.task.name, *options, *numbers)
+        finer = () if self.resolution == self.task.resolutions[0] else (self.resolution,)
+        return (self.task.name, *options, *numbers, *finer)
 
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
@@ -149,6 +157,6 @@ class Declared:
         """Name some variables and what follows them at once, without physics, causes first."""
         return self.declaration.static_order(targets)
 
-    def in_coordinates(self, name: str, value: Value) -> Value:
-        """Give a value of a quantity in other coordinates of it."""
-        return self.declaration.in_coordinates(name, value)
+    def in_coordinates(self, name: str, *values: Value) -> Value:
+        """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""
+        return self.declaration.in_coordinates(name, *values)

@@ -22,6 +22,7 @@ from scm_world.variables import (
     Null,
     Rotations,
     Shift,
+    whole_of,
 )
 from scm_world.variables.checks import check_bounds, check_space
 from scm_world.variables.subsets import AnyRegion
@@ -68,6 +69,7 @@ class Draft:
         self.index = instant.index
         self._moment = moment
         self._problems: list[InterventionError] = []
+        self._whole: dict[str, Value] = {}  # what bundles are to be
 
     def _is_state(self, target: str) -> bool:
         return self._world.model.declared(target).role == "state"
@@ -108,7 +110,7 @@ class Draft:
 
     def _follows_others(self, name: str, act: Intervention) -> bool:
         """Tell whether what a variable is drawn from depends on other variables."""
-        requested: Any = self._world.model.declared(name)
+        requested: Any = self._world.model.declared(whole_of(act, name))
         source = act.source if isinstance(act, Draw) else None
         found = requested.space(source) if isinstance(source, str) else source
         return found is not None and bool(found.parents())
@@ -120,7 +122,7 @@ class Draft:
         anew = {
             target
             for target, (name, act) in self._requests.items()
-            if isinstance(act, Draw) and name not in self._moment.kept
+            if isinstance(act, Draw) and whole_of(act, name) not in self._moment.kept
         }
         for name in self._order:
             bounds = self._world.model.declared(name).bounds
@@ -162,12 +164,13 @@ class Draft:
             else:
                 self.static[name] = value
 
-    def _coordinates(self, target: str, name: str) -> Value:
-        """Give the value of a target in the coordinates that were asked for."""
-        value = self._value(target)
-        if name == target:
-            return np.asarray(value)
-        return self._world.in_coordinates(name, value)
+    def _coordinates(self, name: str) -> Value:
+        """Give the value that something has which was asked for, such as other coordinates."""
+        targets = self._world.model.targets(name)
+        values = [self._value(target) for target in targets]
+        if targets == (name,):
+            return np.asarray(values[0])
+        return self._world.in_coordinates(name, *values)
 
     def _value(self, target: str) -> Value:
         if target == CONTROL_INDEX:
@@ -219,6 +222,20 @@ class Draft:
         return bounds.nearest(value) if isinstance(bounds, Rotations) else value
 
     def _wish(self, target: str, name: str, act: Intervention) -> Value:
+        """Give the value that a state is to have."""
+        whole = whole_of(act, name)
+        requested: Any = self._world.model.declared(whole)
+        if whole == name:
+            value = self._wanted(name, act)
+            return np.asarray(value if name == target else requested.inverse.bind()(value))
+        if whole not in self._whole:
+            self._whole[whole] = self._wanted(whole, act)
+        return np.asarray(
+            requested.mechanism.split(self._whole[whole])[requested.parts.index(name)]
+        )
+
+    def _wanted(self, name: str, act: Intervention) -> Value:
+        """Give the value that is asked of a state, of other coordinates or of a bundle."""
         requested: Any = self._world.model.declared(name)
         if isinstance(act, Hard):
             value = requested.array(act.value)
@@ -226,16 +243,16 @@ class Draft:
             values = {**self.static, **self._world.states(self.instant.state)}
             value = followed(requested, act, values)
         elif isinstance(act, Natural | Null):
-            value = self._coordinates(target, name)
+            value = self._coordinates(name)
         elif isinstance(act, Draw):
             source = requested.space(act.source) if isinstance(act.source, str) else act.source
             values = {**self.static, **self._world.states(self.state)}
             value = self._moment.draw(source, name, requested.shape, values, act.stream)
         else:
-            present = self._coordinates(target, name)
+            present = self._coordinates(name)
             by = np.asarray(act.by)
             value = present + by if isinstance(act, Shift) else present * by
-        return np.asarray(value if name == target else requested.inverse.bind()(value))
+        return np.asarray(value)
 
     def _carry(self, variable: Measured) -> None:
         """Let a state follow the parents that act on it when set (a block that grows)."""
@@ -267,20 +284,16 @@ class Draft:
             return self._world.view(name, self.instant.state)
         return self.instant.static[name]
 
-    def check(self, accepted: Requests, space: AnyRegion | None) -> list[InterventionError]:
+    def check(self, asked: tuple[str, ...], space: AnyRegion | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
         problems = self._problems
         if space is None or problems:
             return problems
         context = self._context()
-        for target, (name, act) in accepted.items():
+        for name in asked:
             requested = self._world.model.declared(name)
             try:
-                value = (
-                    self._held(target, act)
-                    if target in self._world.actions
-                    else self._coordinates(target, name)
-                )
+                value = self._held(name) if self._is_action(name) else self._coordinates(name)
                 check_space(requested, value, space, context)
             except InterventionError as problem:
                 problems.append(problem)
@@ -289,13 +302,19 @@ class Draft:
     def _context(self) -> Values:
         return {**self.static, **self._world.states(self.state)}
 
-    def _held(self, target: str, act: Intervention) -> Value:
-        if isinstance(act, Hard):
-            return np.array(act.value)
+    def _is_action(self, name: str) -> bool:
+        return self._world.model.target(name) in self._world.actions
+
+    def _held(self, name: str) -> Value:
+        """Give the action that is to be taken from now on."""
+        acts = [self.accepted[target][1] for target in self._world.model.targets(name)]
+        if all(isinstance(act, Hard) for act in acts):
+            values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
+            return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
         raise InterventionError(
-            f"do({target}): {act!r} is another action at every step, so it cannot be compared "
+            f"do({name}): {acts[0]!r} is another action at every step, so it cannot be compared "
             "with a space; leave out `space`, or give one action as numbers",
-            variable=target,
+            variable=name,
         )
 
     def frozen(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:

@@ -102,6 +102,26 @@ class Together:
 
 
 @final
+class Copied:
+    """A bundle, whose numbers are those of its parts.
+
+    Args:
+        sources: Columns of the parts.
+        place: Its own columns.
+    """
+
+    def __init__(self, sources: list[slice], place: slice) -> None:
+        self._sources, self._targets = places(sources), places([place])
+
+    def begin(self, row: int, now: Values) -> None:
+        """Need nothing."""
+
+    def compute(self, matrix: Floats, rows: Integers) -> None:
+        """Copy the numbers."""
+        move_columns(matrix, rows, self._sources, self._targets)
+
+
+@final
 class Weighted:
     """A weighted sum of numbers, added up in the order of ``Linear``.
 
@@ -230,6 +250,8 @@ def _compiled(
     """Bind a mechanism that needs no Python for each row; None if it does."""
     if isinstance(variable.mechanism, Linear):
         return Weighted(variable.mechanism, columns, place)
+    if variable.parts:
+        return Copied(columns, place)
     function, constants = positional(variable.mechanism.bind(), len(columns))
     stacked = isinstance(function, Stacked)
     if stacked:

@@ -86,7 +86,7 @@ class Family:
             return None
         kept = {name: act for name, act in held.interventions.items() if name in self.head}
         model = self.head.with_interventions(kept).with_interventions(mine)
-        targets = {self.head.target(name) for name in (*kept, *mine)}
+        targets = {target for name in (*kept, *mine) for target in self.head.targets(name)}
         known = {
             v.name: static[v.name]
             for v in self.head.variables

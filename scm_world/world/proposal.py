@@ -19,7 +19,7 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM, flatten
 from scm_world.models import State
-from scm_world.variables import Draw, Hard, Intervention, Natural, Null
+from scm_world.variables import Draw, Hard, Intervention, Natural, Null, divided
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.draft import Draft, Requests
 from scm_world.world.restructure import restructured
@@ -89,9 +89,13 @@ class Proposal:
 def accept(
     instant: Instant, request: Mapping[str, Any]
 ) -> tuple[Requests, list[InterventionError]]:
-    """Check names, types and shapes; keep what is right and list what is wrong."""
+    """Check names, types and shapes; keep what is right and list what is wrong.
+
+    What is asked of a bundle is asked of its parts.
+    """
     model = instant.declaration.model
     accepted: Requests = {}
+    asked: dict[str, str] = {}
     problems: list[InterventionError] = []
     for name, value in flatten(request).items():
         if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
@@ -100,14 +104,17 @@ def accept(
             continue  # it is there
         try:
             act = _accept(instant, name, value)
-            target = model.target(name)
-            if target in accepted:
-                raise ConflictingTargets((accepted[target][0], name), target)
-            accepted[target] = (name, act)
+            for target in model.targets(name):
+                if target in asked:
+                    raise ConflictingTargets((asked[target], name), target)
+                asked[target] = name
+            for part, own in divided(model.declared(name), act).items():
+                accepted[model.target(part)] = (part, own)
         except InterventionError as problem:
             reason = instant.declaration.task.refusal(name)
-            known = reason is None or not isinstance(problem, UnknownVariable)
-            problems.append(problem if known else NotIntervenable(name, reason))
+            if reason is not None and isinstance(problem, UnknownVariable):
+                problem = NotIntervenable(name, reason)
+            problems.append(problem)
     return accepted, problems
 
 
@@ -159,14 +166,18 @@ def propose(
     model = instant.declaration.model
     # What was asked of bodies that are gone waits for them, should they come back at once.
     mine = {t: act for t, act in requests.items() if t in model}
+    asked = tuple(
+        name
+        for name in flatten(request)
+        if name in model and all(target in accepted for target in model.targets(name))
+    )
     draft = Draft(instant, accepted, mine, moment, earlier)
     with np.errstate(all="ignore"):  # what is not finite is refused by name
         draft.solve_parameters()
         if not (draft.is_impossible and len(world.family.head)):
             problems += draft.set_states()  # else bodies and layouts may not go together
-        problems += draft.check(accepted, space)
+        problems += draft.check(asked, space)
     raise_all(problems)
-    asked = tuple(name for name, _ in accepted.values())
     nulls = {n: (n, act) for n, act in flatten(request).items() if isinstance(act, Null)}
     frozen: Requests = {
         target: draft.frozen(target, *named) if target in model else named

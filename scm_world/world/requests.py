@@ -12,16 +12,18 @@ def merged(declaration: Declaration, *requests: Mapping[str, Any]) -> dict[str, 
     """Put interventions over one another; the last one that sets a quantity counts.
 
     Args:
-        declaration: Knows which names are coordinates of one quantity.
+        declaration: Knows which names are coordinates of one quantity, and which are bundles.
         requests: With dotted names.
     """
     merged_acts: dict[str, Any] = {}
     for acts in requests:
-        mine = {_target(declaration, name) for name in acts}
-        kept = {n: act for n, act in merged_acts.items() if _target(declaration, n) not in mine}
+        mine = {target for name in acts for target in _targets(declaration, name)}
+        kept = {
+            n: a for n, a in merged_acts.items() if not mine.issuperset(_targets(declaration, n))
+        }
         merged_acts = {**kept, **acts}
     return merged_acts
 
 
-def _target(declaration: Declaration, name: str) -> str:
-    return declaration.model.target(name) if name in declaration.model else name
+def _targets(declaration: Declaration, name: str) -> tuple[str, ...]:
+    return declaration.model.targets(name) if name in declaration.model else (name,)

@@ -82,7 +82,7 @@ def _static(
     instant: Instant, declaration: Declaration, model: SCM, moment: Moment
 ) -> dict[str, Value]:
     """Solve the new model from the roots that both have; those that are held follow from that."""
-    held = {model.target(name) for name in model.interventions}
+    held = {target for name in model.interventions for target in model.targets(name)}
     known = {
         v.name: instant.static[v.name]
         for v in model.variables

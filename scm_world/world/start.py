@@ -37,7 +37,7 @@ def beginning(declaration: Declaration, moment: Moment | None) -> tuple[dict[str
     state = declaration.empty_state()
     for variable in declaration.model.variables:
         where = declaration.slices.get(variable.name)
-        if where is not None and isinstance(variable, Measured):
+        if where is not None and isinstance(variable, Measured) and not variable.parts:
             state.vector[where] = np.ravel(_first(declaration, variable, static))
     return static, state
 

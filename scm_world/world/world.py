@@ -42,6 +42,10 @@ class World(Stepped):
         preset: Of the robot's tasks: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
         action_mode: Of the robot's tasks: ``"joint_positions"``, ``"joint_torques"`` or
             ``"end_effector_positions"``.
+        resolution: Of the robot's tasks: whether joint positions, velocities, torques and actions
+            are variables of the whole robot (``"vector"``), of each ``"finger"`` or of each
+            ``"joint"``. The names of the whole robot can be used at every resolution, and nothing
+            that happens depends on it.
         frame_skip: Length of a control step: of the robot's tasks in units of 4 ms, whatever the
             preset; of a model in its physics steps. The default of the task if None.
         max_episode_length: In control steps; the task's own length if None.
@@ -71,6 +75,7 @@ class World(Stepped):
         backend: Backend | str = "mujoco",
         preset: str | None = None,
         action_mode: str | None = None,
+        resolution: str | None = None,
         frame_skip: int | None = None,
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
@@ -83,6 +88,7 @@ class World(Stepped):
             kind,
             preset=preset,
             action_mode=action_mode,
+            resolution=resolution,
             frame_skip=frame_skip,
             max_episode_length=max_episode_length,
             conventions_name=conventions,
@@ -326,7 +332,8 @@ class World(Stepped):
         self._now.update(declaration.states(self._state))
         views = [(name, declaration.view(name, self._state)) for name in declaration.whole]
         self._counted = tuple((self._now[name], view) for name, view in views)
-        self._readouts = Readouts(declaration.model, self._now, self._before, declaration.computed)
+        order = tuple(name for name in declaration.computed if name not in self._now)
+        self._readouts = Readouts(declaration.model, self._now, self._before, order)
 
     def current(self) -> tuple[Values, State]:
         """Give the live values and the live state, for the parts of a ``do``."""
