@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, final
 
@@ -26,6 +26,9 @@ from scm_world.models.scene import ParameterKey
 
 SMALLEST = 1e-9
 """Below this no mass [kg], time [s] or length [m] is accepted."""
+
+MEDIUM = ("density", "viscosity", "wind")
+"""Options that act once a medium does."""
 
 GRAY = (0.5, 0.5, 0.5, 1.0)
 """The color of a shape for which MuJoCo takes that of its material."""
@@ -165,33 +168,36 @@ class Direction(Slot):
 
 
 @final
-@dataclass(frozen=True)
 class Color(Slot):
     """Red, green, blue and opacity, which MuJoCo keeps as 32 bits each.
 
     A shape with a material has the color of the material while its own is ``GRAY``.
 
-    Attributes:
+    Args:
         numbers: Of the shape.
         material: Of its material, or None.
     """
 
-    numbers: NDArray[np.float32]
-    material: NDArray[np.float32] | None
+    def __init__(self, numbers: NDArray[np.float32], material: NDArray[np.float32] | None) -> None:
+        self._numbers, self._material = numbers, material
+        self._inherits = material is not None and self._is_gray()
+
+    def _is_gray(self) -> bool:
+        return bool((self._numbers == np.array(GRAY, dtype=np.float32)).all())
 
     def write(self, value: Floats) -> None:
         """Write a color."""
-        self.numbers[:] = value
-        if self.material is not None and (self.numbers == self.material).all():
-            self.numbers[:] = GRAY
-        elif self.material is not None and (self.numbers == np.float32(GRAY)).all():
-            self.numbers[0] = np.nextafter(np.float32(0.5), np.float32(1.0))
+        self._numbers[:] = value
+        if self._inherits and (self._numbers == self._material).all():
+            self._numbers[:] = GRAY
+        elif self._inherits and self._is_gray():  # as little as can be, so that it is shown
+            self._numbers[0] = np.nextafter(np.float32(0.5), np.float32(1.0))
 
     def read(self) -> Floats:
         """Read it with the digits that 32 bits hold: 0.3 is read as 0.3."""
-        found = self.numbers
-        if self.material is not None and (found == np.float32(GRAY)).all():
-            found = self.material
+        found = self._numbers
+        if self._inherits and self._material is not None and self._is_gray():
+            found = self._material
         return np.array([float(str(number)) for number in found])
 
 
@@ -979,37 +985,58 @@ def tendon_unit(mj: mujoco.MjModel, tendon: int) -> str:
     return units.pop() if len(units) == 1 else "1"
 
 
-def table(
-    mj: mujoco.MjModel, reserved: Sequence[tuple[str, str]] = (), *, fluid: bool = False
-) -> list[Field]:
+def table(mj: mujoco.MjModel, *, fluid: bool = False) -> list[Field]:
     """List the parameters of a compiled model, each with its own name.
 
     Where two elements have the same name and attribute, the usual one keeps the plain name; if
-    none or both are usual, both are told apart by their kind: ``"geom:torso.friction"``.
+    none or both are usual, both are told apart by their kind: ``"geom:torso.color"``. So is what
+    has the name of a state.
 
     Args:
         mj: The model, which is only read.
-        reserved: Kinds and names of states and inputs, which are not given away.
         fluid: Whether a medium may be made to act although it does not now.
     """
     fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
-    found = list(Table(mj, element_names(mj), Couplings(mj, fluid), fluid).fields())
+    names = element_names(mj)
+    found = list(Table(mj, names, Couplings(mj, fluid), fluid).fields())
     claims: dict[str, list[Field]] = {}
     for field in found:
         claims.setdefault(field.plain_name, []).append(field)
-    taken = {name for _, name in reserved}
+    states = _state_names(mj, names)
     named = []
     for field in found:
-        rivals = claims[field.plain_name]
-        first = field.usual and not field.refusal
-        alone = len(rivals) == 1 or (
-            first and sum(rival.usual and not rival.refusal for rival in rivals) == 1
-        )
-        plain = alone and field.plain_name not in taken
+        usual = [rival for rival in claims[field.plain_name] if rival.usual and not rival.refusal]
+        alone = len(claims[field.plain_name]) == 1 or (len(usual) == 1 and usual[0] is field)
+        plain = alone and field.plain_name not in states
         named.append(
             replace(field, name=field.plain_name if plain else f"{field.kind}:{field.plain_name}")
         )
     return named
+
+
+def _state_names(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> set[str]:
+    """Name the states that have an attribute in common with parameters."""
+    found = set()
+    for joint, kind in enumerate(mj.jnt_type.tolist()):
+        if kind in (_SLIDE, _HINGE):
+            found.add(f"{names['joint'][joint]}.position")
+        else:
+            element = (
+                names["body"][mj.jnt_bodyid[joint]] if kind == _FREE else names["joint"][joint]
+            )
+            found.add(f"{element}.orientation")
+    return found
+
+
+def places(
+    mj: mujoco.MjModel, keys: Collection[ParameterKey], data: mujoco.MjData | None = None
+) -> dict[ParameterKey, Slot]:
+    """Find the places of some parameters in a compiled model; see ``slots``."""
+    return {
+        field.key: field.slot(mj, data)
+        for field in table(mj)
+        if field.key in keys and field.slot is not None
+    }
 
 
 def slots(
@@ -1024,11 +1051,4 @@ def slots(
         model: Its description.
         data: Where the model is stepped; only models with mocap bodies need it.
     """
-    exposed = {row.key for row in model.parameters}
-    reserved = [("", row.name) for row in (*model.states, *model.inputs)]
-    fluid = any(row.name in ("density", "viscosity", "wind") for row in model.parameters)
-    return {
-        field.key: field.slot(mj, data)
-        for field in table(mj, reserved, fluid=fluid)
-        if field.key in exposed and field.slot is not None
-    }
+    return places(mj, {row.key for row in model.parameters}, data)

@@ -6,19 +6,21 @@ import fnmatch
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from scm_world._types import Integers
-from scm_world.backends.mujoco.fields import Field, element_names, table, tendon_unit
-from scm_world.backends.mujoco.sources import Source, read_source
+from scm_world.backends.mujoco.bodies import describe
+from scm_world.backends.mujoco.fields import MEDIUM, Field, element_names, table
+from scm_world.backends.mujoco.readouts import find_readouts
+from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, nearest
-from scm_world.models.model import Input, Model, Numbers, Parameter, Readout, StateRow
+from scm_world.models.bodies import Bodies
+from scm_world.models.model import Input, Model, Numbers, Parameter, StateRow
 
 _DSBL, _JNT, _TRN, _INT = (
     mujoco.mjtDisableBit,
@@ -62,22 +64,23 @@ def read_model(
     sealed, own_name, where = read_source(
         source, fixed_base=fixed_base, options=dict(settings or {})
     )
-    try:
-        mj = _compiled(sealed)
-    except (ValueError, mujoco.FatalError) as error:
-        said = " ".join(str(error).split())
-        raise ModelError([f"MuJoCo cannot compile {where}: {said}; correct the model"]) from error
+    with understood(where):
+        mj, notes = realized(sealed)
     _check(mj, sealed, where)
     trees = Couplings(mj)
     names = element_names(mj)
     states, inputs = tuple(_states(mj, names, trees)), tuple(_inputs(mj, names, trees))
+    placed = [
+        (row, state.array, state.numbers, state.index if state.kind == "joint" else -1)
+        for row, state in zip(states, _moving(mj, names), strict=True)
+    ]
     patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
-    medium = ("density", "viscosity", "wind")
-    fluid = patterns is not None and any(fnmatch.filter(medium, p) for p in patterns if p != "*")
-    fields = table(mj, [("", row.name) for row in (*states, *inputs)], fluid=fluid)
+    fluid = patterns is not None and any(fnmatch.filter(MEDIUM, p) for p in patterns if p != "*")
+    fields = table(mj, fluid=fluid)
     chosen = _exposed(fields, patterns)
-    parameters = tuple(_parameter(mj, field) for field in fields if field.name in chosen)
-    model = Model(
+    data = mujoco.MjData(mj) if mj.nmocap else None
+    parameters = tuple(_parameter(mj, data, field) for field in fields if field.name in chosen)
+    return Model(
         name=name or own_name or "model",
         digest=_digest(sealed, parameters),
         source=sealed,
@@ -85,15 +88,16 @@ def read_model(
         parameters=parameters,
         states=states,
         inputs=inputs,
+        readouts=tuple(find_readouts(mj, sealed, placed, parameters, tuple(readouts))),
         trees=tuple(names["body"][root] for root in trees.roots),
         refused=tuple(
             (field.name, field.refusal or "is not exposed; name it in expose=[…]")
             for field in fields
             if field.name not in chosen
         ),
-        notes=tuple(_notes(mj, sealed)),
+        notes=(*notes, *_notes(mj)),
+        describe=described,
     )
-    return model
 
 
 def compiled(model: Model) -> mujoco.MjModel:
@@ -101,36 +105,12 @@ def compiled(model: Model) -> mujoco.MjModel:
 
     It is compiled once in a process. Callers copy it before they change it.
     """
-    source: Source = model.source
-    return _compiled(source)
+    return realized(model.source)[0]
 
 
-@lru_cache(maxsize=32)
-def _compiled(source: Source) -> mujoco.MjModel:
-    """Compile, and let trees that do not touch leave one another alone to the last bit.
-
-    The causes of leaks, as measured: one solve for all constraints instead of one for each island,
-    a warm start that is chosen for all, sleep, the reset of everything after a number that is not
-    finite, and Euler's implicit damping, which begins for all trees with the first damped joint.
-    """
-    mj = source.compile()
-    options = mj.opt
-    options.disableflags |= int(_DSBL.mjDSBL_WARMSTART) | int(_DSBL.mjDSBL_AUTORESET)
-    options.disableflags &= ~int(_DSBL.mjDSBL_ISLAND)
-    options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    if _mixes_damping(mj):
-        if mj.nflex:
-            options.disableflags |= int(_DSBL.mjDSBL_EULERDAMP)
-        else:
-            options.integrator = int(_INT.mjINT_IMPLICITFAST)
-    return mj
-
-
-def _mixes_damping(mj: mujoco.MjModel) -> bool:
-    """Tell whether Euler's implicit damping would tie trees together."""
-    several = len(set(mj.body_rootid[mj.body_treeid >= 0].tolist())) > 1
-    damped = not mj.opt.disableflags & int(_DSBL.mjDSBL_EULERDAMP)
-    return several and damped and mj.opt.integrator == int(_INT.mjINT_EULER)
+def described(model: Model) -> Bodies:
+    """Describe the bodies of a model, for engines that do not read its source."""
+    return describe(compiled(model))
 
 
 def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
@@ -141,7 +121,8 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
     """
     problems = []
     if mj.nv == 0:
-        problems.append(f"{where} has no joint: nothing in it can move; add one")
+        hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
+        problems.append(f"{where} has no joint, so that nothing in it can move; {hint}")
     if mj.nplugin:
         named = sorted({p.plugin_name for p in _spec(source).plugins}) if source.text else []
         shown = f" ({', '.join(named)})" if named else ""
@@ -181,24 +162,14 @@ def _spec(source: Source) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(source.text, assets=dict(source.assets))
 
 
-def _notes(mj: mujoco.MjModel, source: Source) -> Iterator[str]:
-    """Say what is different from the file, and what acts without having a variable."""
-    own = source.compile().opt if mj.opt.integrator == int(_INT.mjINT_IMPLICITFAST) else mj.opt
-    if own.integrator != mj.opt.integrator:
-        yield (
-            "The integrator is implicitfast instead of Euler, whose implicit damping would tie "
-            "trees together that do not touch."
-        )
+def _notes(mj: mujoco.MjModel) -> Iterator[str]:
+    """Say what acts without having a variable, and what is not used."""
     if mj.nflex:
         yield f"{mj.nflex} flex(es) act through their vertices; their material has no variables."
-        if mj.opt.disableflags & int(_DSBL.mjDSBL_EULERDAMP):
-            yield "Joint damping is explicit, because flexes do not allow for implicitfast."
     if mj.nskin:
         yield f"{mj.nskin} skin(s) act on pictures only."
     if mj.nkey:
         yield f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file."
-    if mj.nuserdata:
-        yield "User data acts on nothing."
 
 
 def _digest(source: Source, parameters: Sequence[Parameter]) -> str:
@@ -243,10 +214,10 @@ def _exposed(fields: Sequence[Field], patterns: Sequence[str] | None) -> set[str
     return found
 
 
-def _parameter(mj: mujoco.MjModel, field: Field) -> Parameter:
+def _parameter(mj: mujoco.MjModel, data: mujoco.MjData | None, field: Field) -> Parameter:
     """Describe a field with what it is in the model as it was given."""
     assert field.slot is not None
-    slot = field.slot(mj, mujoco.MjData(mj) if "mocap" in field.doc else None)
+    slot = field.slot(mj, data)
     default = slot.read()
     always, contact = field.effect()
     return Parameter(

@@ -1,0 +1,376 @@
+"""What follows from the states of a model at once: poses, velocities, sensors.
+
+A readout computes on a model and data of its own, in which everything that is not among its
+parents stays as it is in the file. So its value is a function of its parents, to the last bit.
+"""
+
+from __future__ import annotations
+
+import copy
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, final
+
+import mujoco
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.backends.mujoco.fields import clean, element_names, places, tendon_unit
+from scm_world.backends.mujoco.slots import Slot
+from scm_world.backends.mujoco.sources import Source, realized
+from scm_world.backends.mujoco.trees import disabled
+from scm_world.errors import ModelError, nearest
+from scm_world.models.model import Parameter, Readout, StateRow
+from scm_world.models.scene import ParameterKey
+
+_OBJ, _SENS, _STAGE, _TRN = mujoco.mjtObj, mujoco.mjtSensor, mujoco.mjtStage, mujoco.mjtTrn
+_POSES = {
+    "position": ("m", (3,), "Place of the {kind} in the world."),
+    "orientation": ("1", (4,), "Orientation of the {kind} in the world (x, y, z, w), w >= 0."),
+    "linear_velocity": ("m/s", (3,), "Velocity of the {kind} in the world."),
+    "angular_velocity": ("rad/s", (3,), "Angular velocity of the {kind} in the world."),
+}
+_OBJECTS = {"site": _OBJ.mjOBJ_SITE, "body": _OBJ.mjOBJ_XBODY, "geom": _OBJ.mjOBJ_GEOM}
+_MOVING = ("position", "orientation", "axis", "anchor", "ref")
+"""Attributes that decide where things are."""
+
+
+@lru_cache(maxsize=64)
+def _scratch(
+    source: Source, keys: tuple[ParameterKey, ...], thread: int
+) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, dict[ParameterKey, Slot]]:
+    """Give a model and data to compute on: for each thread, and for each set of parameters."""
+    mj = realized(source)[0]
+    mj = copy.copy(mj) if keys else mj
+    data = mujoco.MjData(mj)
+    for each in (data, other := mujoco.MjData(mj)):
+        each.warning.number[:] = 1  # no warnings on the console
+    return mj, data, other, places(mj, keys, data) if keys else {}
+
+
+@dataclass(frozen=True)
+class _Computed(ABC):
+    """A function of states and parameters, in this order.
+
+    Attributes:
+        source: Of the model.
+        states: For each state, which numbers of ``"qpos"``, ``"qvel"`` or ``"act"`` it is.
+        keys: Of the parameters.
+        index: Of the element.
+    """
+
+    source: Source
+    states: tuple[tuple[str, tuple[int, ...]], ...]
+    keys: tuple[ParameterKey, ...]
+    index: int
+
+    def __call__(self, *values: Any) -> Floats | float:
+        """Compute the value from those of the parents."""
+        mj, data, scratch, slots = _scratch(self.source, self.keys, threading.get_ident())
+        data.qpos[:], data.qvel[:] = mj.qpos0, 0.0
+        for (array, numbers), value in zip(self.states, values, strict=False):
+            getattr(data, array)[list(numbers)] = value
+        for key, value in zip(self.keys, values[len(self.states) :], strict=True):
+            slots[key].write(np.asarray(value, dtype=np.float64))
+        if any(slots[key].constant for key in self.keys):
+            mujoco.mj_setConst(mj, scratch)
+        return self._value(mj, data)
+
+    @abstractmethod
+    def _value(self, mj: mujoco.MjModel, data: mujoco.MjData) -> Floats | float:
+        """Compute it from positions and velocities."""
+
+
+@final
+@dataclass(frozen=True)
+class Pose(_Computed):
+    """Where a site, body or shape is, or how it moves.
+
+    Attributes:
+        kind: Of the element.
+        attribute: What is asked for.
+    """
+
+    kind: str
+    attribute: str
+
+    def _value(self, mj: mujoco.MjModel, data: mujoco.MjData) -> Floats:
+        mujoco.mj_kinematics(mj, data)
+        if self.attribute.endswith("velocity"):
+            mujoco.mj_comPos(mj, data)
+            mujoco.mj_comVel(mj, data)
+            found = np.empty(6)
+            mujoco.mj_objectVelocity(mj, data, _OBJECTS[self.kind], self.index, found, 0)
+            return found[:3] if self.attribute == "angular_velocity" else found[3:]
+        prefix = {"site": "site_x", "body": "x", "geom": "geom_x"}[self.kind]
+        if self.attribute == "position":
+            return np.array(getattr(data, f"{prefix}pos")[self.index])
+        turned = np.empty(4)
+        mujoco.mju_mat2Quat(turned, getattr(data, f"{prefix}mat")[self.index])
+        return turned[[1, 2, 3, 0]] * (-1.0 if turned[0] < 0.0 else 1.0)
+
+
+@final
+@dataclass(frozen=True)
+class Sensed(_Computed):
+    """What a sensor of positions or velocities measures."""
+
+    def _value(self, mj: mujoco.MjModel, data: mujoco.MjData) -> Floats | float:
+        mujoco.mj_fwdPosition(mj, data)
+        mujoco.mj_sensorPos(mj, data)
+        if mj.sensor_needstage[self.index] == int(_STAGE.mjSTAGE_VEL):
+            mujoco.mj_fwdVelocity(mj, data)
+            mujoco.mj_sensorVel(mj, data)
+        first, size = int(mj.sensor_adr[self.index]), int(mj.sensor_dim[self.index])
+        found = data.sensordata[first : first + size].copy()
+        return found if size > 1 else float(found[0])
+
+
+# --- finding -----------------------------------------------------------------------------------
+
+
+def find_readouts(
+    mj: mujoco.MjModel,
+    source: Source,
+    states: Sequence[tuple[StateRow, str, Sequence[int], int]],
+    parameters: Sequence[Parameter],
+    wanted: Sequence[str],
+) -> Iterator[Readout]:
+    """Describe what was asked for.
+
+    Args:
+        mj: The compiled model.
+        source: What it was compiled from.
+        states: Each with the array it is in, its numbers there, and its joint (-1 if it has none).
+        parameters: Those that are exposed.
+        wanted: Names: ``"tip.position"``, ``"body:tip.position"``, ``"imu.value"``.
+
+    Raises:
+        ModelError: All names that cannot be computed, with the reasons.
+    """
+    finder = _Finder(mj, source, states, parameters)
+    problems = []
+    for name in wanted:
+        found = finder.find(name)
+        if isinstance(found, str):
+            problems.append(f"readouts={name!r}: {found}")
+        else:
+            yield found
+    if problems:
+        raise ModelError(problems)
+
+
+@final
+class _Finder:
+    """Looks for elements, and for what decides where they are."""
+
+    def __init__(
+        self,
+        mj: mujoco.MjModel,
+        source: Source,
+        states: Sequence[tuple[StateRow, str, Sequence[int], int]],
+        parameters: Sequence[Parameter],
+    ) -> None:
+        self._mj, self._source, self._states = mj, source, states
+        self._parameters = [row for row in parameters if not row.visual]
+        self._names = element_names(mj)
+
+    def find(self, name: str) -> Readout | str:
+        """Describe a readout, or say what is wrong with its name."""
+        prefix, _, plain = name.rpartition(":")
+        element, _, attribute = plain.rpartition(".")
+        taken = [row.name for row in (*self._parameters, *(row for row, *_ in self._states))]
+        if name in taken:
+            return f"it is a variable already; write a kind before it, as in 'body:{name}'"
+        if attribute == "value":
+            return self._sensor(name, element)
+        if attribute not in _POSES:
+            allowed = ", ".join((*_POSES, "value"))
+            return f"{attribute!r} is nothing that can be computed; there are: {allowed}"
+        for kind in [prefix] if prefix else _OBJECTS:
+            if kind in _OBJECTS and clean(element) in self._names[kind]:
+                return self._pose(name, kind, self._names[kind].index(clean(element)), attribute)
+        known = [n for kind in _OBJECTS for n in self._names[kind]]
+        near = nearest(element, known)
+        return f"no site, body or shape is called {element!r}" + (
+            f"; did you mean {near!r}?" if near else ""
+        )
+
+    def _pose(self, name: str, kind: str, index: int, attribute: str) -> Readout:
+        unit, shape, doc = _POSES[attribute]
+        states, keys = self._parents([(kind, index)], attribute.endswith("velocity"))
+        function = Pose(self._source, self._places(states), keys, index, kind, attribute)
+        return self._row(name, unit, shape, states, keys, function, doc.format(kind=kind))
+
+    def _row(
+        self,
+        name: str,
+        unit: str,
+        shape: tuple[int, ...],
+        states: Sequence[str],
+        keys: Sequence[ParameterKey],
+        function: _Computed,
+        doc: str,
+    ) -> Readout:
+        named = {row.key: row.name for row in self._parameters}
+        parents = (*states, *(named[key] for key in keys))
+        return Readout(name, unit, shape, parents, function, doc)
+
+    def _places(self, states: Iterable[str]) -> tuple[tuple[str, tuple[int, ...]], ...]:
+        where = {row.name: (array, tuple(numbers)) for row, array, numbers, _ in self._states}
+        return tuple(where[name] for name in states)
+
+    def _parents(
+        self, objects: Iterable[tuple[str, int]], velocity: bool
+    ) -> tuple[list[str], tuple[ParameterKey, ...]]:
+        """Find the states and parameters that decide where some objects are."""
+        mj, elements, joints = self._mj, set[tuple[str, str]](), set[int]()
+        for kind, index in objects:
+            elements.add((kind, self._names[kind][index]))
+            body = {"site": mj.site_bodyid, "geom": mj.geom_bodyid}.get(kind, range(mj.nbody))[
+                index
+            ]
+            while body:
+                elements.add(("body", self._names["body"][body]))
+                first = int(mj.body_jntadr[body])
+                joints |= set(range(first, first + int(mj.body_jntnum[body])))
+                body = mj.body_parentid[body]
+        elements |= {("joint", self._names["joint"][joint]) for joint in joints}
+        arrays = ("qpos", "qvel") if velocity else ("qpos",)
+        states = [
+            row.name for row, array, _, joint in self._states if array in arrays and joint in joints
+        ]
+        keys = tuple(
+            row.key
+            for row in self._parameters
+            if row.key[1] in _MOVING and any(_belongs(row.key, *element) for element in elements)
+        )
+        return states, keys
+
+    # --- sensors -------------------------------------------------------------------------------
+
+    def _sensor(self, name: str, element: str) -> Readout | str:
+        mj, sensors = self._mj, self._names["sensor"]
+        if clean(element) not in sensors:
+            near = nearest(element, sensors)
+            return f"no sensor is called {element!r}" + (
+                f"; did you mean {near!r}?" if near else ""
+            )
+        index = sensors.index(clean(element))
+        kind = mujoco.mjtSensor(int(mj.sensor_type[index]))
+        reason = self._hidden(index, kind)
+        if reason:
+            return reason
+        velocity = mj.sensor_needstage[index] == int(_STAGE.mjSTAGE_VEL)
+        objects = self._objects(index, kind)
+        if kind in _OF_JOINTS:
+            array, joint = "qvel" if velocity else "qpos", int(mj.sensor_objid[index])
+            states = [row.name for row, a, _, j in self._states if a == array and j == joint]
+            keys: tuple[ParameterKey, ...] = ()
+        elif objects is None:
+            states = [row.name for row, *_ in self._states if "activation" not in row.name]
+            keys = tuple(row.key for row in self._parameters)
+        else:
+            states, keys = self._parents(objects, velocity)
+        function = Sensed(self._source, self._places(states), keys, index)
+        size = int(mj.sensor_dim[index])
+        shape = (size,) if size > 1 else ()
+        what = kind.name.removeprefix("mjSENS_").lower()
+        return self._row(
+            name, self._unit(index, kind), shape, states, keys, function, f"The {what} sensor."
+        )
+
+    def _hidden(self, index: int, kind: mujoco.mjtSensor) -> str:
+        """Say why a sensor is no function of states and parameters, if it is none."""
+        mj = self._mj
+        if disabled(mj, mujoco.mjtDisableBit.mjDSBL_SENSOR):
+            return "the model disables sensors"
+        if kind == _SENS.mjSENS_CLOCK:
+            return "it is the time, and no function of the state"
+        if kind in (_SENS.mjSENS_USER, _SENS.mjSENS_PLUGIN):
+            return "what it measures is decided by a callback or plugin"
+        if (
+            mj.sensor_historyadr[index] >= 0
+            or mj.sensor_delay[index]
+            or mj.sensor_interval[index, 0]
+        ):
+            return "it has a delay or an interval, and so a memory"
+        if mj.sensor_needstage[index] not in (int(_STAGE.mjSTAGE_POS), int(_STAGE.mjSTAGE_VEL)):
+            return "it measures forces or accelerations, which are no function of the state alone"
+        return ""
+
+    def _objects(self, index: int, kind: mujoco.mjtSensor) -> list[tuple[str, int]] | None:
+        """List what decides the value of a sensor; None where that may be anything."""
+        mj = self._mj
+        target = int(mj.sensor_objid[index])
+        match kind:
+            case (
+                _SENS.mjSENS_FRAMEPOS
+                | _SENS.mjSENS_FRAMEQUAT
+                | _SENS.mjSENS_FRAMEXAXIS
+                | _SENS.mjSENS_FRAMEYAXIS
+                | _SENS.mjSENS_FRAMEZAXIS
+                | _SENS.mjSENS_FRAMELINVEL
+                | _SENS.mjSENS_FRAMEANGVEL
+                | _SENS.mjSENS_VELOCIMETER
+                | _SENS.mjSENS_GYRO
+            ):
+                ends = [(int(mj.sensor_objtype[index]), target)]
+                if mj.sensor_refid[index] >= 0:
+                    ends.append((int(mj.sensor_reftype[index]), int(mj.sensor_refid[index])))
+                kinds = {
+                    int(_OBJ.mjOBJ_SITE): "site",
+                    int(_OBJ.mjOBJ_GEOM): "geom",
+                    int(_OBJ.mjOBJ_XBODY): "body",
+                }
+                if any(obj not in kinds for obj, _ in ends):
+                    return None  # inertial frames and cameras follow more
+                return [(kinds[obj], end) for obj, end in ends]
+            case _:
+                return None
+
+    def _unit(self, index: int, kind: mujoco.mjtSensor) -> str:
+        """Give the unit of a sensor; ``"1"`` where it mixes or has none."""
+        mj, target = self._mj, int(self._mj.sensor_objid[index])
+        if kind in (_SENS.mjSENS_JOINTPOS, _SENS.mjSENS_JOINTVEL, _SENS.mjSENS_JOINTLIMITPOS):
+            slides = mj.jnt_type[target] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+            unit = "m" if slides else "rad"
+        elif kind in (_SENS.mjSENS_TENDONPOS, _SENS.mjSENS_TENDONVEL, _SENS.mjSENS_TENDONLIMITPOS):
+            unit = tendon_unit(mj, target)
+        else:
+            return _UNITS.get(kind, "1")
+        speed = kind in (_SENS.mjSENS_JOINTVEL, _SENS.mjSENS_TENDONVEL)
+        return f"{unit}/s" if speed and unit != "1" else unit
+
+
+_OF_JOINTS = (
+    _SENS.mjSENS_JOINTPOS,
+    _SENS.mjSENS_JOINTVEL,
+    _SENS.mjSENS_BALLQUAT,
+    _SENS.mjSENS_BALLANGVEL,
+)
+_UNITS = {
+    _SENS.mjSENS_VELOCIMETER: "m/s",
+    _SENS.mjSENS_GYRO: "rad/s",
+    _SENS.mjSENS_MAGNETOMETER: "T",
+    _SENS.mjSENS_RANGEFINDER: "m",
+    _SENS.mjSENS_BALLANGVEL: "rad/s",
+    _SENS.mjSENS_FRAMEPOS: "m",
+    _SENS.mjSENS_FRAMELINVEL: "m/s",
+    _SENS.mjSENS_FRAMEANGVEL: "rad/s",
+    _SENS.mjSENS_SUBTREECOM: "m",
+    _SENS.mjSENS_SUBTREELINVEL: "m/s",
+    _SENS.mjSENS_SUBTREEANGMOM: "kg m^2/s",
+    _SENS.mjSENS_GEOMDIST: "m",
+    _SENS.mjSENS_GEOMFROMTO: "m",
+    _SENS.mjSENS_E_POTENTIAL: "J",
+    _SENS.mjSENS_E_KINETIC: "J",
+}
+
+
+def _belongs(key: ParameterKey, kind: str, element: str) -> bool:
+    """Tell whether a parameter is one of an element."""
+    return key[0] in (element, f"{kind}:{element}")
