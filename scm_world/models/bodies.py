@@ -8,7 +8,8 @@ that those before it have moved.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, final
 
 from scm_world._types import Floats
@@ -147,6 +148,26 @@ class Actuator:
     force_range: tuple[float, float] | None = None
 
 
+@final
+@dataclass(frozen=True)
+class Coupling:
+    """A joint that follows another one: ``x - reference = offset + ratio (x' - reference')``.
+
+    Attributes:
+        name: As errors call it.
+        joint: Number of the hinge or slide with the coordinate x.
+        leader: Number of that with the coordinate x'.
+        offset: [rad] or [m].
+        ratio: See above.
+    """
+
+    name: str
+    joint: int
+    leader: int
+    offset: float
+    ratio: float
+
+
 class Part(NamedTuple):
     """Where a number of a parameter stands in a row.
 
@@ -186,6 +207,7 @@ class Bodies:
         joints: In the order in which they act.
         geoms: What can touch something.
         actuators: What follows commands.
+        couplings: Joints that follow others.
         touching: The pairs of geoms that may touch each other, in ascending order.
         gravity: [m/s²].
         timestep: Physics step [s].
@@ -199,6 +221,7 @@ class Bodies:
     joints: tuple[Joint, ...]
     geoms: tuple[Geom, ...]
     actuators: tuple[Actuator, ...]
+    couplings: tuple[Coupling, ...]
     touching: tuple[tuple[int, int], ...]
     gravity: Vector
     timestep: float
@@ -212,26 +235,29 @@ class Bodies:
         Args:
             values: Numbers, or sequences of them.
         """
-        tables = {
-            table.name: list(getattr(self, table.name))
-            for table in fields(self)
-            if table.name in ("bodies", "joints", "geoms", "actuators")
+        tables: dict[str, list[Any]] = {
+            "bodies": list(self.bodies),
+            "joints": list(self.joints),
+            "geoms": list(self.geoms),
+            "actuators": list(self.actuators),
         }
-        shared: dict[str, Any] = {}
+        changed: dict[str, Any] = {}
         for key, value in values.items():
             table, row, parts = self.places[key]
             plain = tuple(value) if isinstance(value, Sequence) else float(value)
             if not table:
-                shared[parts[0].field] = plain
+                changed[parts[0].field] = plain
                 continue
-            changes: dict[str, Any] = {}
             for part in parts:
-                changes[part.field] = _with_part(tables[table][row], part, plain)
-                tables[table][row] = replace(tables[table][row], **changes)
-        return replace(self, **{name: tuple(rows) for name, rows in tables.items()}, **shared)
+                element = tables[table][row]
+                value_there = _with_part(element, part, plain)
+                tables[table][row] = replace(element, **{part.field: value_there})
+        changed.update((name, tuple(rows)) for name, rows in tables.items())
+        return replace(self, **changed)
 
-    def moving(self) -> tuple[int, ...]:
-        """Give for each body the one at the root of all that moves with it; 0 if it is fixed."""
+    @cached_property
+    def roots(self) -> tuple[int, ...]:
+        """For each body the one at the root of all that moves with it; 0 if it is fixed."""
         jointed = {joint.body for joint in self.joints}
         roots = [0]
         for number, body in enumerate(self.bodies[1:], start=1):

@@ -18,7 +18,7 @@ from scm_world.backends.bullet.history import History, Record, SavedState, reliv
 from scm_world.backends.bullet.model.client import ModelClient
 from scm_world.backends.bullet.trifinger.client import TriFingerClient
 from scm_world.backends.bullet.values import Instant, Values
-from scm_world.errors import EngineFailure, SnapshotMismatch
+from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
@@ -247,7 +247,14 @@ class BulletBackend(Backend):
         into.vector[:] = numbers
 
     def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
-        """Hold a command for some physics steps."""
+        """Hold a command for some physics steps.
+
+        Raises:
+            UnknownOption: Commands of this structure mean something else.
+        """
+        modes = self._kind(self.structure).modes
+        if mode not in modes:
+            raise UnknownOption("control mode", str(mode), map(str, modes))
         numbers, size = np.asarray(command, dtype=np.float64).tolist(), self.structure.n_commands
         if len(numbers) != size:
             raise ValueError(f"a command has {size} numbers, got {len(numbers)}")

@@ -7,7 +7,7 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from scm_world._types import Floats
 from scm_world.backends.base import Contact
 from scm_world.backends.bullet.values import Instant, Values
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode, ParameterKey, Structure
+from scm_world.models.scene import ControlMode, ParameterKey
 from scm_world.models.state import State
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
@@ -29,11 +29,14 @@ class Client(ABC):
     the bodies, sets and reads them, and steps. Everything else is here.
 
     Attributes:
+        modes: What a command can mean.
         engine: The module ``pybullet``.
         handle: The number of the client; None once it is closed.
         applied: The value of each parameter that is in force.
         generation: Counts the canonical states; a saved state is exact within one of them.
     """
+
+    modes: ClassVar[tuple[ControlMode, ...]]
 
     def __init__(self, engine: Any) -> None:
         self.engine = engine
@@ -54,12 +57,12 @@ class Client(ABC):
 
     @staticmethod
     @abstractmethod
-    def keys(structure: Structure) -> Iterable[ParameterKey]:
+    def keys(structure: Any) -> Iterable[ParameterKey]:
         """List every parameter of a structure, in the order in which they are set."""
 
     @staticmethod
     @abstractmethod
-    def check(structure: Structure, parameters: Values) -> None:
+    def check(structure: Any, parameters: Values) -> None:
         """Say what the engine cannot honour, before anything is made.
 
         Raises:
@@ -69,12 +72,12 @@ class Client(ABC):
 
     @staticmethod
     @abstractmethod
-    def heavy(structure: Structure) -> Iterable[ParameterKey]:
+    def heavy(structure: Any) -> Iterable[ParameterKey]:
         """List the parameters that need new bodies, or new contacts."""
 
     @staticmethod
     @abstractmethod
-    def settle(structure: Structure, given: State) -> list[float]:
+    def settle(structure: Any, given: State) -> list[float]:
         """Turn a state into plain numbers: unit quaternions, and 0 for what nobody can set.
 
         Raises:
@@ -84,7 +87,7 @@ class Client(ABC):
 
     @staticmethod
     @abstractmethod
-    def rotations(structure: Structure) -> Sequence[int]:
+    def rotations(structure: Any) -> Sequence[int]:
         """List where in the state the quaternions (x, y, z, w) begin."""
 
     # --- what is done in the engine -------------------------------------------------------------
@@ -94,7 +97,7 @@ class Client(ABC):
         """Add what stands in every scene, and set how the engine works."""
 
     @abstractmethod
-    def construct(self, structure: Structure, parameters: Values) -> None:
+    def construct(self, structure: Any, parameters: Values) -> None:
         """Make sure that the bodies are there, with their shapes.
 
         What is made anew has no parameters in ``applied``.
@@ -170,9 +173,7 @@ class Client(ABC):
         if others:
             self.written(others)
 
-    def stepped(
-        self, mode: ControlMode, command: Sequence[float], substeps: int
-    ) -> list[float]:
+    def stepped(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
         """Hold a command for some physics steps; see ``advance``."""
         self._untouched = None
         return self.advance(mode, command, substeps)

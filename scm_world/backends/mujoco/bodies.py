@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -15,6 +15,7 @@ from scm_world.models.bodies import (
     Actuator,
     Bodies,
     Body,
+    Coupling,
     Geom,
     Joint,
     Part,
@@ -22,7 +23,6 @@ from scm_world.models.bodies import (
     Rotation,
     Vector,
 )
-from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey
 
 _OFF, _JNT, _GEOM, _TRN, _GAIN, _BIAS, _DYN, _INT = (
@@ -93,13 +93,8 @@ _TABLES = {
 }
 
 
-def describe(mj: mujoco.MjModel, model: Model) -> Bodies:
-    """Describe the bodies of a model.
-
-    Args:
-        mj: The model, compiled.
-        model: Its tables.
-    """
+def describe(mj: mujoco.MjModel) -> Bodies:
+    """Describe the bodies of a compiled model."""
     names = element_names(mj)
     couplings = Couplings(mj)
     joints, start = [], 0
@@ -124,6 +119,11 @@ def describe(mj: mujoco.MjModel, model: Model) -> Bodies:
         joints=tuple(joints),
         geoms=tuple(_geom(mj, shape, names["geom"][shape]) for shape in shapes),
         actuators=tuple(actuators.values()),
+        couplings=tuple(
+            _coupling(mj, equality, names["equality"][equality])
+            for equality in range(mj.neq)
+            if _acts(mj, equality) and _is_linear(mj, equality)
+        ),
         touching=tuple(
             (number_of[int(first)], number_of[int(second)])
             for first, second in np.argwhere(np.triu(couplings.touches))
@@ -131,7 +131,7 @@ def describe(mj: mujoco.MjModel, model: Model) -> Bodies:
         ),
         gravity=gravity,
         timestep=float(mj.opt.timestep),
-        places=dict(_places(mj, model, names, rows)),
+        places=dict(_places(mj, names, rows)),
         missing=tuple(_missing(mj, names)),
         notes=tuple(_notes(mj)),
     )
@@ -181,10 +181,8 @@ def _joint(mj: mujoco.MjModel, joint: int, name: str, start: int) -> Joint:
 
 def _touching(mj: mujoco.MjModel, couplings: Couplings) -> list[int]:
     """List the geoms that may touch something and have a word."""
-    touches = couplings.touches.any(axis=1)
-    return [
-        shape for shape in range(mj.ngeom) if touches[shape] and int(mj.geom_type[shape]) in _SHAPES
-    ]
+    touches = np.flatnonzero(couplings.touches.any(axis=1)).tolist()
+    return [shape for shape in touches if int(mj.geom_type[shape]) in _SHAPES]
 
 
 def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
@@ -206,7 +204,7 @@ def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
 def _hull(mj: mujoco.MjModel, mesh: int) -> Floats:
     """Copy the corners of the convex hull of a mesh, shape (n, 3) [m]."""
     first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
-    vertices = mj.mesh_vert[first : first + count].astype(np.float64)
+    vertices: Floats = mj.mesh_vert[first : first + count].astype(np.float64)
     graph = int(mj.mesh_graphadr[mesh])
     if graph >= 0:  # number of corners and faces, where their edges begin, which vertices they are
         corners = int(mj.mesh_graph[graph])
@@ -251,6 +249,24 @@ def _works(mj: mujoco.MjModel, actuator: int) -> bool:
     return not (off or disabled(mj, _OFF.mjDSBL_ACTUATION))
 
 
+def _acts(mj: mujoco.MjModel, equality: int) -> bool:
+    """Tell whether an equality constraint is in force."""
+    off = disabled(mj, _OFF.mjDSBL_EQUALITY) or disabled(mj, _OFF.mjDSBL_CONSTRAINT)
+    return bool(mj.eq_active0[equality]) and not off
+
+
+def _is_linear(mj: mujoco.MjModel, equality: int) -> bool:
+    """Tell whether an equality constraint lets a joint follow another one in proportion."""
+    joints = mj.eq_type[equality] == int(mujoco.mjtEq.mjEQ_JOINT) and mj.eq_obj2id[equality] >= 0
+    return bool(joints and not mj.eq_data[equality, 2:5].any())
+
+
+def _coupling(mj: mujoco.MjModel, equality: int, name: str) -> Coupling:
+    joint, leader = int(mj.eq_obj1id[equality]), int(mj.eq_obj2id[equality])
+    offset, ratio = mj.eq_data[equality, :2].tolist()
+    return Coupling(name, joint, leader, offset, ratio)
+
+
 # --- what there is no word for -----------------------------------------------------------------
 
 
@@ -277,54 +293,63 @@ def _odd_actuator(mj: mujoco.MjModel, actuator: int) -> str:
     ):
         return "acts on a ball joint in the frame of its parent"
     for what in ("damping", "armature"):
-        added = getattr(mj, f"actuator_{what}", None)
-        if added is not None and np.any(added[actuator]):
+        if _has(mj, f"actuator_{what}", actuator):
             return f"adds {what} of its own"
     return ""
 
 
 def _missing(mj: mujoco.MjModel, names: dict[str, tuple[str, ...]]) -> Iterator[str]:
     """List what acts in a model and has no words."""
-    for kind, count in (("tendon", mj.ntendon), ("flex", mj.nflex), ("pair", mj.npair)):
-        yield from (f"the {kind} {names[kind][i]!r}" for i in range(count))
+    yield from (f"the flex {names['flex'][i]!r}" for i in range(mj.nflex))
+    yield from (f"the pair {names['pair'][i]!r}" for i in range(mj.npair))
+    for i in range(mj.ntendon):
+        forces = ("stiffness", "damping", "frictionloss", "armature", "limited")
+        if any(np.any(getattr(mj, f"tendon_{what}")[i]) for what in forces):
+            yield f"the tendon {names['tendon'][i]!r}"
     for i in range(mj.neq):
-        if mj.eq_active0[i] and not disabled(mj, _OFF.mjDSBL_EQUALITY):
+        if _acts(mj, i) and not _is_linear(mj, i):
             kind = mujoco.mjtEq(int(mj.eq_type[i])).name.removeprefix("mjEQ_").lower()
             yield f"the equality constraint {names['equality'][i]!r} ({kind})"
     if mj.opt.density > 0.0 or mj.opt.viscosity > 0.0:
         yield f"a fluid (density {mj.opt.density:g}, viscosity {mj.opt.viscosity:g})"
+    for i in range(mj.nactuator):
+        if _works(mj, i) and _odd_actuator(mj, i):
+            yield f"the actuator {names['actuator'][i]!r}: it {_odd_actuator(mj, i)}"
+    yield from _missing_of_bodies(mj, names)
+
+
+def _missing_of_bodies(mj: mujoco.MjModel, names: dict[str, tuple[str, ...]]) -> Iterator[str]:
+    """List what bodies, joints and shapes do that has no words."""
     for i in range(mj.nbody):
         if mj.body_gravcomp[i] != 0.0:
             yield f"gravity compensation of the body {names['body'][i]!r}"
         if mj.body_mocapid[i] >= 0:
             yield f"the mocap body {names['body'][i]!r}"
     for i in range(mj.njnt):
-        dofs = slice(int(mj.jnt_dofadr[i]), int(mj.jnt_dofadr[i]) + 1)
-        for array in ("jnt_stiffnesspoly", "dof_dampingpoly"):
-            rows = getattr(mj, array, None)
-            if rows is not None and np.any(rows[i] if array.startswith("jnt") else rows[dofs]):
-                yield f"the polynomial {array.partition('_')[2]} of the joint {names['joint'][i]!r}"
+        name, dof = names["joint"][i], int(mj.jnt_dofadr[i])
+        if _has(mj, "jnt_stiffnesspoly", i) or _has(mj, "dof_dampingpoly", dof):
+            yield f"the nonlinear stiffness or damping of the joint {name!r}"
         if mj.jnt_actgravcomp[i]:
-            yield f"gravity compensation by the actuators of the joint {names['joint'][i]!r}"
-    touches = Couplings(mj).touches.any(axis=1)
+            yield f"gravity compensation by the actuators of the joint {name!r}"
+    touches = np.flatnonzero(Couplings(mj).touches.any(axis=1)).tolist()
     for i in range(mj.ngeom):
-        name = names["geom"][i]
-        if touches[i] and int(mj.geom_type[i]) not in _SHAPES:
-            kind = mujoco.mjtGeom(int(mj.geom_type[i])).name.removeprefix("mjGEOM_").lower()
-            yield f"the {kind} {name!r}"
-        for what in ("adhesion", "surfacevel"):
-            added = getattr(mj, f"geom_{what}", None)
-            if added is not None and np.any(added[i]):
-                yield f"{what} of the geom {name!r}"
-    for i in range(mj.nactuator):
-        if _works(mj, i) and _odd_actuator(mj, i):
-            yield f"the actuator {names['actuator'][i]!r}: it {_odd_actuator(mj, i)}"
+        name, kind = names["geom"][i], int(mj.geom_type[i])
+        if i in touches and kind not in _SHAPES:
+            yield f"the {mujoco.mjtGeom(kind).name.removeprefix('mjGEOM_').lower()} {name!r}"
+        if _has(mj, "geom_adhesion", i) or _has(mj, "geom_surfacevel", i):
+            yield f"adhesion or moving surface of the geom {name!r}"
+
+
+def _has(mj: mujoco.MjModel, array: str, row: int) -> bool:
+    """Tell whether a row of an array, which old versions of MuJoCo do not have, is not zero."""
+    numbers = getattr(mj, array, None)
+    return numbers is not None and bool(np.any(numbers[row]))
 
 
 def _notes(mj: mujoco.MjModel) -> Iterator[str]:
     """List what is left out because it matters little."""
     if mj.opt.integrator == int(_INT.mjINT_RK4):
-        yield "The file asks for a Runge-Kutta integrator; steps are semi-implicit Euler steps."
+        yield "The Runge-Kutta integrator of the file is left out."
     if mj.ngeom and (mj.geom_condim > 3).any():
         yield "Friction against turning and rolling (condim 4 and 6) is left out."
     if mj.ngeom and (mj.geom_margin > 0.0).any():
@@ -335,17 +360,11 @@ def _notes(mj: mujoco.MjModel) -> Iterator[str]:
 
 
 def _places(
-    mj: mujoco.MjModel,
-    model: Model,
-    names: dict[str, tuple[str, ...]],
-    rows: dict[str, dict[int, int]],
+    mj: mujoco.MjModel, names: dict[str, tuple[str, ...]], rows: dict[str, dict[int, int]]
 ) -> Iterator[tuple[ParameterKey, Place]]:
-    """Find the place of every parameter of the model that has a meaning here."""
-    exposed = {row.key for row in model.parameters}
-    reserved = [("", row.name) for row in (*model.states, *model.inputs)]
-    fluid = any(row.name in ("density", "viscosity", "wind") for row in model.parameters)
-    for field in table(mj, reserved, fluid=fluid):
-        if field.key not in exposed or field.kind not in _TABLES:
+    """Find the place of every parameter, exposed or not, that has a meaning here."""
+    for field in table(mj):
+        if field.slot is None or field.kind not in _TABLES:
             continue
         number = names[field.kind].index(field.element) if field.element else 0
         row = rows[field.kind].get(number) if field.kind in rows else number

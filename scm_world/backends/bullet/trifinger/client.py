@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
@@ -40,6 +40,11 @@ class TriFingerClient(Client):
     Attributes:
         bodies: The engine's numbers of all bodies.
     """
+
+    modes: ClassVar[tuple[ControlMode, ...]] = (
+        ControlMode.JOINT_POSITIONS,
+        ControlMode.JOINT_TORQUES,
+    )
 
     def __init__(self, engine: Any) -> None:
         super().__init__(engine)
@@ -168,7 +173,7 @@ class TriFingerClient(Client):
         if any(key[0] == "controller" for key in keys):
             told = {key: v for key, v in self.applied.items() if key[0] == "controller"}
             spec = controller_spec(arrays(told))
-            self._laws = {mode: compile_law(spec, mode) for mode in ControlMode}
+            self._laws = {mode: compile_law(spec, mode) for mode in self.modes}
 
     def parameter(self, key: ParameterKey) -> Floats:
         """Ask the engine for a parameter, in the units of the scene.

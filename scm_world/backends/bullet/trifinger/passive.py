@@ -15,6 +15,16 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
+from scm_world.backends.bullet.vectors import (
+    Vector,
+    applied,
+    cross,
+    dot,
+    plus,
+    scaled,
+    turned,
+    vector,
+)
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.scene import trifinger
 
@@ -27,8 +37,6 @@ MASSES = tuple(
     for link in (1, 2, 3)
 )
 """Keys of the masses that move, in the order of the joints."""
-
-Vector = tuple[float, float, float]
 
 
 def _per_mass(part: trifinger.Inertial) -> Floats:
@@ -102,7 +110,7 @@ def _resist(
         wanted = known[2, start : start + 3] - bias - damping * speeds
         acceleration = _solve(inertia + timestep * damping * np.eye(3), wanted)
         for j in range(3):
-            result[start + j] = bias[j] + _dot(inertia[j], acceleration)
+            result[start + j] = bias[j] + dot(inertia[j], acceleration)
     return result
 
 
@@ -136,26 +144,26 @@ def inverse_dynamics(
         section 5.3, with all vectors in the frames of the links.
     """
     forces, moments = np.zeros((3, 3)), np.zeros((3, 3))
-    spin, growth, rise = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), _scaled(-1.0, gravity)
+    spin, growth, rise = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), scaled(-1.0, gravity)
     for link in range(3):
-        axis, angle = _vector(_AXES[link]), angles[link]
-        rise = _turned(axis, -angle, _moved(rise, growth, spin, _vector(_OFFSETS[link])))
-        spin, growth = _turned(axis, -angle, spin), _turned(axis, -angle, growth)
-        twist = _scaled(speeds[link], axis)
-        growth = _plus(_plus(growth, _cross(spin, twist)), _scaled(accelerations[link], axis))
-        spin = _plus(spin, twist)
+        axis, angle = vector(_AXES[link]), angles[link]
+        rise = turned(axis, -angle, _moved(rise, growth, spin, vector(_OFFSETS[link])))
+        spin, growth = turned(axis, -angle, spin), turned(axis, -angle, growth)
+        twist = scaled(speeds[link], axis)
+        growth = plus(plus(growth, cross(spin, twist)), scaled(accelerations[link], axis))
+        spin = plus(spin, twist)
         _carry(link, masses[link], rise, growth, spin, forces[link], moments[link])
         if link == 2:
             _carry(_TIP, _TIP_MASS, rise, growth, spin, forces[link], moments[link])
     torques = np.empty(3)
     force, moment = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for link in (2, 1, 0):
-        axis = _vector(_AXES[link])
-        force = _plus(force, _vector(forces[link]))
-        moment = _plus(moment, _vector(moments[link]))
-        torques[link] = _dot(axis, moment)
-        force, moment = _turned(axis, angles[link], force), _turned(axis, angles[link], moment)
-        moment = _plus(moment, _cross(_vector(_OFFSETS[link]), force))
+        axis = vector(_AXES[link])
+        force = plus(force, vector(forces[link]))
+        moment = plus(moment, vector(moments[link]))
+        torques[link] = dot(axis, moment)
+        force, moment = turned(axis, angles[link], force), turned(axis, angles[link], moment)
+        moment = plus(moment, cross(vector(_OFFSETS[link]), force))
     return torques
 
 
@@ -170,12 +178,12 @@ def _carry(
     moment: Floats,
 ) -> None:
     """Add what a part needs to move so: force, and moment about the origin of its link."""
-    center = _vector(_CENTERS[part])
-    push = _scaled(mass, _moved(rise, growth, spin, center))
+    center = vector(_CENTERS[part])
+    push = scaled(mass, _moved(rise, growth, spin, center))
     inertia = _INERTIAS[part]
-    turning = _cross(spin, _applied(inertia, spin))
-    turning = _scaled(mass, _plus(turning, _applied(inertia, growth)))
-    turning = _plus(turning, _cross(center, push))
+    turning = cross(spin, applied(inertia, spin))
+    turning = scaled(mass, plus(turning, applied(inertia, growth)))
+    turning = plus(turning, cross(center, push))
     for k in range(3):
         force[k] += push[k]
         moment[k] += turning[k]
@@ -184,51 +192,13 @@ def _carry(
 @njit(cache=True)
 def _moved(rise: Vector, growth: Vector, spin: Vector, arm: Vector) -> Vector:
     """Give the acceleration of a point of a body from that of its origin [m/s²]."""
-    return _plus(_plus(rise, _cross(growth, arm)), _cross(spin, _cross(spin, arm)))
-
-
-@njit(cache=True)
-def _turned(axis: Vector, angle: float, vector: Vector) -> Vector:
-    """Turn a vector about a unit axis, by Rodrigues' formula."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    along = _scaled((1.0 - cos) * _dot(axis, vector), axis)
-    return _plus(_plus(_scaled(cos, vector), _scaled(sin, _cross(axis, vector))), along)
+    return plus(plus(rise, cross(growth, arm)), cross(spin, cross(spin, arm)))
 
 
 @njit(cache=True)
 def _solve(matrix: Floats, right: Floats) -> Vector:
     """Solve three equations by Cramer's rule."""
-    a, b, c = _vector(matrix[0]), _vector(matrix[1]), _vector(matrix[2])
-    bc, ca, ab = _cross(b, c), _cross(c, a), _cross(a, b)
-    total = _plus(_plus(_scaled(right[0], bc), _scaled(right[1], ca)), _scaled(right[2], ab))
-    return _scaled(1.0 / _dot(a, bc), total)
-
-
-@njit(cache=True)
-def _vector(array: Floats) -> Vector:
-    return array[0], array[1], array[2]
-
-
-@njit(cache=True)
-def _applied(matrix: Floats, v: Vector) -> Vector:
-    return _dot(matrix[0], v), _dot(matrix[1], v), _dot(matrix[2], v)
-
-
-@njit(cache=True)
-def _plus(a: Vector, b: Vector) -> Vector:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-@njit(cache=True)
-def _scaled(factor: float, a: Vector) -> Vector:
-    return factor * a[0], factor * a[1], factor * a[2]
-
-
-@njit(cache=True)
-def _dot(a: Any, b: Any) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # type: ignore[no-any-return]
-
-
-@njit(cache=True)
-def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    a, b, c = vector(matrix[0]), vector(matrix[1]), vector(matrix[2])
+    bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
+    total = plus(plus(scaled(right[0], bc), scaled(right[1], ca)), scaled(right[2], ab))
+    return scaled(1.0 / dot(a, bc), total)
