@@ -269,8 +269,7 @@ def test_an_empty_list_is_a_picture_of_the_sky() -> None:
     """Where there is nothing, there is sky."""
     canvas = draw_shapes([], CAMERA, LIGHT)
 
-    sky = np.rint(255.0 * np.array(SKY))
-    assert (canvas.rgb == sky[:, None, None]).all()
+    assert (canvas.rgb == np.reshape(SKY, (3, 1, 1))).all()
     assert not seen(canvas).any()
 
 

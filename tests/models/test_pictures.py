@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import multiprocessing
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -471,3 +472,31 @@ def test_a_window_shows_a_model(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
     assert window.model.geom("ball").rgba.tolist() == [0, 1, 0, 1]
     assert window.user_scn.ngeom == 1
     assert window.user_scn.geoms[0].pos[2] == 2.0
+
+
+def test_what_bends_is_seen() -> None:
+    """Cables, cloths and solids that bend are drawn, and lie in the picture."""
+    for dim, count in ((1, "6 1 1"), (2, "6 6 1"), (3, "3 3 3")):
+        model = read_model(
+            f"""<mujoco><worldbody><geom type="plane" size="0 0 1"/>
+            <flexcomp name="flex" type="grid" count="{count}" spacing=".1 .1 .1" pos="0 0 .5"
+                      dim="{dim}" radius=".02" rgba="1 0 0 1" mass="1">
+              <edge equality="true"/></flexcomp></worldbody></mujoco>"""
+        )
+        rgb = software(model.default_scene())
+        red = (rgb[:, :, 0] > COLORFUL / 2) & (rgb[:, :, 1] == 0)
+
+        assert red.sum() > 50
+        assert red[1:-1, 1:-1].sum() == red.sum()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not fork")
+def test_a_forked_process_can_draw(scene: Scene) -> None:
+    """After a picture by MuJoCo, a forked process draws, and does not hang."""
+    if opengl() is None:
+        pytest.skip("neither EGL nor OSMesa works here")
+    picture(scene, size=SIZE, renderer="mujoco")
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        theirs = pool.apply_async(picture, (scene, "front", SIZE)).get(timeout=60.0)
+
+    np.testing.assert_array_equal(theirs, software(scene, "front"))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, final
 
 import mujoco
@@ -87,7 +87,12 @@ class Drawing:
     def shapes(self, data: mujoco.MjData) -> list[Shape]:
         """List what is shown: geoms, sites, tendons, height fields, flexes and skins."""
         scene = self.scene(data)
-        found = (self._shape(scene, geom) for geom in scene.geoms[: scene.ngeom])
+        found: list[Shape | None] = []
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.type == _GEOM.mjGEOM_FLEX and scene.flexfaceused[geom.objid] == 0:
+                found += self._edges(scene, geom)
+            else:
+                found.append(self._shape(scene, geom))
         return [shape for shape in found if shape is not None]
 
     def camera(self, data: mujoco.MjData, name: str, size: tuple[int, int]) -> Camera:
@@ -144,6 +149,22 @@ class Drawing:
             color[:3] *= texture.mean(axis=0)
         body, moves = self._body(geom)
         return Shape(kind, halves, position, rotation, color, body, moves, mesh, tiles)
+
+    def _edges(self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Iterator[Shape]:
+        """Give a flex without faces, a cable, as a capsule for each edge."""
+        flex, radius = geom.objid, float(self.model.flex_radius[geom.objid])
+        first, n = scene.flexvertadr[flex], scene.flexvertnum[flex]
+        begin, m = scene.flexedgeadr[flex], scene.flexedgenum[flex]
+        vertices = scene.flexvert[3 * first : 3 * (first + n)].reshape(-1, 3).astype(np.float64)
+        for start, end in vertices[scene.flexedge[2 * begin : 2 * (begin + m)].reshape(-1, 2)]:
+            turn, length = np.empty(4), float(np.linalg.norm(end - start))
+            rotation = np.empty(9)
+            mujoco.mju_quatZ2Vec(turn, end - start)
+            mujoco.mju_quat2Mat(rotation, turn)
+            halves = np.array([radius, radius, radius + length / 2.0])
+            color = np.array(geom.rgba, dtype=np.float64)
+            middle = (start + end) / 2.0
+            yield Shape("capsule", halves, middle, rotation.reshape(3, 3), color, moves=True)
 
     def _tile(self, geom: mujoco.MjvGeom) -> tuple[float, float]:
         """Give the edges of the tiles of a plane: a texture holds two by two of them."""

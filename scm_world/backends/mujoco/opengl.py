@@ -40,10 +40,11 @@ def opengl() -> str | None:
     """Name the library with which MuJoCo can draw here without a screen; None if none can.
 
     Each is tried once, in another process, since a driver that fails can end its process. The
-    environment variable ``MUJOCO_GL`` can name one of them, or forbid all with ``disabled``.
+    environment variable ``MUJOCO_GL`` can name one of them, or forbid all with ``disabled``. No
+    library works in a process forked from one that has drawn with it: its threads are missing.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if wanted in FORBIDDEN:
+    if wanted in FORBIDDEN or _drew - {os.getpid()}:
         return None
     return next(filter(_works, [wanted] if wanted in LIBRARIES else LIBRARIES), None)
 
@@ -65,14 +66,14 @@ def _works(library: str) -> bool:
 
 
 def draw_scene(
-    scene: Scene, camera: Camera, sky: tuple[float, float, float], library: str
+    scene: Scene, camera: Camera, sky: tuple[int, int, int], library: str
 ) -> NDArray[np.uint8]:
     """Let MuJoCo draw the scene of a ``Model``, shape (h, w, 3).
 
     Args:
         scene: What to show. Its light shines if the model has none; the headlight always does.
         camera: Where from.
-        sky: Shown where there is nothing, unless the model has a sky; red, green, blue in [0, 1].
+        sky: Red, green and blue where there is nothing, unless the model has a sky.
         library: One of ``LIBRARIES`` that works here; see ``opengl``.
     """
     drawing, data = drawn(scene)
@@ -83,7 +84,7 @@ def draw_scene(
         _light(abstract, scene.light, camera, float(drawing.model.stat.extent))
     rgb, there = _canvas(drawing, (camera.height, camera.width), library).picture(abstract)
     if not (drawing.model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any():
-        rgb[~there] = np.rint(255.0 * np.array(sky)).astype(np.uint8)
+        rgb[~there] = sky
     return rgb
 
 
@@ -119,7 +120,8 @@ class _Canvas:
     """An OpenGL context with the meshes and textures of a model."""
 
     def __init__(self, drawing: Drawing, size: tuple[int, int], library: str) -> None:
-        self._of, self._process = (drawing, size, library), os.getpid()
+        self._of = drawing, size, library
+        _drew.add(os.getpid())
         height, width = size
         self._place = mujoco.MjrRect(0, 0, width, height)
         self._context = importlib.import_module(f"mujoco.{library}").GLContext(width, height)
@@ -130,9 +132,9 @@ class _Canvas:
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._renderer)
 
     def fits(self, drawing: Drawing, size: tuple[int, int], library: str) -> bool:
-        """Tell whether it was made for this, and by this process."""
+        """Tell whether it was made for this."""
         mine, *rest = self._of
-        return mine is drawing and rest == [size, library] and self._process == os.getpid()
+        return mine is drawing and rest == [size, library]
 
     def picture(self, scene: mujoco.MjvScene) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Draw a scene; give the colors (h, w, 3), and where there is something (h, w)."""
@@ -145,11 +147,14 @@ class _Canvas:
 
     def close(self) -> None:
         """Free all of it, unless it belongs to the process that this one was forked from."""
-        if self._process == os.getpid():
+        if not _drew - {os.getpid()}:
             self._context.make_current()
             self._renderer.free()
             self._context.free()
 
+
+_drew: set[int] = set()
+"""Numbers of the processes that have made a canvas: of this one, and of those before a fork."""
 
 _local = threading.local()
 """The canvas of each thread: an OpenGL context belongs to one."""

@@ -25,7 +25,7 @@ from scm_world.backends.renderer.bodies import (
     NOTHING,
     Bodies,
 )
-from scm_world.backends.renderer.kernels import Canvas, View, byte, draw
+from scm_world.backends.renderer.kernels import Canvas, View, draw
 from scm_world.backends.renderer.meshes import Ground, Triangles, draw_ground, draw_mesh
 from scm_world.backends.renderer.views import camera_view
 from scm_world.geometry import rotation_matrix
@@ -42,7 +42,7 @@ SOLIDS = {
 }
 SHADOW_TEXELS = 256
 GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
-SKY = (0.70, 0.78, 0.87)
+SKY = (178, 199, 222)  # red, green, blue
 
 THREE_QUARTER = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
 """From what is seen towards an automatic camera."""
@@ -82,7 +82,7 @@ def draw_shapes(
     rgb = NO_COLORS
     if colors:
         rgb = np.empty((3, height, width), dtype=np.uint8)
-        rgb[:] = np.reshape([byte(255.0 * color) for color in SKY], (3, 1, 1))
+        rgb[:] = np.reshape(SKY, (3, 1, 1))
     canvas = Canvas(depth, owners, rgb)
     solid = [shape for shape in shapes if shape.color[3] >= 1.0]
     clear = [shape for shape in shapes if 0.0 < shape.color[3] < 1.0] if colors else []
