@@ -430,6 +430,12 @@ class StepFunction(InMemory):
             states = self._structure.advance(parameters, states, commands)
         self._state.vector[:] = states[0]
 
+    @property
+    def vector(self) -> Floats:
+        """The state itself, flat, shape (s,)."""
+        vector: Floats = self._state.vector
+        return vector
+
     def _keep(self, parameters: Parameters) -> None:
         super()._keep(parameters)
         parts = [self._parameters[quantity.key].ravel() for quantity in self._structure.parameters]
@@ -467,23 +473,27 @@ class StepBatch(EngineBatch):
         for index in which.tolist():
             together.setdefault(self._backends[index].structure, []).append(index)
         for model, rows in together.items():
-            members = [self._backends[row] for row in rows]
-            size, count = model.layout.size, model.n_commands
-            if not model.vectorized:
-                for row, member in zip(rows, members, strict=True):
-                    member.step(mode, commands[row, :count], substeps)
+            members, size = [self._backends[row] for row in rows], model.layout.size
+            if model.vectorized:
+                self._together(model, members, commands[rows, : model.n_commands], substeps)
             else:
-                states = np.array([member.state().vector for member in members])
-                given = np.array([member.numbers for member in members]), commands[rows, :count]
-                if (model, len(rows)) not in self._compared:
-                    _refuse_company(model, given[0], states, given[1])
-                    self._compared.add((model, len(rows)))
-                for _ in range(substeps):
-                    states = model.advance(given[0], states, given[1])
-                for member, vector in zip(members, states, strict=True):
-                    member.apply(Difference(state=State(model.layout, vector)))
-            for row, member in zip(rows, members, strict=True):
-                member.read(State(model.layout, into[row, :size]))
+                for row, member in zip(rows, members, strict=True):
+                    member.step(mode, commands[row, : model.n_commands], substeps)
+            into[rows, :size] = [member.vector for member in members]
+
+    def _together(
+        self, model: StepModel, members: list[StepFunction], commands: Floats, substeps: int
+    ) -> None:
+        """Step systems of one vectorised function."""
+        states = np.array([member.vector for member in members])
+        parameters = np.array([member.numbers for member in members])
+        if (model, len(members)) not in self._compared:
+            _refuse_company(model, parameters, states, commands)
+            self._compared.add((model, len(members)))
+        for _ in range(substeps):
+            states = model.advance(parameters, states, commands)
+        for member, vector in zip(members, states, strict=True):
+            member.vector[:] = vector
 
 
 def _require_controls(mode: ControlMode) -> None:
