@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from numba import njit
@@ -292,6 +293,25 @@ def test_what_is_refused_changes_nothing(request_: dict[str, Any], error: type[E
     assert {k: v.tolist() for k, v in world.values().items()} == {
         k: v.tolist() for k, v in twin.values().items()
     }
+
+
+def test_it_is_an_environment() -> None:
+    """Gymnasium makes one of the task, or many: with its reward, and an end where it says so."""
+    task = shop_world(terminated=(np.any, "customers")).task  # the first customer ends it
+    env = gymnasium.make("scm_world/Model-v0", model=task, backend="step")
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (3,)
+    ended, steps = False, 0
+    while not ended:
+        _, reward, ended, _, _ = env.step(np.zeros(3, np.float32))
+        steps += 1
+    world = env.unwrapped.world  # type: ignore[attr-defined]
+    assert world["customers"] > 0
+    assert reward == world["reward"]
+    many = gymnasium.make_vec("scm_world/Model-v0", model=task, backend="step", num_envs=3)
+    many.reset(seed=0)
+    ends = [bool(many.step(np.zeros((3, 3), np.float32))[2][0]) for _ in range(steps)]
+    assert ends.index(True) == steps - 1
 
 
 # --- what holds for every world -------------------------------------------------------------------
