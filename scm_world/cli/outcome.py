@@ -13,6 +13,8 @@ from rich.text import Text
 from scm_world._types import Value
 from scm_world.cli.console import keep_whole, plain, show, staged, table, written
 from scm_world.cli.intervene import Outcome, Row
+from scm_world.cli.tasks import tag
+from scm_world.models import Model
 from scm_world.output.locations import Location
 from scm_world.queries.experiments.versions import versions
 from scm_world.variables import Draw, Hard, Scale, Shift
@@ -22,24 +24,36 @@ if TYPE_CHECKING:
 
 FORMAT = "scm_world/do/1"
 SAME = "="
+PICTURES = ("before.png", "after.png", "scene.png")
 DIVIDER = 4  # [pixels] between two pictures
 
 
 def save(outcome: Outcome, folder: Location) -> None:
     """Write result.json and the pictures, all of them or none."""
-    from scm_world.backends.renderer import render, write_png
-    from scm_world.scene.camera import OVERVIEW
+    from scm_world.backends.renderer import write_png
 
-    before, after = (
-        render(scene, OVERVIEW, samples=2).rgb for scene in (outcome.before, outcome.after)
-    )
-    white = np.full((before.shape[0], DIVIDER, 3), 255, dtype=np.uint8)
     with staged(folder) as draft:
-        write_png(draft / "before.png", before)
-        write_png(draft / "after.png", after)
-        write_png(draft / "scene.png", np.concatenate([before, white, after], axis=1))
+        shown = _pictures(outcome)
+        if shown:
+            white = np.full((shown[0].shape[0], DIVIDER, 3), 255, dtype=np.uint8)
+            both = np.concatenate([shown[0], white, shown[1]], axis=1)
+            for name, picture in zip(PICTURES, (*shown, both), strict=True):
+                write_png(draft / name, picture)
         text = json.dumps(as_dict(outcome), indent=1, allow_nan=False)
         (draft / "result.json").write_text(text + "\n")
+
+
+def _pictures(outcome: Outcome) -> list[Any]:
+    """Draw the scenes before and after; a step function has nothing to draw."""
+    from scm_world.backends.renderer import automatic_camera, picture
+    from scm_world.backends.step import StepModel
+
+    scenes = outcome.before, outcome.after
+    if isinstance(outcome.before.structure, StepModel):
+        return []
+    foreign = isinstance(outcome.before.structure, Model)
+    camera = automatic_camera(*scenes) if foreign else None
+    return [picture(scene, camera, samples=2) for scene in scenes]
 
 
 def as_dict(outcome: Outcome) -> dict[str, Any]:
@@ -101,13 +115,13 @@ def report(terminal: Console, outcome: Outcome, folder: Location, *, show_all: b
         names = ", ".join(outcome.astray)
         line = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {names}. The graph is wrong."
         terminal.print(Text(line, style="bold white on red"))
-    files = ("before.png", "after.png", "scene.png", "result.json")
-    written(terminal, *(folder / name for name in files))
+    there = [name for name in PICTURES if (folder / name).exists()]
+    written(terminal, *(folder / name for name in (*there, "result.json")))
 
 
 def _print_audit(terminal: Console, outcome: Outcome) -> None:
     options = outcome.options
-    title = f"do() in {options.task} on {outcome.engine}, seed {options.seed}"
+    title = f"do() in {tag(options.task)} on {outcome.engine}, seed {options.seed}"
     made = table("target", "requested", "applied", "engine reports", title=title)
     for name, entry in outcome.audit.targets.items():
         back = "-" if entry.read_back is None else show(entry.read_back)

@@ -198,12 +198,14 @@ def _report(terminal: Any, run: Run, engine: str, found: dict[str, float]) -> No
 
 def _picture(path: Path, scenes: Sequence[Any]) -> None:
     """Write pictures of scenes, one beside the other."""
-    from scm_world.backends.renderer import render, write_png
-    from scm_world.scene.camera import OVERVIEW
+    from scm_world.backends.renderer import automatic_camera, picture, write_png
+    from scm_world.models import Model
 
+    foreign = isinstance(scenes[0].structure, Model)
+    camera = automatic_camera(*scenes) if foreign else None
     strip: list[Any] = []
     for scene in scenes:
-        frame = render(scene, OVERVIEW, samples=2).rgb
+        frame = picture(scene, camera, samples=2)
         strip += [frame, np.full((frame.shape[0], DIVIDER, 3), 255, dtype=np.uint8)]
     write_png(path, np.concatenate(strip[:-1], axis=1))
 
