@@ -1,16 +1,16 @@
 """Probe states: where experiments are made.
 
 A task may know where causes show; see ``Task.scenarios``. Of any other system, states are drawn:
-where episodes begin, where random actions lead, and anywhere that can be, with parameters as they
-are and with others. All choices are drawn from keyed noise: probe i of a seed is the same,
-whatever ran before.
+where episodes begin, where random actions lead, anywhere that can be, and where bodies touch, with
+parameters as they are and with others. All choices are drawn from keyed noise: probe i of a seed is
+the same, whatever ran before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import numpy as np
 
@@ -21,11 +21,18 @@ from scm_world.tasks.experiments import Dice, Scenario
 from scm_world.variables import Box, Exogenous, Measured, Noise, Rotations, Variable
 from scm_world.world import World, WorldSnapshot
 
+Pair = tuple[str, str]
+T = TypeVar("T")
+
 ATTEMPTS = 20  # how often a scenario is tried with other numbers where it is not feasible
 LONGEST = 60  # control steps of random actions before a probe state
+TRIED = 60  # states in which bodies may touch
+WORLD = "world"  # the body that everything fixed belongs to
+MOVING = 0.75  # of the pairs that touch are of two other bodies, where there are such
 KEPT = 10  # for how many control steps an action is kept at most
 JITTER = 0.2  # how far, as a fraction, a parameter without a space is moved
 SHARE = 0.5  # of the parameters that have other values, in the probes where some have
+NEAR = 0.5  # of the places are within reach
 REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
 """How far a state without bounds is moved from where it is, by its unit; others by 1."""
 
@@ -61,7 +68,7 @@ def probes(
     """
     noise = Noise(seed)
     world.reset(seed=seed)
-    kinds = tuple(world.task.scenarios(world)) or (ANY if settled else ANY_MADE)
+    kinds = tuple(world.task.scenarios(world)) or _kinds(world, settled=settled)
     for number in range(first, n):
         yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
 
@@ -110,23 +117,79 @@ def start(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
 def onward(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
     """Go where random actions lead, each kept for a while."""
     steps = 1 + int(dice.between(0.0, LONGEST))
-    kept = 1 + int(dice.between(0.0, KEPT))
-    actions = dice.of("probe way", steps * world.declaration.n_actions).reshape(steps, -1)
-    for step in range(steps):
-        world.step(_within(world, actions[step // kept]))
+    for action in _way(world, dice, steps):
+        world.step(action)
+    return {}, None
+
+
+def onward_touching(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+    """Go where random actions lead, to where two bodies are about to touch that do on the way."""
+    before: dict[Pair, WorldSnapshot] = {}
+    for action in _way(world, dice, LONGEST):
+        here = world.snapshot()
+        world.step(action)
+        for pair in _touching(world):
+            before.setdefault(pair, here)
+    if before:
+        world.restore(_one_of(before, dice))
     return {}, None
 
 
 def anywhere(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
     """Move everything to where it can be, with velocities of a few natural units."""
+    return _anywhere(world, dice, "moved"), None
+
+
+def touching(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+    """Move everything to where two bodies touch, if some of the states that are tried have such."""
+    here, action = world.snapshot(), _at_random(world, None, dice)
+    found: dict[Pair, dict[str, Value]] = {}
+    for number in range(TRIED):
+        states = _anywhere(world, dice, f"moved {number}")
+        try:
+            world.do(states)
+            world.step(action)
+        except (InterventionError, EngineFailure):
+            continue
+        else:
+            for pair in _touching(world):
+                found.setdefault(pair, states)
+        finally:
+            world.restore(here)
+    return (_one_of(found, dice) if found else _anywhere(world, dice, "moved")), None
+
+
+def _way(world: World, dice: Dice, steps: int) -> Iterator[Floats]:
+    """Draw actions, each kept for a while."""
+    kept = 1 + int(dice.between(0.0, KEPT))
+    shares = dice.of("probe way", steps * world.declaration.n_actions).reshape(steps, -1)
+    for step in range(steps):
+        yield _within(world, shares[step // kept])
+
+
+def _touching(world: World) -> set[Pair]:
+    """Name the pairs of bodies that press on each other now."""
+    pressing = (contact for contact in world.backend.contacts() if contact.force > 0.0)
+    return {(min(contact.bodies), max(contact.bodies)) for contact in pressing}
+
+
+def _one_of(found: dict[Pair, T], dice: Dice) -> T:
+    """Draw one of the pairs that were found, mostly one of two bodies that can move."""
+    moving = [pair for pair in sorted(found) if WORLD not in pair]
+    which = dice.between(0.0, 1.0)
+    pairs = moving if moving and which < MOVING else sorted(found)
+    return found[pairs[int(dice.between(0.0, len(pairs)))]]
+
+
+def _anywhere(world: World, dice: Dice, stream: str) -> dict[str, Value]:
+    """Draw a value of every state."""
     model = world.model
     variables = (v for v in model.variables if isinstance(v, Measured) and v.settable)
-    states = {
-        v.name: _moved(v, world[v.name], dice)
+    return {
+        v.name: _moved(v, world[v.name], dice.of(f"{v.name}|{stream}", 1 + int(np.prod(v.shape))))
         for v in variables
         if v.dtype == "real" and model.target(v.name) == v.name
     }
-    return states, None
 
 
 def _with_others(prepare: Any) -> Any:
@@ -182,18 +245,24 @@ def _jittered(variable: Exogenous, world: World, dice: Dice) -> Value | None:
     return np.asarray(moved if bounds is None else bounds.nearest(moved, world.current()[0]))
 
 
-def _moved(variable: Variable, present: Value, dice: Dice) -> Value:
-    """Draw a value of a state: within its bounds, or within reach of where it is."""
-    n = int(np.prod(variable.shape))
-    unit = 2.0 * dice.of(f"{variable.name}|moved", n).reshape(variable.shape) - 1.0
+def _moved(variable: Variable, present: Value, drawn: Floats) -> Value:
+    """Give a value of a state: within its bounds, or within reach of where it is.
+
+    Of places whose bounds are further away than what is within reach, every other one is within
+    reach: else bodies would hardly meet.
+    """
+    unit = 2.0 * drawn[1:].reshape(variable.shape) - 1.0
     if isinstance(variable.bounds, Rotations):
         return variable.bounds.nearest(present + 2.0 * unit)
     reach = REACH.get(variable.unit, 1.0)
     low, high = np.full(variable.shape, -np.inf), np.full(variable.shape, np.inf)
     if isinstance(variable.bounds, Box):
         low, high = variable.bounds.bounds(variable.shape, {})
-    low = np.where(np.isfinite(low), low, np.minimum(present, high) - reach)
-    high = np.where(np.isfinite(high), high, np.maximum(present, low) + reach)
+    near = np.maximum(low, np.minimum(present, high) - reach)
+    far = np.minimum(high, np.maximum(present, low) + reach)
+    if variable.unit == "m" and drawn[0] < NEAR:
+        low, high = near, far
+    low, high = np.where(np.isfinite(low), low, near), np.where(np.isfinite(high), high, far)
     return np.asarray(low + 0.5 * (1.0 + unit) * (high - low))
 
 
@@ -209,19 +278,22 @@ def _at_random(world: World, extra: None, dice: Dice) -> Floats:
 
 
 AT_START = Scenario("start", start, _at_random, steps=0)
-_MADE = (
-    Scenario("anywhere", anywhere, _at_random),
-    Scenario("anywhere, other parameters", _with_others(anywhere), _at_random),
+_ANYWHERE = Scenario("anywhere", anywhere, _at_random)
+_OTHERWISE = Scenario("anywhere, other parameters", _with_others(anywhere), _at_random)
+_ONWARD = Scenario("onward", onward, _at_random, steps=0)
+_ON_OTHERWISE = Scenario("onward, other parameters", _with_others(onward), _at_random, steps=0)
+_ON_TOUCHING = Scenario("onward, touching", onward_touching, _at_random, steps=0)
+_TOUCHING = Scenario("touching", touching, _at_random, steps=0)
+_TOUCH_OTHERWISE = Scenario(
+    "touching, other parameters", _with_others(touching), _at_random, steps=0
 )
-ANY = (
-    AT_START,
-    Scenario("onward", onward, _at_random, steps=0),
-    _MADE[0],
-    Scenario("onward, other parameters", _with_others(onward), _at_random, steps=0),
-    Scenario("onward", onward, _at_random, steps=0),
-    _MADE[1],
-)
-"""What is tried in a system of which the task knows nothing."""
 
-ANY_MADE = (AT_START, *_MADE)
-"""The same where a state is made of the same numbers on every engine."""
+
+def _kinds(world: World, *, settled: bool) -> tuple[Scenario, ...]:
+    """List what is tried in a system of which the task says nothing."""
+    if not settled:
+        return AT_START, _ANYWHERE, _OTHERWISE
+    if any(edge.when == "contact" for edge in world.model.edges):
+        first = (AT_START, _TOUCHING, _ON_TOUCHING, _ANYWHERE)
+        return *first, _TOUCH_OTHERWISE, _ON_OTHERWISE, _TOUCHING, _ON_TOUCHING
+    return AT_START, _ONWARD, _ANYWHERE, _ON_OTHERWISE, _ONWARD, _OTHERWISE
