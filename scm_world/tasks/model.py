@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world.backends import Backend, read_model
 from scm_world.entities import Clock, Composition
-from scm_world.errors import ModelError, UnknownOption, nearest
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.models import Model, ParameterKey, Readout, Row
 from scm_world.tasks.base import Task, Timing
 from scm_world.tasks.observed import Observed
@@ -403,7 +403,6 @@ def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iter
         return ModelTask(source, **options)
     if ":" in source:
         made = load_factory(source)(**options)
+        made = getattr(made, "task", made)  # of a world
         return made if isinstance(made, Task) else ModelTask(made)
-    hint = nearest(str(source), known())
-    choices = (*known(), "a file.xml or file.urdf", "module:function")
-    raise UnknownOption("task", source, choices if hint is None else (hint, *choices))
+    raise UnknownOption("task", source, (*known(), "file.xml", "file.urdf", "module:function"))
