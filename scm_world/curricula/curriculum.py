@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.curricula.base import AnyPart, as_part, read_from
+from scm_world.curricula.choices import Stages
 from scm_world.curricula.times import AtStep, Every
-from scm_world.errors import ModelError, UnknownVariable, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
+from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.spaces import Frozen
@@ -114,7 +116,12 @@ class Curriculum(Frozen):
 
         Raises:
             InterventionError: With the name.
+            UnknownOption: It has stages, and the task does not say what success is.
         """
+        has_stages = any(isinstance(part, Stages) for part in self.part.walk())
+        if has_stages and SUCCESS not in world.model:
+            allowed = (f"a task with {SUCCESS!r}, as success=(function, 'hinge.position', …)",)
+            raise UnknownOption("task for a curriculum with stages", world.task.name, allowed)
         may_come = self._may_restructure(world)
         for part in self.part.walk():
             try:

@@ -70,9 +70,9 @@ def matching(declaration: Declaration, patterns: Iterable[str]) -> tuple[str, ..
 
 
 def settable(declaration: Declaration) -> tuple[str, ...]:
-    """List what ``do`` accepts in a structure, without the action."""
-    model = declaration.model
-    return tuple(n for n in model if model.declared(model.target(n)).settable and n != "action")
+    """List what ``do`` accepts in a structure, without the actions."""
+    model, actions = declaration.model, declaration.actions
+    return tuple(n for n in model if model.declared(model.target(n)).settable and n not in actions)
 
 
 def _spaced(declaration: Declaration) -> Iterable[Variable]:

@@ -18,12 +18,13 @@ from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.members import Member
 from scm_world.curricula.situations import Memory
 from scm_world.curricula.wrapper import CurriculumEnv, place
-from scm_world.env import IDS
+from scm_world.env import IDS, MODEL_ID
 from scm_world.env.batched.choice import fastest
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.world.start import whole_number
 
 NATIVE, PROCESSES, LOOP = "native", "processes", "loop"
+SUCCESS = "is_success"
 MODES = (NATIVE, PROCESSES, LOOP, "sync", "async")
 
 _TIME_LIMIT = "max_episode_steps"
@@ -79,7 +80,7 @@ def make_vec(
 def _has_native(env_id: str, options: Mapping[str, Any]) -> bool:
     """Tell whether the engine steps many worlds in one call, and nothing needs single ones."""
     kind = fastest(str(options.get("backend", "mujoco")), 1, workers=None)
-    return kind == NATIVE and env_id in IDS and options.get(_TIME_LIMIT) is None
+    return kind == NATIVE and env_id in (*IDS, MODEL_ID) and options.get(_TIME_LIMIT) is None
 
 
 def _crewed(
@@ -205,7 +206,7 @@ class CurriculumVectorEnv(VectorWrapper):
 
         Args:
             running: What ``running`` gave, of as many environments in a crew.
-            actions: Of each control step since their resets, shape (steps, n, 9).
+            actions: Of each control step since their resets, shape (steps, n, n_actions).
             lengths: How many of them each member took, shape (n,).
 
         Returns:
@@ -258,8 +259,8 @@ class CurriculumVectorEnv(VectorWrapper):
         if not self._ahead and waited.any():
             self._begin(waited)
         self._stepped |= self._ahead | ~waited
-        present = info["is_success"]
-        final = info["final_info"]["is_success"] if "final_info" in info else present
+        present = info.get(SUCCESS, False)
+        final = info["final_info"].get(SUCCESS, False) if "final_info" in info else present
         self._success = np.where(ended, final, present).astype(bool)
         if ended.any():
             levels = self._levels()

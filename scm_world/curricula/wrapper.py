@@ -187,7 +187,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             InterventionError: An intervention was refused; the control step is over.
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._stepped, self._success = True, bool(info["is_success"])
+        self._stepped, self._success = True, bool(info.get("is_success"))
         if terminated or truncated:
             self._close()
         elif self._turn.step(self._inner):

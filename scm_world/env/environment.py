@@ -15,7 +15,7 @@ from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.copies import Copied
 from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode, delta_for
-from scm_world.env.given import doubles, finite, made_task, names_of
+from scm_world.env.given import action_scale, doubles, finite, made_task, names_of
 from scm_world.env.goals import GoalReward, Goals, reward_scale
 from scm_world.env.looks import Looks
 from scm_world.env.observer import Observation, Observer, Observing, observer
@@ -236,10 +236,12 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     def _act(self, normalize: bool, mode: str, steps: Mapping[str, Any]) -> None:
         """Choose what an action means; what has no two bounds keeps its unit."""
         low, high = self.world.action_low, self.world.action_high
-        scaled = normalize & np.isfinite(low) & np.isfinite(high) & (low < high)
-        inside = np.where(scaled, low, -1.0), np.where(scaled, high, 1.0)
-        self._middle, self._half = (inside[0] + inside[1]) / 2.0, (inside[1] - inside[0]) / 2.0
-        bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
+        self._middle, self._half = np.zeros(low.size), np.ones(low.size)
+        bounds = (low, high)
+        if normalize:
+            self._middle, self._half = action_scale(self.world)
+            scaled = np.isfinite(low + high) & (low < high)
+            bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         self._delta = delta_for(mode, self.world, self._middle, self._half, **steps)
         self._given = np.empty(low.size)
         self._range = (self._middle, self._half, low, high)

@@ -10,6 +10,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.tasks import Task, make_task
+from scm_world.world import World
 from scm_world.world.family import Family
 
 
@@ -32,6 +33,17 @@ def doubles(action: Any, size: int) -> Floats:
         return np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError):
         raise ActionError(f"an action is {finite(size)}, got {action!r}", action) from None
+
+
+def action_scale(world: World) -> tuple[Floats, Floats]:
+    """Give what normalized actions stand for: ``middle + half * action``, shape (n_actions,) each.
+
+    What has no two bounds keeps its unit.
+    """
+    low, high = world.action_low, world.action_high
+    bounded = np.isfinite(low + high) & (low < high)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    return (low + high) / 2.0, (high - low) / 2.0
 
 
 def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:

@@ -31,7 +31,8 @@ def model_env(model: Any = None, **options: Any) -> ScmWorldEnv:
             ``Model``, ``"module:function"`` for a function that gives a task, or a task.
         options: Of ``ModelTask`` (``reward``, ``terminated``, ``spaces``, ``seconds``, …) and of
             ``ScmWorldEnv``. ``start`` and ``frame_skip`` are those of ``ModelTask``, and
-            ``observe`` is, except with ``observation_mode="custom"``.
+            ``observe`` is, except with ``observation_mode="custom"``. With ``task_options``, a
+            dictionary of all options of the model, the others are those of ``ScmWorldEnv``.
 
     Raises:
         UnknownOption: An option exists in neither, or the task is made already.
@@ -70,9 +71,12 @@ def model_vector_env(num_envs: int = 1, model: Any = None, **options: Any) -> Sc
 
 def _split(model: Any, options: Mapping[str, Any]) -> tuple[Task, dict[str, Any]]:
     """Make the task, and give the options that are left for the environment."""
+    given = options.get("task_options")
     shared = ("observe",) if options.get("observation_mode") == "custom" else ()
-    of_task = {name: options[name] for name in options if name in OF_TASK and name not in shared}
-    of_env = {name: options[name] for name in options if name not in of_task}
+    mixed = [name for name in options if name in OF_TASK and name not in shared]
+    of_task = {name: options[name] for name in mixed} if given is None else dict(given)
+    apart = ("task_options", *(mixed if given is None else ()))
+    of_env = {name: value for name, value in options.items() if name not in apart}
     for name in of_env:
         if name not in OF_ENV:
             raise UnknownOption(f"option of {MODEL_ID}", name, (*OF_TASK, *OF_ENV))

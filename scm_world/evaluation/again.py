@@ -26,6 +26,9 @@ from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
 from scm_world.world.start import whole_number
 
+_TASK = ("task", "arguments", "class", "model")
+"""What says of an evaluation where it happened."""
+
 
 @final
 @dataclass(frozen=True)
@@ -95,16 +98,19 @@ def _place(about: Mapping[str, Any], task: Task | None, trusted: Sequence[str]) 
     if task is not None:
         place = Place(task, options)
         now = place.about()
-        if any(now.get(key) != about.get(key) for key in ("task", "arguments", "class")):
+        if any(now.get(key) != about.get(key) for key in _TASK):
             made = about.get("class", about["task"])
             raise UnknownOption("task", task, (f"{made} with {about['arguments']}",))
         return place
-    if about["task"] not in tasks():
+    if about["task"] not in tasks() and ("class" in about or about["arguments"]):
         allowed = (*tasks(), "one of your own, if it is given: task=")
         raise UnknownOption("task", about.get("class", about["task"]), allowed)
     if about["arguments"]:
         options["task_options"] = about["arguments"]
     place = Place(about["task"], options)
+    if place.about().get("model") != about.get("model"):
+        allowed = (f"the file that was evaluated, whose content has the sum {about.get('model')}",)
+        raise UnknownOption("task", about["task"], allowed)
     mine = place.about().get("class", place.name)
     if mine != about.get("class", place.name):
         made = about.get("class", place.name)

@@ -18,6 +18,7 @@ from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, Unkn
 from scm_world.evaluation.policies import Player
 from scm_world.evaluation.policies.players import Actions
 from scm_world.evaluation.protocols import Protocol
+from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Null, Subset
 
 LAST = 20
@@ -31,7 +32,7 @@ FRACTIONS = (
 """The published scores: at the end, over the last steps, over all steps."""
 
 METRICS = (*FRACTIONS, "success", "return")
-"""What is measured of every episode."""
+"""What is measured of every episode, as far as the task says what success is."""
 
 Watch = Callable[[ScmWorldEnv], Any]
 
@@ -49,7 +50,7 @@ class Row:
         seed: Of the noise.
         episode: Its number within the noise.
         steps: How many control steps it had.
-        scores: By the names of ``METRICS``.
+        scores: By those names of ``METRICS`` that the task has.
         drawn: The values of what was intervened on, by variable.
         hash: Sums up all states, parameters and actions, bit for bit.
     """
@@ -123,23 +124,25 @@ class Game:
         self.mark = Fingerprint(env)
         self._player, self._turn = player, turn
         self._fractions: list[float] = []
-        self._total = 0.0
+        self._total, self._steps = 0.0, 0
 
     def act(self, observation: Any) -> Actions:
-        """Let the player choose an action, shape (9,)."""
+        """Let the player choose an action, shape (n,)."""
         action = self._player.act(observation)
         self.mark.act(action)
         return action
 
-    def stepped(self, reward: float, fraction: float) -> None:
-        """Note what a control step gave: the reward, and the fractional success."""
+    def stepped(self, reward: float, fraction: float | None) -> None:
+        """Note what a control step gave: the reward, and the fractional success if there is one."""
         self._total += reward
-        self._fractions.append(fraction)
+        self._steps += 1
+        if fraction is not None:
+            self._fractions.append(fraction)
 
     @property
     def is_due(self) -> bool:
         """Whether the protocol may act now."""
-        return self._turn.may_act(len(self._fractions))
+        return self._turn.may_act(self._steps)
 
     def intervene(self, env: ScmWorldEnv) -> bool:
         """Let the protocol act, if anything is due; tell whether it did."""
@@ -148,15 +151,15 @@ class Game:
         self._drawn |= _drawn(env, env.world.index)
         return True
 
-    def row(self, place: tuple[str, int, str, str, int, int], *, success: bool) -> Row:
+    def row(self, place: tuple[str, int, str, str, int, int], *, success: bool | None) -> Row:
         """Give what is kept.
 
         Args:
             place: Agent, run, engine, protocol, seed and episode.
-            success: Whether it succeeded in the end.
+            success: Whether it succeeded in the end, if the task says so.
         """
         scores = scored(self._fractions, success=success, total=float(self._total))
-        return Row(*place, len(self._fractions), scores, self._drawn, str(self.mark))
+        return Row(*place, self._steps, scores, self._drawn, str(self.mark))
 
 
 def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
@@ -229,20 +232,21 @@ class Arena:
             success = self._finish(game, observation, watch)
         return game.row((*who, engine, protocol.name, seed, episode), success=success)
 
-    def _finish(self, game: Game, observation: Any, watch: Watch | None) -> bool:
-        """Play an episode that has begun; tell whether it succeeded in the end."""
-        env, truncated = self.env, False
-        while not truncated:
+    def _finish(self, game: Game, observation: Any, watch: Watch | None) -> bool | None:
+        """Play an episode that has begun; tell whether it succeeded, if the task has that."""
+        env, over = self.env, False
+        while not over:
             if watch is not None:
                 watch(env)
-            observation, reward, _, truncated, info = env.step(game.act(observation))
-            game.stepped(reward, info["fractional_success"])
-            if not truncated and game.intervene(env):
+            observation, reward, terminated, truncated, info = env.step(game.act(observation))
+            game.stepped(reward, info.get(FRACTION))
+            over = terminated or truncated
+            if not over and game.intervene(env):
                 observation = env.observe()
             game.mark.look()
         if watch is not None:
             watch(env)
-        return bool(info["is_success"])
+        return info.get(SUCCESS)
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
         """See whether a protocol fits: begin the first episode with it.
@@ -287,16 +291,16 @@ class Arena:
         self.env.close()
 
 
-def scored(fractions: list[float], *, success: bool, total: float) -> dict[str, float]:
+def scored(fractions: list[float], *, success: bool | None, total: float) -> dict[str, float]:
     """Compute the scores of an episode.
 
     Args:
-        fractions: Fractional success after each control step.
-        success: Whether it succeeded in the end.
+        fractions: Fractional success after each control step; none if the task has no such thing.
+        success: Whether it succeeded in the end; None if the task does not say so.
         total: Sum of the rewards.
 
     Returns:
-        A number for each of ``METRICS``.
+        A number for each of ``METRICS`` that the task has.
 
     Example:
         >>> found = scored([0.0, 0.5, 1.0], success=True, total=2.5)
@@ -307,14 +311,14 @@ def scored(fractions: list[float], *, success: bool, total: float) -> dict[str, 
         CausalWorld 1.2, ``metrics``: full, last integrated and last fractional success. There the
         second one is the mean of the first step and the last nineteen.
     """
-    ends = fractions[-LAST:]
-    return {
-        "last_fractional_success": fractions[-1],
-        "last_integrated_fractional_success": sum(ends) / len(ends),
-        "full_integrated_fractional_success": sum(fractions) / len(fractions),
-        "success": float(success),
-        "return": total,
-    }
+    found = {}
+    if fractions:
+        ends = fractions[-LAST:]
+        values = fractions[-1], sum(ends) / len(ends), sum(fractions) / len(fractions)
+        found = dict(zip(FRACTIONS, values, strict=True))
+    if success is not None:
+        found["success"] = float(success)
+    return {**found, "return": total}
 
 
 def _drawn(env: ScmWorldEnv, step: int) -> dict[str, list[float]]:
@@ -328,7 +332,9 @@ def _drawn(env: ScmWorldEnv, step: int) -> dict[str, list[float]]:
     names = tuple(
         name
         for name, act in asked.items()
-        if not isinstance(act, Null) and name in env.world.model and name != "action"
+        if not isinstance(act, Null)
+        and name in env.world.model
+        and name not in env.world.declaration.actions
     )
     now = env.world.evaluate(names) if names else {}
     return {name: np.ravel(now[name]).astype(float).tolist() for name in names}

@@ -1,4 +1,4 @@
-"""The protocols P0 to P11 of every task, as rows of a table.
+"""The protocols P0 to P11 of the robot's tasks, as rows of a table; and those of any other task.
 
 Source:
     CausalWorld 1.2, ``benchmark/benchmarks.py``, for reaching, pushing, picking, pick_and_place
@@ -16,10 +16,11 @@ from typing import final
 
 from scm_world.curricula import together
 from scm_world.curricula.parts import Goal, Part, Resample
-from scm_world.errors import UnknownOption
-from scm_world.evaluation.protocols import Protocol
-from scm_world.tasks import tasks
+from scm_world.evaluation.protocols import LONGEST, Protocol
+from scm_world.tasks import StepTask, Task, tasks
 from scm_world.variables.kinds import SpaceName
+from scm_world.world import World
+from scm_world.world.start import the_task
 
 FRICTION = "floor_friction"
 
@@ -113,14 +114,17 @@ REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
 """Reaching has one more."""
 
 
-def protocols_of(task: str) -> tuple[Protocol, ...]:
-    """Give the protocols of a task; one of the user's own has P0 alone.
+def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol, ...]:
+    """Give the protocols of a task.
 
-    P10 and P11 draw everything that the predecessor draws, the joints excepted; a fair coin
-    decides in each episode whether sizes or positions are drawn, as published.
+    The tasks of this package have those of the table. P10 and P11 draw everything that the
+    predecessor draws, the joints excepted; a fair coin decides in each episode whether sizes or
+    positions are drawn, as published. A task registered by a user has P0 alone. Any other task, of
+    a model or of a step function, has those that follow from its spaces: see ``general``.
 
     Args:
-        task: Name of a registered task.
+        task: Name of a registered task, a file or function that names one, or a task.
+        backend: As in ``general``.
 
     Raises:
         UnknownOption: There is no such task.
@@ -129,12 +133,42 @@ def protocols_of(task: str) -> tuple[Protocol, ...]:
         >>> [(p.name, p.space) for p in protocols_of("pushing")[1:3]]
         [('P1', 'A'), ('P2', 'B')]
     """
-    if task not in tasks():
-        raise UnknownOption("task with protocols", task, tasks())
-    if task not in ROLES:
-        return (_protocol(_BLOCK, *ROWS[0]),)  # nothing varies in it
-    rows = (*ROWS, REACHING) if task == "reaching" else ROWS
-    return tuple(_protocol(ROLES[task], *row) for row in rows)
+    name = task.name if isinstance(task, Task) else task
+    if name in tasks() and isinstance(task, str | tasks()[name]):
+        if name not in ROLES:
+            return (_protocol(_BLOCK, *ROWS[0]),)  # nothing varies in it
+        rows = (*ROWS, REACHING) if name == "reaching" else ROWS
+        return tuple(_protocol(ROLES[name], *row) for row in rows)
+    return general(the_task(task), backend)
+
+
+def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
+    """Give the protocols that follow from the spaces of any task.
+
+    In ``P0`` nothing varies. In ``A`` every variable with a space A is drawn from it, and in
+    ``A:pole.mass`` only that one; likewise ``B``.
+
+    Args:
+        task: Of a model or a step function.
+        backend: Whose parameters count; MuJoCo's, or that of step functions, if None.
+    """
+    usual = "step" if isinstance(task, StepTask) else "mujoco"
+    declaration = World(task, backend=backend or usual).declaration
+    found = [Protocol("P0", doc="nothing varies")]
+    spaces: tuple[SpaceName, ...] = ("A", "B")
+    for space in spaces:
+        names = Resample("@everything", space=space).targets(declaration)
+        if names:
+            doc = f"everything that has a space {space}"
+            found.append(Protocol(space, tuple(names), space, doc=doc))
+        found += [Protocol(_label(space, name), name, space, doc=name) for name in names]
+    return tuple(found)
+
+
+def _label(space: str, name: str) -> str:
+    """Name the protocol that draws one variable, as it can stand in the name of a file."""
+    plain = "".join("_" if letter in "/\\," else letter for letter in name)
+    return f"{space}:{plain}"[:LONGEST]
 
 
 def _protocol(roles: Roles, name: str, what: str, space: SpaceName) -> Protocol:

@@ -17,9 +17,8 @@ from scm_world.evaluation.again import bench_of
 from scm_world.evaluation.arena import Arena, Row
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.protocols import Protocol
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Shard
-from scm_world.evaluation.tables import known
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.variables import Draw
@@ -139,7 +138,7 @@ def why(
     run: int = 0,
     engine: str | None = None,
     seed: int | None = None,
-    metric: str = SCORE,
+    metric: str | None = None,
     versus: str | None = None,
     policy: Any = None,
     task: Task | None = None,
@@ -172,6 +171,7 @@ def why(
         UnknownOption: There is no such episode, or nothing was varied in it.
         SnapshotMismatch: The episode does not happen again bit for bit.
     """
+    metric = evaluation.metric(metric)
     agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
     seeds = evaluation.only(agent=agent, engine=engine, protocol=protocol)._listed("seed")
     seed = seeds[0] if seed is None else seed
@@ -179,7 +179,6 @@ def why(
     one = evaluation.only(**where, episode=episode)
     if versus not in (None, *VERSUS):
         raise UnknownOption("versus", versus, VERSUS)
-    known(metric)
     bench = bench_of(evaluation, policy=policy, task=task, trusted=trusted)
     try:
         shard = bench.setup.shard_of({**where, "episode": episode})
@@ -217,7 +216,8 @@ def _others(
         except EvaluationError as error:
             left_out[name] = error.reason
         else:
-            scores = row.scores[metric], then.scores[metric], bool(then.scores["success"])
+            success = bool(then.scores.get("success", False))
+            scores = row.scores[metric], then.scores[metric], success
             would_be = tuple(then.drawn.get(name, look.value))
             one = Otherwise(name, tuple(row.drawn[name]), would_be, *scores)
             reason = _no_answer(one, row, then, part.found, arena.env.world)

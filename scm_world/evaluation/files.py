@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.arena import METRICS
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import what_it_is
 from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
@@ -57,7 +56,7 @@ def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
             "protocol": protocol,
             **{
                 metric: mine.score(protocol, metric, agent=agent, engine=engine).as_dict()
-                for metric in METRICS
+                for metric in mine.metrics
             },
         }
         for agent in evaluation.agents
@@ -145,7 +144,7 @@ def _differences(one: Evaluation, other: Evaluation) -> list[str]:
     """Say what of two evaluations cannot stand in one table."""
     found = [
         f"{what} is {one.about.get(what)!r} in one and {other.about.get(what)!r} in another"
-        for what in ("task", "class", "arguments", "env")
+        for what in ("task", "class", "model", "arguments", "env")
         if one.about.get(what) != other.about.get(what)
     ]
     for engine in one.about["versions"].keys() & other.about["versions"].keys():
@@ -232,7 +231,7 @@ def _from_csv(data: bytes) -> Columns:
 
 def _typed(columns: Mapping[str, Any]) -> Columns:
     """Give columns the types that they had."""
-    missing = [name for name in (*KEYS, "steps", *METRICS, "hash") if name not in columns]
+    missing = [name for name in (*KEYS, "steps", "return", "hash") if name not in columns]
     if missing:
         raise ValueError(f"the table has no column {missing[0]!r}")
     kinds: dict[str, Any] = {**dict.fromkeys(TEXTS, str), **dict.fromkeys(WHOLE, np.int64)}

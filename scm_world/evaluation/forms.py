@@ -15,10 +15,10 @@ from scm_world.evaluation.policies.cards import (
     COMMON,
     FORM,
     FREE,
-    USUAL,
     PolicyAbout,
     contradiction,
     plain,
+    usual,
 )
 from scm_world.tasks import Task
 
@@ -70,7 +70,7 @@ def shared_options(given: Mapping[str, Any] | None, agents: Trained) -> Options:
         wanted = _distinct(about.option(option) for _, about in trained)
         if len(wanted) > 1:
             raise _disagreement(option, trained)
-        if wanted and wanted[0] != USUAL[option]:
+        if wanted and wanted[0] != usual(option, trained[0][1].task):
             found[option] = wanted[0]
     return found
 
@@ -100,7 +100,8 @@ def _refuse_contradiction(
     option: str, given: Mapping[str, Any], trained: Sequence[tuple[str, PolicyAbout]]
 ) -> None:
     for name, about in trained:
-        if option in given and plain(given[option]) != about.option(option):
+        wanted = about.option(option)
+        if option in given and wanted is not None and plain(given[option]) != wanted:
             raise contradiction(option, given[option], about.option(option), name)
 
 

@@ -51,16 +51,16 @@ class _Seat:
         game: What is kept of it.
         place: Agent, run, engine, protocol, seed and episode.
         seen: What is needed to ask the policy again, if that has to be done.
-        success: Whether the last control step was a success.
+        success: Whether the last control step was a success, if the task says so.
     """
 
     game: Game
     place: tuple[str, int, str, str, int, int]
     seen: Seen | None
-    success: bool = False
+    success: bool | None = None
 
     def act(self, shown: Callable[[int], Any], row: int) -> Actions:
-        """Let the player choose an action, shape (9,).
+        """Let the player choose an action, shape (n,).
 
         Args:
             shown: Gives a copy of the observation of a row.
@@ -158,14 +158,14 @@ class Lockstep:
         """Play episodes that have begun."""
         crew = self._ready()
         which = np.arange(crew.num_envs) < len(seats)
-        actions = np.zeros((crew.num_envs, 9))
+        actions = np.zeros((crew.num_envs, self._env.world.declaration.n_actions))
         while which.any():
             rows = np.flatnonzero(which).tolist()
             for row in rows:
                 actions[row] = seats[row].act(crew.sheet.observation, row)
             crew.step(which, actions)
             self._note(seats, rows)
-            which[rows] &= ~crew.sheet.truncations[rows]
+            which[rows] &= ~(crew.sheet.terminations | crew.sheet.truncations)[rows]
             for row in rows:
                 if which[row] and seats[row].game.is_due:
                     with crew.alone(row) as env:
@@ -179,10 +179,11 @@ class Lockstep:
         sheet = self._ready().sheet
         infos: Mapping[str, Any] = sheet.infos
         rewards = sheet.rewards.tolist()
-        fractions, successes = infos[FRACTION], infos[FLAGS[0]]
+        fractions, successes = infos.get(FRACTION), infos.get(FLAGS[0])
         for row in rows:
-            seats[row].game.stepped(rewards[row], float(fractions[row]))
-            seats[row].success = bool(successes[row])
+            fraction = None if fractions is None else float(fractions[row])
+            seats[row].game.stepped(rewards[row], fraction)
+            seats[row].success = None if successes is None else bool(successes[row])
 
     def _acts_alike_alone(self, player: Any, seat: _Seat) -> bool:
         """Tell whether a policy does what it did, with nobody else to act for."""

@@ -16,7 +16,7 @@ from scm_world.evaluation.outputs import (
     record_videos,
     write_report,
 )
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.output.durable import removed
 from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
@@ -32,7 +32,7 @@ def write_outputs(
     evaluation: Evaluation,
     folder: Location | str,
     *,
-    metric: str = SCORE,
+    metric: str | None = None,
     videos: bool = False,
     policy: Any = None,
     trusted: Sequence[str] = (),
@@ -57,6 +57,7 @@ def write_outputs(
         UnwritableFolder: There is no room, or no permission.
         MissingExtra: Videos are wanted, and moviepy is not installed.
     """
+    metric = evaluation.metric(metric)
     place = located(folder)
     for name in STALE:
         for old in place.glob(name):

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.arena import METRICS, Row
+from scm_world.evaluation.arena import FRACTIONS, Row
 from scm_world.evaluation.statistics import (
     Causes,
     Interval,
@@ -29,12 +29,10 @@ from scm_world.evaluation.tables import (
     is_rate,
     known,
     means,
+    measured,
     paired,
 )
 from scm_world.output.locations import Location, located
-
-SCORE = "last_fractional_success"
-"""The metric of the published figures."""
 
 
 @final
@@ -101,6 +99,22 @@ class Evaluation:
         """In which protocols."""
         return self._listed("protocol")
 
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """What was measured: those of ``METRICS`` that the task has."""
+        return measured(self.columns)
+
+    def metric(self, name: str | None = None) -> str:
+        """Choose what is looked at; None stands for the first one of ``metrics``.
+
+        That is the last fractional success, as in the published figures; of a task without it,
+        success; of one that does not say what success is, the return.
+
+        Raises:
+            UnknownOption: Nothing of this name was measured.
+        """
+        return known(self.columns, name)
+
     def runs(self, agent: str) -> tuple[int, ...]:
         """List the training runs of an agent."""
         return self.only(agent=agent)._listed("run")
@@ -138,7 +152,7 @@ class Evaluation:
     # --- what it says -------------------------------------------------------------------------
 
     def scores(
-        self, metric: str = SCORE, *, agent: str | None = None, engine: str | None = None
+        self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
     ) -> Floats:
         """Give the scores of an agent on an engine.
 
@@ -150,7 +164,7 @@ class Evaluation:
             UnknownOption: There is no such metric, agent or engine, or protocols do not have the
                 same episodes.
         """
-        known(metric)
+        metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine)
         played = [protocol for protocol in self.protocols if protocol in mine.protocols]
@@ -171,7 +185,7 @@ class Evaluation:
     def score(
         self,
         protocol: str,
-        metric: str = SCORE,
+        metric: str | None = None,
         *,
         agent: str | None = None,
         engine: str | None = None,
@@ -184,7 +198,7 @@ class Evaluation:
         Raises:
             UnknownOption: There is no such protocol, metric, agent or engine.
         """
-        known(metric)
+        metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine, protocol=protocol)
         values, runs = mine.columns[metric], mine.columns["run"]
@@ -198,7 +212,7 @@ class Evaluation:
         one: str,
         other: str,
         protocol: str,
-        metric: str = SCORE,
+        metric: str | None = None,
         *,
         engine: str | None = None,
     ) -> Interval:
@@ -210,6 +224,7 @@ class Evaluation:
         Raises:
             UnknownOption: They did not play the same episodes.
         """
+        metric = self.metric(metric)
         engine = self.the("engine", engine)
         here = self.only(engine=engine, protocol=protocol)
         return paired(here.only(agent=one).columns, here.only(agent=other).columns, metric)
@@ -219,7 +234,7 @@ class Evaluation:
         one: str,
         other: str,
         protocol: str,
-        metric: str = SCORE,
+        metric: str | None = None,
         *,
         agent: str | None = None,
     ) -> Interval:
@@ -228,16 +243,18 @@ class Evaluation:
         Raises:
             UnknownOption: It did not play the same episodes on both.
         """
+        metric = self.metric(metric)
         here = self.only(agent=self.the("agent", agent), protocol=protocol)
         return paired(here.only(engine=one).columns, here.only(engine=other).columns, metric)
 
     def overall(
-        self, metric: str = SCORE, *, agent: str | None = None, engine: str | None = None
+        self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
     ) -> dict[str, Interval]:
         """Estimate mean, median, interquartile mean and optimality gap over all protocols.
 
         Over training runs if there are several, else over episodes; see ``aggregate``.
         """
+        metric = self.metric(metric)
         scores = self.scores(metric, agent=agent, engine=engine)
         return aggregate(scores, over="runs" if len(scores) > 1 else "episodes")
 
@@ -252,7 +269,7 @@ class Evaluation:
     def causes(
         self,
         protocol: str,
-        metric: str = SCORE,
+        metric: str | None = None,
         *,
         agent: str | None = None,
         engine: str | None = None,
@@ -262,10 +279,11 @@ class Evaluation:
         The values were drawn at random, each on its own, so what goes with them is their effect.
         Of several runs of an agent the mean counts.
         """
+        metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine, protocol=protocol)
         first = mine.only(run=mine._listed("run")[0])
-        score_of = means(mine.columns, known(metric))
+        score_of = means(mine.columns, metric)
         units = zip(first.columns["seed"].tolist(), first.columns["episode"].tolist(), strict=True)
         varied = {n: v for n, v in first.drawn().items() if not np.isnan(v).all()}
         scores = np.array([score_of[unit] for unit in units])
@@ -279,7 +297,8 @@ class Evaluation:
             mine = self.only(agent=agent, engine=engine, protocol=protocol)
             found[protocol] = {
                 f"{how}_{metric}": float(getattr(np, how)(mine.columns[metric]))
-                for metric in METRICS[:3]
+                for metric in FRACTIONS
+                if metric in mine.columns
                 for how in ("mean", "std")
             }
         return found
@@ -309,4 +328,4 @@ class Evaluation:
         return load(located(path))
 
 
-__all__ = ["DRAWN", "KEYS", "SCORE", "Columns", "Evaluation"]
+__all__ = ["DRAWN", "KEYS", "Columns", "Evaluation"]

@@ -190,8 +190,9 @@ def _walked(player: Player, env: Any, steps: int) -> list[bytes]:
     for _ in range(steps):
         action: NDArray[Any] = player.act(observation)
         found.append(action.tobytes())
-        observation, *_, truncated, _ = env.step(walk.uniform(low, high).astype(np.float32))
-        if truncated:
+        taken = walk.uniform(low, high).astype(np.float32)
+        observation, _, terminated, truncated, _ = env.step(taken)
+        if terminated or truncated:
             break
     return found
 

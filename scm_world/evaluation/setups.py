@@ -6,6 +6,7 @@ import inspect
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from hashlib import blake2b
 from typing import Any, final
 
@@ -19,8 +20,9 @@ from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.forms import form_of, in_form, shared_options, task_for
 from scm_world.evaluation.protocols import Protocol, chosen
 from scm_world.evaluation.seats import Entry, Seat, entries_of, source_of
+from scm_world.models import Model
 from scm_world.queries.experiments.versions import versions
-from scm_world.tasks import TASKS, Task, tasks
+from scm_world.tasks import TASKS, Task, make_task, tasks
 from scm_world.world.start import whole_number
 
 SHARD = 25
@@ -52,6 +54,17 @@ class Place:
         """
         return ScmWorldEnv(self.task, backend=engine, **in_form(self.options, form))
 
+    @cached_property
+    def made(self) -> Task:
+        """The task itself."""
+        if isinstance(self.task, Task):
+            return self.task
+        return make_task(self.task, **(self.options.get("task_options") or {}))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the task that was made of a name."""
+        return {name: value for name, value in self.__dict__.items() if name != "made"}
+
     @property
     def name(self) -> str:
         """Name of the task."""
@@ -64,8 +77,12 @@ class Place:
             ModelError: Something of it cannot be written down.
         """
         arguments = {} if isinstance(self.task, str) else self.task.given
-        kind = tasks()[self.task] if isinstance(self.task, str) else type(self.task)
-        own = {} if kind is TASKS.get(self.name) else {"class": _class(kind)}
+        kind = tasks().get(self.task) if isinstance(self.task, str) else type(self.task)
+        own = {} if kind in (None, TASKS.get(self.name)) else {"class": _class(kind)}
+        system = getattr(self.made, "system", None)
+        if isinstance(system, Model):
+            arguments = {name: value for name, value in arguments.items() if name != "model"}
+            own["model"] = system.digest
         try:
             return json.loads(  # type: ignore[no-any-return]
                 json.dumps(
@@ -226,7 +243,7 @@ def prepare(
     for engine in engines:
         if not isinstance(engine, str) or engine not in backends():
             raise UnknownOption("backend", engine, backends())
-    known = protocols_of(place.name) if place.name in tasks() or protocols is None else ()
+    known = protocols_of(place.made if place.name not in tasks() else place.name, engines[0])
     wanted = chosen(protocols, known)
     count = whole_number("n", n, least=1)
     noises = tuple(_seed(seed) for seed in _several("seeds", seeds))
@@ -276,7 +293,7 @@ def _seated(entries: Sequence[Entry], place: Place, shared: ScmWorldEnv) -> Iter
 def _place(task: Task | str | None, env: Any, entries: Sequence[Entry]) -> Place:
     agents = [(entry.agent, entry.made_for) for entry in entries]
     task = task_for(task, agents)
-    if not isinstance(task, Task) and (not isinstance(task, str) or task not in tasks()):
+    if not isinstance(task, Task | str):
         raise UnknownOption("task", task, tasks())
     if not isinstance(env, Mapping | None):
         raise UnknownOption("env", env, ("options of the environment, by name",))
@@ -284,7 +301,9 @@ def _place(task: Task | str | None, env: Any, entries: Sequence[Entry]) -> Place
     for name in env or {}:
         if name not in allowed:
             raise UnknownOption("option of the environment", name, allowed)
-    return Place(task, shared_options(env, agents))
+    place = Place(task, shared_options(env, agents))
+    place.made  # noqa: B018 # refuses a task that is not there
+    return place
 
 
 def _seed(seed: Any) -> int:
@@ -309,4 +328,7 @@ def _plain(value: Any) -> Any:
         return dump(mode="json")
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
+    if callable(value):
+        text = blake2b(source_of(value), digest_size=8).hexdigest()
+        return f"{value.__module__}:{value.__qualname__} {text}"
     raise TypeError(f"{value!r} is no plain data")

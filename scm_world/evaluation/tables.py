@@ -32,7 +32,8 @@ def columns_of(rows: Sequence[Row]) -> Columns:
         kind: Any = str if name in TEXTS else np.int64
         found[name] = np.array([getattr(row, name) for row in rows], dtype=kind)
     for metric in METRICS:
-        found[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
+        if all(metric in row.scores for row in rows):
+            found[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
     found["hash"] = np.array([row.hash for row in rows], dtype=str)
     return {**found, **_drawn(rows)}
 
@@ -66,14 +67,22 @@ def joined(tables: Iterable[Columns]) -> Columns:
     }
 
 
-def known(metric: str) -> str:
-    """Check the name of a metric.
+def measured(columns: Columns) -> tuple[str, ...]:
+    """List those of ``METRICS`` that a table has."""
+    return tuple(metric for metric in METRICS if metric in columns)
+
+
+def known(columns: Columns, metric: str | None) -> str:
+    """Check the name of a metric; None stands for the first one that a table has.
 
     Raises:
-        UnknownOption: There is none of this name.
+        UnknownOption: It has none of this name.
     """
-    if metric not in METRICS:
-        raise UnknownOption("metric", metric, METRICS)
+    there = measured(columns)
+    if metric is None:
+        return there[0]
+    if metric not in there:
+        raise UnknownOption("metric", metric, there)
     return metric
 
 
@@ -86,13 +95,14 @@ def means(columns: Columns, metric: str) -> dict[tuple[int, int], float]:
     return {unit: sum(scores) / len(scores) for unit, scores in found.items()}
 
 
-def paired(one: Columns, other: Columns, metric: str) -> Interval:
+def paired(one: Columns, other: Columns, metric: str | None) -> Interval:
     """Estimate by how much the scores of a table are higher, episode by episode.
 
     Raises:
         UnknownOption: They do not have the same episodes, or there is no such metric.
     """
-    mine, its = means(one, known(metric)), means(other, metric)
+    metric = known(one, metric)
+    mine, its = means(one, metric), means(other, metric)
     if mine.keys() != its.keys():
         differ = sorted(mine.keys() ^ its.keys())[0]
         allowed = ("episodes that both have played",)

@@ -292,8 +292,8 @@ def test_given_actions_are_played_and_the_last_one_is_held() -> None:
     np.testing.assert_array_equal(found[:3], given)
     np.testing.assert_array_equal(found[3:], given[[2, 2, 2]])
     np.testing.assert_array_equal(played([0.5] * 9, make()), np.full((STEPS, 9), 0.5))
-    with pytest.raises(ActionError):
-        as_player(np.zeros((2, 8)))
+    with pytest.raises(ActionError, match=r"shape \(9,\)"):
+        played(np.zeros((2, 8)), make())
 
 
 def test_a_saved_episode_is_played(tmp_path: Path) -> None:

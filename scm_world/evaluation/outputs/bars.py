@@ -16,7 +16,7 @@ from scm_world.evaluation.outputs.looks import (
 )
 from scm_world.evaluation.outputs.sheets import PLAIN, text_size
 from scm_world.evaluation.outputs.strips import Strips, value_axis
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval
 from scm_world.output.canvas import INK, save
 from scm_world.output.locations import Location
@@ -30,7 +30,7 @@ BETWEEN = 0.28  # [inches] between the bars of two protocols
 NUMBER = 7.0  # [points]
 
 
-def draw_bars(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
+def draw_bars(evaluation: Evaluation, path: Location | str, metric: str | None = None) -> None:
     """Draw the mean score in each protocol, a bar for each agent and engine.
 
     Whiskers are 95 % intervals; a bar has none if the data say nothing about it. Where an agent
@@ -48,8 +48,9 @@ def draw_bars(evaluation: Evaluation, path: Location | str, metric: str = SCORE)
     save(bars_figure(evaluation, metric), path)
 
 
-def bars_figure(evaluation: Evaluation, metric: str = SCORE) -> Figure:
+def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     """Draw the same for a page."""
+    metric = evaluation.metric(metric)
     said = metric_words(metric)
     looks, scores = Looks(lines_of(evaluation)), intervals(evaluation, metric)
     count = len(looks.lines)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from scm_world.evaluation.outputs.looks import metric_words, protocol_words
 from scm_world.evaluation.outputs.sheets import GAP, MARGIN, PLAIN, Sheet, text_size, wrapped
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Cause, Causes
 from scm_world.output.canvas import INK, PALETTE, save
 from scm_world.output.locations import Location
@@ -28,14 +28,17 @@ SIGNS: Mapping[str, str] = {"up": "▲", "down": "▼", "unclear": "?"}
 
 
 def causes_of(
-    evaluation: Evaluation, agent: str | None = None, engine: str | None = None, metric: str = SCORE
+    evaluation: Evaluation,
+    agent: str | None = None,
+    engine: str | None = None,
+    metric: str | None = None,
 ) -> dict[str, Causes]:
     """Estimate the effects in every protocol in which an agent acted on an engine.
 
     Raises:
         UnknownOption: There is no such agent, engine or metric, or it has to be named.
     """
-    metric_words(metric)
+    metric = evaluation.metric(metric)
     agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
     mine = evaluation.only(agent=agent, engine=engine)
     return {protocol: mine.causes(protocol, metric) for protocol in mine.protocols}
@@ -46,7 +49,7 @@ def draw_causes(
     path: Location | str,
     agent: str | None = None,
     engine: str | None = None,
-    metric: str = SCORE,
+    metric: str | None = None,
 ) -> None:
     """Draw what each varied variable does to the score, the strongest one above.
 
@@ -76,9 +79,10 @@ def causes_figure(
     found: Mapping[str, Causes],
     agent: str,
     engine: str,
-    metric: str = SCORE,
+    metric: str | None = None,
 ) -> Figure:
     """Draw effects that are known already, by protocol."""
+    metric = evaluation.metric(metric)
     varied = {name: one for name, one in found.items() if one.causes or one.left_out}
     panels = {name: one for name, one in varied.items() if not is_flat(one)}
     flat = [name for name in varied if name not in panels]

@@ -16,7 +16,7 @@ from scm_world.evaluation.outputs.looks import (
     protocol_words,
 )
 from scm_world.evaluation.outputs.strips import Strips
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval
 from scm_world.output.canvas import INK, save
 from scm_world.output.locations import Location
@@ -31,12 +31,13 @@ Gaps = dict[tuple[str, str, str, str], Interval]
 """By one engine, the other, agent and protocol."""
 
 
-def gaps_of(evaluation: Evaluation, metric: str = SCORE) -> Gaps:
+def gaps_of(evaluation: Evaluation, metric: str | None = None) -> Gaps:
     """Estimate all gaps between engines, of the agents that acted on both in a protocol.
 
     Raises:
         UnknownOption: There is one engine only, or an agent did not play the same episodes on both.
     """
+    metric = evaluation.metric(metric)
     if len(evaluation.engines) < 2:
         allowed = ("an evaluation on two engines or more, such as backend='mujoco,bullet'",)
         raise UnknownOption("engines of a gap", ", ".join(evaluation.engines), allowed)
@@ -51,7 +52,7 @@ def gaps_of(evaluation: Evaluation, metric: str = SCORE) -> Gaps:
     return found
 
 
-def draw_gap(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
+def draw_gap(evaluation: Evaluation, path: Location | str, metric: str | None = None) -> None:
     """Draw the gap between engines in each protocol, with paired 95 % intervals.
 
     Args:
@@ -67,8 +68,9 @@ def draw_gap(evaluation: Evaluation, path: Location | str, metric: str = SCORE) 
     save(gap_figure(evaluation, gaps_of(evaluation, metric), metric), path)
 
 
-def gap_figure(evaluation: Evaluation, gaps: Gaps, metric: str = SCORE) -> Figure:
+def gap_figure(evaluation: Evaluation, gaps: Gaps, metric: str | None = None) -> Figure:
     """Draw gaps that are known already."""
+    metric = evaluation.metric(metric)
     said, looks = metric_words(metric), Looks(lines_of(evaluation))
     agents, pairs = evaluation.agents, list(combinations(evaluation.engines, 2))
     strips = Strips(

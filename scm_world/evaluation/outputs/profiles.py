@@ -18,7 +18,7 @@ from scm_world.evaluation.outputs.looks import (
     metric_words,
 )
 from scm_world.evaluation.outputs.sheets import GAP, MARGIN, PLAIN, Sheet, text_size, wrapped
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import (
     Interval,
     Profile,
@@ -55,7 +55,7 @@ class Comparison:
     better: dict[tuple[str, str], Interval]
 
 
-def compare_agents(evaluation: Evaluation, engine: str, metric: str = SCORE) -> Comparison:
+def compare_agents(evaluation: Evaluation, engine: str, metric: str | None = None) -> Comparison:
     """Compare the agents on an engine over all protocols.
 
     Raises:
@@ -65,7 +65,7 @@ def compare_agents(evaluation: Evaluation, engine: str, metric: str = SCORE) -> 
         Agarwal et al., *Deep reinforcement learning at the edge of the statistical precipice*,
         NeurIPS 2021.
     """
-    metric_words(metric)
+    metric = evaluation.metric(metric)
     here = evaluation.only(engine=engine)
     for agent in here.agents:
         missing = set(here.protocols) - set(here.only(agent=agent).protocols)
@@ -93,7 +93,7 @@ def _thresholds(metric: str, scores: list[Floats]) -> Floats:
     return np.linspace(low - room, high + room, 101)
 
 
-def draw_profile(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
+def draw_profile(evaluation: Evaluation, path: Location | str, metric: str | None = None) -> None:
     """Draw the share of scores above each threshold, and who is better with what probability.
 
     For each engine one panel of profiles with their 95 % bands, and with several agents one of
@@ -115,9 +115,10 @@ def draw_profile(evaluation: Evaluation, path: Location | str, metric: str = SCO
 
 
 def profile_figure(
-    evaluation: Evaluation, found: dict[str, Comparison], metric: str = SCORE
+    evaluation: Evaluation, found: dict[str, Comparison], metric: str | None = None
 ) -> Figure:
     """Draw comparisons that are known already, by engine."""
+    metric = evaluation.metric(metric)
     said, looks = metric_words(metric), Looks(lines_of(evaluation))
     blocks = [sum(_pair_heights(one)) for one in found.values()]
     several = any(one.better for one in found.values())

@@ -24,7 +24,7 @@ from scm_world.evaluation.outputs.looks import (
     protocol_words,
 )
 from scm_world.evaluation.outputs.sheets import GAP, MARGIN, Sheet, balanced, text_size, wrapped
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval
 from scm_world.output.canvas import INK, save
 from scm_world.output.locations import Location
@@ -41,7 +41,7 @@ WIDEST = 20.0  # [inches] of radars side by side
 OUT = 0.1  # [inches] from the outer ring to the names
 
 
-def draw_radar(evaluation: Evaluation, path: Location | str, metric: str = SCORE) -> None:
+def draw_radar(evaluation: Evaluation, path: Location | str, metric: str | None = None) -> None:
     """Draw the mean scores as polygons, with bands of their 95 % intervals.
 
     Up to six lines share a radar. With more of them every agent has a radar of its own; none is
@@ -59,8 +59,9 @@ def draw_radar(evaluation: Evaluation, path: Location | str, metric: str = SCORE
     save(radar_figure(evaluation, metric), path)
 
 
-def radar_figure(evaluation: Evaluation, metric: str = SCORE) -> Figure:
+def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     """Draw the same for a page."""
+    metric = evaluation.metric(metric)
     said, words = metric_words(metric), protocol_words(evaluation)
     if len(words) < 3:
         allowed = ("three protocols or more; draw_bars draws fewer",)

@@ -27,7 +27,7 @@ from scm_world.evaluation.outputs.tables import (
     published_table,
     verdict,
 )
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Causes
 from scm_world.output.canvas import small_png
 from scm_world.output.durable import write_whole
@@ -46,7 +46,7 @@ def write_report(
     path: Location | str,
     *,
     videos: Sequence[Location | str] = (),
-    metric: str = SCORE,
+    metric: str | None = None,
 ) -> None:
     """Write the report: scores, pictures, differences, causes, and how to check all of it.
 
@@ -63,6 +63,7 @@ def write_report(
         UnknownOption: There is no such metric, or no episode.
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
+    metric = evaluation.metric(metric)
     said = metric_words(metric)
     if not len(evaluation):
         raise UnknownOption("evaluation", "without episodes", ("one with an episode or more",))

@@ -12,7 +12,7 @@ from scm_world.evaluation.files import summarized
 from scm_world.evaluation.outputs.causes import ALPHA, is_flat
 from scm_world.evaluation.outputs.gap import Gaps
 from scm_world.evaluation.outputs.looks import Line, lines_of, protocol_words
-from scm_world.evaluation.results import SCORE, Evaluation
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Cause, Causes, Interval
 from scm_world.output.pages import Entry, table
 
@@ -20,8 +20,9 @@ Pairs = dict[tuple[str, str, str, str], Interval | str]
 """Paired differences by engine, protocol, one agent and another, or why there is none."""
 
 
-def differences(evaluation: Evaluation, metric: str = SCORE) -> Pairs:
+def differences(evaluation: Evaluation, metric: str | None = None) -> Pairs:
     """Estimate all paired differences between agents."""
+    metric = evaluation.metric(metric)
     found: Pairs = {}
     for engine in evaluation.engines:
         here = evaluation.only(engine=engine)
@@ -84,7 +85,7 @@ class Scores:
         row = self._rows.get((line, protocol))
         return None if row is None else interval(row[metric])
 
-    def summary(self, bold: set[tuple[Line, str]], metric: str = SCORE) -> str:
+    def summary(self, bold: set[tuple[Line, str]], metric: str) -> str:
         """Write a row for each protocol, a column for each agent and engine."""
         heads = ["protocol", "what varies", *map(self._name, self.lines)]
         rows: list[list[str | Entry]] = [
@@ -102,16 +103,17 @@ class Scores:
 
     def metrics(self) -> str:
         """Write all metrics, a row for each agent, engine and protocol."""
+        there = [metric for metric in METRICS if all(metric in row for row in self.rows)]
         rows: list[list[str | Entry]] = [
             [
                 row["agent"],
                 row["engine"],
                 row["protocol"],
-                *(shown(interval(row[m])) for m in METRICS),
+                *(shown(interval(row[m])) for m in there),
             ]
             for row in self.rows
         ]
-        return table(["agent", "engine", "protocol", *METRICS], rows, left=3, sortable=True)
+        return table(["agent", "engine", "protocol", *there], rows, left=3, sortable=True)
 
 
 def interval(data: Mapping[str, Any]) -> Interval:
@@ -151,8 +153,9 @@ def gap_table(gaps: Gaps) -> str:
     return table(["agent", "protocol", "engines", "gap"], rows, left=3, sortable=True)
 
 
-def overall_table(evaluation: Evaluation, metric: str = SCORE) -> str:
+def overall_table(evaluation: Evaluation, metric: str | None = None) -> str:
     """Write the aggregates over all protocols, and say over what they are."""
+    metric = evaluation.metric(metric)
     rows: list[list[str | Entry]] = []
     names = ("interquartile_mean", "mean", "median", "optimality_gap")
     for line in lines_of(evaluation):

@@ -18,7 +18,7 @@ from scm_world.errors import SnapshotMismatch, UnknownOption, UnwritableFolder
 from scm_world.evaluation.outputs.captions import Caption, Frame
 from scm_world.evaluation.outputs.looks import metric_words, protocol_words
 from scm_world.evaluation.pipeline import Bench
-from scm_world.evaluation.results import DRAWN, KEYS, SCORE, Evaluation
+from scm_world.evaluation.results import DRAWN, KEYS, Evaluation
 from scm_world.evaluation.setups import Setup
 from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import write_durably
@@ -37,7 +37,7 @@ def record_videos(
     *,
     agent: str | None = None,
     engine: str | None = None,
-    metric: str = SCORE,
+    metric: str | None = None,
     which: Sequence[str] = WHICH,
     camera: Camera = OVERVIEW,
     progress: Progress | None = None,
@@ -69,6 +69,7 @@ def record_videos(
         UnknownOption: There is no such agent, engine, metric or choice.
         UnwritableFolder: There is no room, or no permission.
     """
+    metric = evaluation.metric(metric)
     writer = load("moviepy.video.io.ffmpeg_writer", "moviepy", "video").FFMPEG_VideoWriter
     chosen = choose(evaluation, agent=agent, engine=engine, metric=metric, which=which)
     total = sum(int(evaluation.columns["steps"][place]) for place in chosen.values())
@@ -91,7 +92,7 @@ def choose(
     *,
     agent: str | None = None,
     engine: str | None = None,
-    metric: str = SCORE,
+    metric: str | None = None,
     which: Sequence[str] = WHICH,
 ) -> dict[str, int]:
     """Choose episodes of an agent on an engine.
@@ -102,7 +103,7 @@ def choose(
     Raises:
         UnknownOption: There is no such agent, engine, metric or choice.
     """
-    metric_words(metric)
+    metric = evaluation.metric(metric)
     agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
     columns = evaluation.columns
     mine = np.flatnonzero((columns["agent"] == agent) & (columns["engine"] == engine))

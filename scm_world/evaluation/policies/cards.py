@@ -11,6 +11,7 @@ from pydantic import Field, JsonValue, ValidationError, field_validator
 
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.tasks import tasks
 from scm_world.variables.spaces import Frozen
 
 KEY = "scm_world"
@@ -55,7 +56,22 @@ def plain(value: Any) -> Any:
 USUAL: Mapping[str, Any] = {
     name: plain(inspect.signature(ScmWorldEnv).parameters[name].default) for name in OPTIONS
 }
-"""What these options are if nothing is said."""
+"""What these options are if nothing is said; None is the task's own."""
+
+
+def usual(option: str, task: str) -> Any:
+    """Give what an option is if nothing is said; None where only the task itself knows it.
+
+    Example:
+        >>> usual("frame_skip", "pushing"), usual("frame_skip", "cartpole.xml")
+        (10, None)
+    """
+    kind = tasks().get(task)
+    if kind is None or option not in ("action_mode", "preset", "frame_skip"):
+        return USUAL[option]
+    if option == "frame_skip":
+        return getattr(kind, option, None)
+    return next(iter(getattr(kind, f"{option}s", ())), None)
 
 
 @final
@@ -110,12 +126,13 @@ class PolicyAbout(Frozen):
         return inputs
 
     def option(self, name: str) -> Any:
-        """Give an option of the environment, as JSON has it."""
-        return self.env.get(name, USUAL[name])
+        """Give an option of the environment, as JSON has it; None is the task's own."""
+        return self.env.get(name, usual(name, self.task))
 
     def unusual(self, names: tuple[str, ...]) -> dict[str, Any]:
         """Give those of some options that are not as usual."""
-        return {name: self.option(name) for name in names if self.option(name) != USUAL[name]}
+        found = {name: self.option(name) for name in names}
+        return {name: v for name, v in found.items() if v != usual(name, self.task)}
 
     def with_card(self, **entries: Any) -> Self:
         """Give the same with other entries of the card."""
@@ -157,7 +174,7 @@ def refuse_other_form(made_for: PolicyAbout | None, env: ScmWorldEnv, name: str)
         return
     for option in (*FORM, *COMMON):
         given, wanted = plain(env.made_with[option]), made_for.option(option)
-        if given != wanted:
+        if wanted is not None and given != wanted:
             raise contradiction(option, given, wanted, name)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from scm_world.env import ScmWorldEnv
 from scm_world.env.delta import PREFIX
+from scm_world.env.given import action_scale
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.evaluation.policies.players import Actions, Player, Playing
 from scm_world.world import World
@@ -24,7 +25,7 @@ class OpenLoop(Playing):
     one with other units they are converted, which rounds them to 64-bit floats.
 
     Args:
-        actions: Shape (steps, 9).
+        actions: Shape (steps, n).
         about: What they are.
         action_mode: What they mean; the same as the environment's if None.
         normalized: Whether they lie in [-1, 1], or are in SI units.
@@ -45,8 +46,8 @@ class OpenLoop(Playing):
     ) -> None:
         super().__init__(about)
         given = np.asarray(actions)
-        if given.ndim != 2 or given.shape[1:] != (9,) or not len(given):
-            raise ActionError("actions have shape (steps, 9), with one step at least", actions)
+        if given.ndim != 2 or not len(given):
+            raise ActionError("actions have shape (steps, n), with one step at least", actions)
         for action in given:
             self._checked(action)
         self._given, self._mode, self._normalized = given, action_mode, normalized
@@ -68,12 +69,14 @@ class OpenLoop(Playing):
         Raises:
             UnknownOption: The environment has another action mode, or relative actions mean
                 something else in it.
+            ActionError: Its actions have another number of components.
         """
         self._env, self._step = env, 0
+        self._checked(self._given[0])
         self._actions = self._given if self._mode is None else self._converted(env, self._mode)
 
     def act(self, observation: Any) -> Actions:
-        """Give the next action, shape (9,)."""
+        """Give the next action, shape (n,)."""
         found: Actions = self._actions[min(self._step, len(self._actions) - 1)]
         self._step += 1
         return found
@@ -97,11 +100,11 @@ class OpenLoop(Playing):
 
 def is_normalized(env: ScmWorldEnv) -> bool:
     """Tell whether actions in [-1, 1] stand for the range of commands."""
-    return bool(np.any(env.as_action(np.ones(9)) != np.ones(9)))
+    return bool(env.made_with["normalize_actions"])
 
 
 def commands(actions: Actions, world: World) -> Actions:
-    """Turn actions in [-1, 1] into commands in SI units, shape (..., 9)."""
-    low, high = world.action_low, world.action_high
-    found: Actions = (low + high) / 2.0 + (high - low) / 2.0 * actions
+    """Turn actions in [-1, 1] into commands in SI units, shape (..., n)."""
+    middle, half = action_scale(world)
+    found: Actions = middle + half * actions
     return found

@@ -26,7 +26,7 @@ class ByNetwork(Playing):
     """Asks a network that takes a batch of observations and gives a batch of actions.
 
     An observation that is an array goes to its only input; one that is arrays by name goes to
-    inputs of the same names. The first output is the action, shape (1, 9) or (9,). What the network
+    inputs of the same names. The first output is the action, shape (1, n) or (n,). What the network
     was trained for stands in its metadata under ``"scm_world"``, if it is known.
 
     Args:
@@ -106,7 +106,7 @@ class ByNetwork(Playing):
                 raise UnreadableFile(str(self._path), reason, _ADVICE)
 
     def act(self, observation: Any) -> Actions:
-        """Choose an action, shape (9,)."""
+        """Choose an action, shape (n_actions,)."""
         try:
             found = self._session.run([self._output], self._feed(observation))[0]
         except Exception as error:  # as above

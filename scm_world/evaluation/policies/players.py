@@ -21,7 +21,6 @@ Actions = NDArray[Any]
 About = dict[str, Any]
 """What a policy is, as plain data: its kind, its name, and where it comes from."""
 
-SHAPE = (9,)
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
 
@@ -41,7 +40,7 @@ class Player(Protocol):
         """
 
     def act(self, observation: Any) -> Actions:
-        """Choose an action of the environment, shape (9,).
+        """Choose an action of the environment, shape (n_actions,).
 
         Args:
             observation: What the environment shows: an array, or arrays by name.
@@ -52,11 +51,11 @@ class Player(Protocol):
 
 
 def checked(action: Any, env: gymnasium.Env[Any, Any] | None, name: str) -> Actions:
-    """Check that a policy gave nine finite numbers; numbers beyond the range are left alone.
+    """Check that a policy gave finite numbers; numbers beyond the range are left alone.
 
     Args:
         action: What it gave.
-        env: Where it acts, for the message.
+        env: Where it acts, which says how many numbers there are; any number if None.
         name: Of the policy.
 
     Returns:
@@ -68,23 +67,24 @@ def checked(action: Any, env: gymnasium.Env[Any, Any] | None, name: str) -> Acti
     Example:
         >>> checked([0] * 9, None, "lazy")
         array([0., 0., 0., 0., 0., 0., 0., 0., 0.])
-        >>> checked([0.0, 1.0], None, "short")
+        >>> checked([0.0, float("nan")], None, "wild")
         Traceback (most recent call last):
-        scm_world.errors.ActionError: the policy 'short' gave [0.0, 1.0]; an action is an array of
-        shape (9,) with finite numbers
+        scm_world.errors.ActionError: the policy 'wild' gave [0.0, nan]; an action is an array of
+        shape (n,) with finite numbers
     """
-    if type(action) is np.ndarray and action.dtype in _FLOATS and action.shape == SHAPE:
+    shape = None if env is None else env.action_space.shape
+    if type(action) is np.ndarray and action.dtype in _FLOATS and action.shape == shape:
         found: Actions = action
-        if math.isfinite(sum(action.tolist())):  # faster than numpy for nine numbers
+        if math.isfinite(sum(action.tolist())):  # faster than numpy for a few numbers
             return found
     else:
         found = _as_floats(action)
-    if found.shape == SHAPE and np.isfinite(found).all():
+    if (found.shape == shape or (shape is None and found.ndim == 1)) and np.isfinite(found).all():
         return found
     where = "" if env is None else f" of {env.action_space}"
     raise ActionError(
-        f"the policy {name!r} gave {action!r}; an action is an array of shape {SHAPE} with finite "
-        f"numbers{where}",
+        f"the policy {name!r} gave {action!r}; an action is an array of shape {shape or '(n,)'} "
+        f"with finite numbers{where}",
         action,
     )
 
@@ -96,7 +96,7 @@ def _as_floats(action: Any) -> Actions:
             return found
         return found.astype(np.float64, casting="safe" if found.dtype.kind in "bui" else "no")
     except (TypeError, ValueError):
-        return np.empty(0)
+        return np.empty((0, 0))
 
 
 @final
@@ -105,7 +105,7 @@ class WorldPolicy:
     """Marks a policy that looks at the world instead of the observation.
 
     It is called with the world of the environment and gives an action in the units of the action
-    mode (rad, N m or m), shape (9,). It serves as a decorator.
+    mode (rad, N m or m), shape (n_actions,). It serves as a decorator.
 
     Attributes:
         policy: The function; a class is made anew for every episode.
@@ -192,7 +192,7 @@ class ByObservation(Playing):
         return None if _forgets(self._policy) else ByObservation(self._policy, self._about)
 
     def act(self, observation: Any) -> Actions:
-        """Choose an action, shape (9,)."""
+        """Choose an action, shape (n_actions,)."""
         return self._checked(self._policy(observation))
 
 
@@ -240,7 +240,7 @@ class ByPrediction(Playing):
         return ByPrediction(self._model, self._about)
 
     def act(self, observation: Any) -> Actions:
-        """Choose an action, shape (9,)."""
+        """Choose an action, shape (n_actions,)."""
         action, self._state = self._model.predict(
             observation,
             state=self._state,
@@ -270,7 +270,7 @@ class ByWorld(Playing):
         forget(self._policy)
 
     def act(self, observation: Any) -> Actions:
-        """Choose an action, shape (9,), dtype float64; it is not rounded.
+        """Choose an action, shape (n_actions,), dtype float64; it is not rounded.
 
         Where actions are relative it leads as near to what the policy asks for as one can.
         """

@@ -29,9 +29,10 @@ from scm_world.evaluation.zoo.shelf import PREFIX as ZOO
 from scm_world.evaluation.zoo.shelf import path_of
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
-from scm_world.queries.policies import NAMED, Policy, Random, Sweep, still
+from scm_world.queries.policies import NAMED, Policy, Random, Sweep
 from scm_world.queries.policies import Sequence as Given
 from scm_world.variables import Function
+from scm_world.world import World
 
 PACKAGE = "scm_world"
 
@@ -39,6 +40,11 @@ PACKAGE = "scm_world"
 def itself(policy: Policy) -> Policy:
     """Give a policy that serves for all episodes."""
     return policy
+
+
+def still(world: World) -> Any:
+    """Let the system be, as the task knows it: shape (n_actions,)."""
+    return world.task.idle(world)
 
 
 NAMES: Mapping[str, Callable[[], Policy]] = {"still": partial(itself, still), **NAMED}
@@ -66,7 +72,7 @@ class Played(Protocol):
 
     @property
     def actions(self) -> Any:
-        """Shape (steps, 9)."""
+        """Shape (steps, n_actions)."""
 
     @property
     def action_mode(self) -> str:
@@ -86,8 +92,8 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
 
     Args:
         policy: A function of the observation; an object with ``predict`` as Stable-Baselines3 has
-            it; the name of a policy of this package; a ``WorldPolicy``; actions, shape (9,) or
-            (steps, 9); an episode of ``World.rollout`` or of a recording; the path of a policy
+            it; the name of a policy of this package; a ``WorldPolicy``; actions, shape (n,) or
+            (steps, n); an episode of ``World.rollout`` or of a recording; the path of a policy
             file, of an ONNX network, an archive of Stable-Baselines 2, a saved episode or a
             recording (``"runs.parquet#3"`` for its fourth episode); the folder of a training run;
             ``"zoo:pushing"``, one that comes with this package; or
@@ -208,7 +214,7 @@ def _rows(given: Any) -> Any:
     try:
         return np.atleast_2d(np.asarray(given, dtype=getattr(given, "dtype", np.float64)))
     except (TypeError, ValueError):
-        raise ActionError("actions have shape (9,) or (steps, 9)", given) from None
+        raise ActionError("actions have shape (n,) or (steps, n)", given) from None
 
 
 def _of_episode(episode: Episode, about: About) -> Player:

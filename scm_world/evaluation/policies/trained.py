@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import UnreadableFile
+from scm_world.errors import ActionError, UnreadableFile
 from scm_world.evaluation.policies.cards import PolicyAbout, refuse_other_form
 from scm_world.evaluation.policies.players import About, Actions, Player, Playing
 from scm_world.evaluation.policies.weights import NetworkPolicy
@@ -47,14 +47,17 @@ class ByWeights(Playing):
 
         Raises:
             UnknownOption: Its options are others.
-            ActionError: It shows more or fewer numbers, as another task does.
+            ActionError: It shows or takes more or fewer numbers, as another task does.
         """
         refuse_other_form(self.made_for, env, self._name)
         self._policy.joined(env.observe())
+        if (self._policy.n_actions,) != env.action_space.shape:
+            given, taken = self._policy.n_actions, env.world.declaration.n_actions
+            raise ActionError(f"the policy gives {given} numbers, and an action has {taken}", None)
         self._env = env
 
     def act(self, observation: Any) -> Actions:
-        """Choose an action, shape (9,)."""
+        """Choose an action, shape (n_actions,)."""
         return self._checked(self._policy(observation))
 
 

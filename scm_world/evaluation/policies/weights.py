@@ -33,9 +33,10 @@ from scm_world.evaluation.policies.cards import KEY, PolicyAbout
 from scm_world.evaluation.policies.mlp import Layer, Weights
 from scm_world.output.durable import write_durably
 from scm_world.output.locations import Location, located
+from scm_world.tasks import TriFingerTask, tasks
 
 LARGEST = 2**28  # [bytes] of a file: more is no policy, and might be a trap
-ACTIONS = 9
+JOINTS = len(TriFingerTask.rest)
 VALUE = "value."
 LOG_STD = "log_std"
 
@@ -48,7 +49,7 @@ class NetworkPolicy:
     Attributes:
         layers: From the observation to the action; all but the last are hidden.
         about: What it was made for, and how.
-        log_std: Logarithm of the standard deviations of the actions, shape (9,), if it is kept.
+        log_std: Logarithm of the standard deviations of the actions, shape (n,), if it is kept.
         value: The layers of the network that gives the value of the state, if it is kept.
 
     Raises:
@@ -63,11 +64,14 @@ class NetworkPolicy:
     def __post_init__(self) -> None:
         if not self.layers:
             raise ModelError(["there is no tensor 'layers.0.weight'"])
-        problems = [*_misfits("layers", self.layers, None, ACTIONS)]
+        kind = tasks().get(self.about.task)
+        is_robot = kind is not None and issubclass(kind, TriFingerTask)
+        problems = [*_misfits("layers", self.layers, None, JOINTS if is_robot else None)]
         if self.value and self.layers[0].weight.ndim == 2:
             problems += _misfits(f"{VALUE}layers", self.value, self.n_observed, 1)
-        if self.log_std is not None and not _is_good(self.log_std, (ACTIONS,)):
-            problems.append(f"{LOG_STD}: expected shape ({ACTIONS},) and finite numbers")
+        shape = self.layers[-1].bias.shape
+        if self.log_std is not None and not _is_good(self.log_std, shape):
+            problems.append(f"{LOG_STD}: expected shape {shape} and finite numbers")
         if problems:
             raise ModelError(problems)
 
@@ -75,6 +79,11 @@ class NetworkPolicy:
     def n_observed(self) -> int:
         """How many numbers it observes."""
         return int(self.layers[0].weight.shape[0])
+
+    @property
+    def n_actions(self) -> int:
+        """How many numbers an action has."""
+        return int(self.layers[-1].weight.shape[1])
 
     @cached_property
     def _doubles(self) -> list[tuple[Floats, Floats]]:
@@ -90,7 +99,7 @@ class NetworkPolicy:
             observation: Shape (..., n), or arrays by name, those of ``about.inputs``.
 
         Returns:
-            Shape (..., 9), in [-1, 1], dtype float32; an observation among others gets, bit for
+            Shape (..., n), in [-1, 1], dtype float32; an observation among others gets, bit for
             bit, the action that it gets alone.
 
         Raises:
@@ -102,7 +111,7 @@ class NetworkPolicy:
         for number, (weight, bias) in enumerate(self._doubles):
             x = _dense(x, weight, bias, _AFTER[self.about.activation if number < last else "none"])
         x = np.tanh(x) if self.about.output == "tanh" else np.clip(x, -1.0, 1.0)
-        found: Weights = x.astype(np.float32).reshape(*seen.shape[:-1], ACTIONS)
+        found: Weights = x.astype(np.float32).reshape(*seen.shape[:-1], self.n_actions)
         return found
 
     def joined(self, observation: Any) -> NDArray[Any]:
@@ -145,7 +154,7 @@ class NetworkPolicy:
             deterministic: It must be true.
 
         Returns:
-            The action, shape (..., 9), and no state.
+            The action, shape (..., n_actions), and no state.
 
         Raises:
             ActionError: As above.
@@ -297,7 +306,9 @@ def _named(prefix: str, layers: Iterable[Layer]) -> dict[str, Weights]:
     return found
 
 
-def _misfits(name: str, layers: Sequence[Layer], first: int | None, last: int) -> Iterable[str]:
+def _misfits(
+    name: str, layers: Sequence[Layer], first: int | None, last: int | None
+) -> Iterable[str]:
     """Say what is wrong with the layers of a network."""
     wrong = [
         f"{name}.{number}: weight (outputs, inputs) and bias (outputs,) are no finite numbers of "
@@ -315,7 +326,7 @@ def _misfits(name: str, layers: Sequence[Layer], first: int | None, last: int) -
         for one, other in pairwise(shapes)
         if one[1] != other[0]
     ]
-    if shapes[-1][1] != last:
+    if last is not None and shapes[-1][1] != last:
         wrong.append(f"{name}: the last one has to give {last} numbers, not {shapes[-1][1]}")
     if first is not None and shapes[0][0] != first:
         wrong.append(f"{name}: the first one has to take {first} numbers, not {shapes[0][0]}")

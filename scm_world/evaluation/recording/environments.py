@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from scm_world.env import IDS, ScmWorldEnv
+from scm_world.env import IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.start import asked
-from scm_world.errors import ModelError, SnapshotMismatch
-from scm_world.tasks import Task
+from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
+from scm_world.tasks import Task, tasks
+from scm_world.tasks.factories import load_factory
 from scm_world.variables import Draw, Subset
 from scm_world.variables.kinds import SPACES
 
@@ -60,17 +61,50 @@ def remade(made_with: Mapping[str, Any], task: Task | None = None) -> ScmWorldEn
     return ScmWorldEnv(**arguments)
 
 
-def gym_id(made_with: Mapping[str, Any]) -> str:
-    """Give the id under which Gymnasium makes environments with the same task.
+def gym_arguments(made_with: Mapping[str, Any]) -> dict[str, Any]:
+    """Give the arguments with which Gymnasium makes an environment again, its ``id`` included.
+
+    Args:
+        made_with: As plain data; see ``as_data``.
 
     Raises:
-        ModelError: There is none, as the task is not registered.
+        ModelError: There is no id, as the task is registered with this package alone.
     """
     name = named(made_with["task"])
     for id_, task in IDS.items():
         if task == name:
-            return id_
-    raise ModelError([f"the task {name!r} has no id with Gymnasium; there are {', '.join(IDS)}"])
+            return {"id": id_, **made_with}
+    if name in tasks():
+        problem = f"the task {name!r} has no id with Gymnasium; there are {', '.join(IDS)}"
+        raise ModelError([problem])
+    options = made_with.get("task_options") or {}
+    rest = {key: value for key, value in made_with.items() if key != "task"}
+    return {"id": MODEL_ID, **rest, "model": name, "task_options": options}
+
+
+def reference(task: Task) -> str:
+    """Name a task by a text from which it can be made again, with its arguments.
+
+    Raises:
+        ModelError: There is none: its class can only be found in the program that runs.
+    """
+    kind = type(task)
+    if tasks().get(task.name) is kind:
+        return task.name
+    text = f"{kind.__module__}:{kind.__qualname__}"
+    try:
+        found = None if kind.__module__ == "__main__" else load_factory(text)
+    except (ImportError, UnknownOption):
+        found = None
+    if found is not kind:
+        raise ModelError(
+            [
+                f"the task {task.name!r} cannot be named in a file: its class {text} is found in "
+                "no module; put the class or a function that makes it into a module, and give "
+                "task='module:name'"
+            ]
+        )
+    return text
 
 
 def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,7 +119,7 @@ def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(task, Task):
         if not task.is_named:
             problems.append(f"give the arguments of {task.name!r} by name")
-        arguments |= {"task": task.name, "task_options": task.given or None}
+        arguments |= {"task": reference(task), "task_options": task.given or None}
     if arguments.get("start"):
         arguments["start"] = {name: _text(act) for name, act in asked(arguments["start"]).items()}
     found: dict[str, Any] = {}

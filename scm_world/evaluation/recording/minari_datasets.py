@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.errors import ModelError, UnreadableFile
-from scm_world.evaluation.recording.environments import as_data, gym_id
+from scm_world.evaluation.recording.environments import as_data, gym_arguments
 from scm_world.evaluation.recording.episodes import ONLY, Recorded, parts, whole
 from scm_world.evaluation.recording.headers import Header, Numbers
 from scm_world.graph.exchange.libraries import load
@@ -34,7 +34,7 @@ def to_dataset(recording: Recording, header: str, dataset_id: str, about: Mappin
     """Write a dataset; see ``Recording.to_minari``."""
     minari = _library()
     made_with = as_data(recording.environment)
-    env: Any = gymnasium.make(gym_id(made_with), disable_env_checker=True, **made_with)
+    env: Any = gymnasium.make(disable_env_checker=True, **gym_arguments(made_with))
     seen = _stacked_all(recording.episodes)
     name = (recording.policy or {}).get("name", "unknown")
     given = {

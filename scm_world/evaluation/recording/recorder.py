@@ -19,7 +19,7 @@ from scm_world.errors import NotReset, UnknownOption
 from scm_world.evaluation.policies import as_player
 from scm_world.evaluation.policies.players import inner
 from scm_world.evaluation.recording.environments import environment
-from scm_world.evaluation.recording.episodes import Recorded
+from scm_world.evaluation.recording.episodes import Recorded, summed
 from scm_world.evaluation.recording.recording import Recording
 from scm_world.output.locations import Location
 from scm_world.queries.experiments.versions import versions
@@ -59,7 +59,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env: Made by this package. Wrappers that change actions, observations or rewards come
             above the recorder.
         infos: Names in ``info`` that are kept; ``"all"`` for all numbers that every instant has,
-            terms of the reward as ``"reward_terms.…"``.
+            terms of the reward as ``"reward_terms.…"``; None for success and fractional success,
+            if the task has them.
 
     Raises:
         UnknownOption: The environment is none of this package, or a wrapper changes it.
@@ -73,12 +74,16 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Recording of 1 episode, 1 control step, of pushing
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], infos: Sequence[str] | str = INFOS) -> None:
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], infos: Sequence[str] | str | None = None
+    ) -> None:
         RecordConstructorArgs.__init__(self, infos=infos)
         super().__init__(env)
         self._inner = inner(env)
         _refuse_changes(env, self._inner)
-        self._wanted = infos if infos == ALL else names_of("infos", infos)
+        model = self._inner.world.model
+        chosen = tuple(name for name in INFOS if name in model) if infos is None else infos
+        self._wanted = chosen if chosen == ALL else names_of("infos", chosen)
         self._made: list[Recorded] = []
         self._now: _Episode | None = None
         self._version = -1
@@ -108,7 +113,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if episode is None:
             raise NotReset
         self._look_again(episode)
-        taken = _as_given(action)
+        taken = _as_given(action, self._inner.world.declaration.n_actions)
         observation, reward, terminated, truncated, info = self.env.step(action)
         episode.actions.append(taken)
         episode.returns.append((float(reward), bool(terminated), bool(truncated)))
@@ -198,7 +203,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             terminations=np.array(ends, dtype=np.bool_),
             truncations=np.array(cuts, dtype=np.bool_),
             infos={name: _column(info[name] for info in episode.infos) for name in names},
-            states=np.array(list(map(_sum, episode.states)), dtype=np.int64),
+            states=np.array(list(map(summed, episode.states)), dtype=np.int64),
         )
 
 
@@ -210,7 +215,7 @@ def record(
     seed: int = 0,
     first: int = 0,
     do: Mapping[str, Any] | None = None,
-    infos: Sequence[str] | str = INFOS,
+    infos: Sequence[str] | str | None = None,
     out: Location | str | None = None,
 ) -> Recording:
     """Let a policy act for some episodes, and record them.
@@ -222,7 +227,7 @@ def record(
         seed: Of the noise.
         first: Number of the first episode within the noise.
         do: An intervention at every reset.
-        infos: Names in ``info`` that are kept, or ``"all"``.
+        infos: Names in ``info`` that are kept; see ``Recorder``.
         out: Where to save the recording, if anywhere.
 
     Raises:
@@ -285,10 +290,10 @@ def _column(values: Iterable[Any]) -> NDArray[Any]:
     return np.array(given, dtype=np.bool_ if is_logical else np.float64)
 
 
-def _as_given(action: Any) -> NDArray[Any]:
+def _as_given(action: Any, size: int) -> NDArray[Any]:
     """Copy an action with the bits that the environment computes with."""
     single = getattr(action, "dtype", None) == np.float32
-    return np.array(action if single else doubles(action))
+    return np.array(action if single else doubles(action, size))
 
 
 def _copied(observation: Any) -> Observation:
