@@ -76,7 +76,8 @@ class Function(Frozen):
 
     def __init__(self, function: Any = None, **fields: Any) -> None:
         if callable(function):
-            fields["reference"] = f"{function.__module__}:{function.__qualname__}"
+            named = function if hasattr(function, "__qualname__") else type(function)
+            fields["reference"] = f"{named.__module__}:{named.__qualname__}"
         elif function is not None:
             fields["reference"] = function
         super().__init__(**fields)
