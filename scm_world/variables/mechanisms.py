@@ -141,8 +141,13 @@ class Function(Frozen):
         return (
             isinstance(other, Function)
             and (self.reference, self.constants) == (other.reference, other.constants)
-            and ("<" not in self.reference or self._function is other._function)
+            and (self._is_named() or self._function == other._function)
         )
+
+    def _is_named(self) -> bool:
+        """Tell whether the reference stands for one function: not for a lambda or an object."""
+        unnamed = self._function is not None and not hasattr(self._function, "__qualname__")
+        return "<" not in self.reference and not unnamed
 
     def __hash__(self) -> int:
         return hash((self.reference, tuple(sorted(self.constants))))
