@@ -1,4 +1,4 @@
-"""A block-building robot, written down as a structural causal model.
+"""Structural causal models of physical systems: any MJCF, URDF or step function.
 
 Importing this registers the environments with Gymnasium and nothing else; what is named below is
 loaded when it is first used.
