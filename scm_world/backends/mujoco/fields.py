@@ -759,6 +759,10 @@ class Table:
         per = {"m": "N/m", "rad": "N m/rad"}.get(length, "1")
         speed = {"m": "N s/m", "rad": "N m s/rad"}.get(length, "1")
         mass = {"m": "kg", "rad": "kg m^2"}.get(length, "1")
+        around = int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)
+        first = int(mj.tendon_adr[tendon])
+        path = mj.wrap_type[first : first + int(mj.tendon_num[tendon])]
+        wraps = any(kind in around for kind in path)
         active = any(
             getattr(mj, f"tendon_{what}")[tendon]
             for what in ("stiffness", "damping", "frictionloss", "armature")
@@ -781,6 +785,7 @@ class Table:
             "tendon", name, "armature", mass, "Inertia that the tendon adds.",
             _at("tendon_armature", tendon, constant=True), effect, 0.0,
             usual=bool(mj.tendon_armature[tendon]),
+            refusal="is not possible: the tendon runs around shapes" if wraps else "",
         )  # fmt: skip
         yield Field(
             "tendon", name, "springlength", length, "Lengths between which the spring is at rest.",

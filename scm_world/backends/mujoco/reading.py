@@ -61,6 +61,15 @@ def read_model(
             names nothing.
         UnknownOption: A setting does not exist.
     """
+    callbacks = [n for n in _CALLBACKS if getattr(mujoco, f"get_mjcb_{n}")() is not None]
+    if callbacks:
+        raise ModelError(
+            [
+                f"the callback mjcb_{name} is in use: what it acts on is unknown; call "
+                f"mujoco.set_mjcb_{name}(None)"
+                for name in callbacks
+            ]
+        )
     sealed, own_name, where = read_source(
         source, fixed_base=fixed_base, options=dict(settings or {})
     )
@@ -129,10 +138,11 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
         problems.append(
             f"{where} uses {mj.nplugin} plugin(s){shown}: what they act on is unknown; remove them"
         )
+    labels = element_names(mj)["actuator"]
     for i in range(mj.nactuator):
         kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
         users = mujoco.mjtDyn.mjDYN_USER, mujoco.mjtGain.mjGAIN_USER, mujoco.mjtBias.mjBIAS_USER
-        label = element_names(mj)["actuator"][i]
+        label = labels[i]
         if any(int(kind) == int(user) for kind, user in zip(kinds, users, strict=True)):
             problems.append(
                 f"{where}: the actuator {label!r} needs a callback of the user; give it one of "
@@ -148,12 +158,6 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
             f"{where} has plastic springs or flexes, whose rest shape is a hidden state; remove "
             "springyield and yield"
         )
-    for name in _CALLBACKS:
-        if getattr(mujoco, f"get_mjcb_{name}")() is not None:
-            problems.append(
-                f"mujoco.set_mjcb_{name} is in use: what it acts on is unknown; call "
-                f"mujoco.set_mjcb_{name}(None)"
-            )
     if problems:
         raise ModelError(problems)
 

@@ -26,6 +26,7 @@ _CHOICES = {
     "cone": mujoco.mjtCone,
     "jacobian": mujoco.mjtJacobian,
 }
+_UNNAMED = "MuJoCo Model"
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
 
 
@@ -83,20 +84,18 @@ def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
     Returns:
         The model, and what is different from the file.
     """
-    mj, notes = source.compile(), []
+    mj, notes, off = source.compile(), list[str](), mujoco.mjtDisableBit
     options = mj.opt
-    options.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART) | int(
-        mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    )
-    options.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    options.disableflags |= int(off.mjDSBL_WARMSTART) | int(off.mjDSBL_AUTORESET)
+    options.disableflags &= ~int(off.mjDSBL_ISLAND)
     options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     if len(Couplings(mj).roots) < 2:
         return mj, ()
-    damped = not options.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    damped = not options.disableflags & int(off.mjDSBL_EULERDAMP)
     if options.integrator == int(mujoco.mjtIntegrator.mjINT_EULER) and damped:
         reason = "Euler's implicit damping would tie trees together that do not touch"
         if mj.nflex:  # flexes do not allow for implicitfast
-            options.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+            options.disableflags |= int(off.mjDSBL_EULERDAMP)
             notes.append(f"Joint damping is explicit: {reason}.")
         else:
             options.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -134,6 +133,7 @@ def read_source(
         binary = np.empty(mujoco.mj_sizeModel(source), np.uint8)
         mujoco.mj_saveModel(source, None, binary)
         name = source.names.split(b"\0", 1)[0].decode()
+        name = "" if name == _UNNAMED else name
         return _sealed("", {}, binary.tobytes(), chosen), name, "the MjModel"
     if isinstance(source, mujoco.MjSpec):
         where, folder, stem = "the MjSpec", Path(source.modelfiledir), ""
@@ -153,7 +153,7 @@ def read_source(
                 "a mujoco.MjSpec or a mujoco.MjModel"
             ]
         )
-    name = spec.modelname or stem
+    name = stem if spec.modelname in ("", _UNNAMED) else spec.modelname
     if not fixed_base and urdf:
         for body in spec.worldbody.bodies:  # MuJoCo fixes the root link to the world
             if not body.joints:

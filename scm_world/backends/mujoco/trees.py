@@ -29,6 +29,7 @@ _OBJ, _TRN, _WRAP, _EQ, _OFF = (
     mujoco.mjtEq,
     mujoco.mjtDisableBit,
 )
+_AROUND = (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER))
 
 
 def disabled(mj: mujoco.MjModel, flag: mujoco.mjtDisableBit) -> bool:
@@ -258,19 +259,17 @@ class Couplings:
         return frozenset(self.tree(body) for body in bodies if self._moves[body])
 
     def _of_tendon(self, tendon: int) -> Trees:
-        return self._moving(body for _, _, body in self._path(tendon))
-
-    def _path(self, tendon: int) -> Iterator[tuple[int, int, int]]:
-        """List what a tendon runs through: kind, number and body of each."""
         mj, first = self._mj, int(self._mj.tendon_adr[tendon])
+        bodies = []
         for i in range(first, first + int(mj.tendon_num[tendon])):
             kind, element = int(mj.wrap_type[i]), int(mj.wrap_objid[i])
             if kind == int(_WRAP.mjWRAP_JOINT):
-                yield kind, element, int(mj.jnt_bodyid[element])
+                bodies.append(int(mj.jnt_bodyid[element]))
             elif kind == int(_WRAP.mjWRAP_SITE):
-                yield kind, element, int(mj.site_bodyid[element])
-            elif kind in (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER)):
-                yield kind, element, int(mj.geom_bodyid[element])
+                bodies.append(int(mj.site_bodyid[element]))
+            elif kind in _AROUND:
+                bodies.append(int(mj.geom_bodyid[element]))
+        return self._moving(bodies)
 
     def _bodies_of_equality(self, equality: int) -> list[int]:
         """List the bodies that a connection or weld holds together."""
@@ -324,39 +323,46 @@ class Couplings:
         """Map sites to the trees of the tendons, actuators and constraints that use them."""
         mj = self._mj
         found: dict[int, Trees] = {}
-
-        def add(site: int, trees: Trees) -> None:
+        for site, trees in (*self._sites_of_tendons(), *self._sites_of_actuators()):
             found[site] = found.get(site, NONE) | trees
-
-        for i in range(mj.ntendon):
-            for kind, element, _ in self._path(i):
-                if kind == int(_WRAP.mjWRAP_SITE):
-                    add(element, self._of_tendon(i))
-        for i in range(mj.nactuator):
-            on_sites = mj.actuator_trntype[i] in (
-                int(_TRN.mjTRN_SITE),
-                int(_TRN.mjTRN_SLIDERCRANK),
-                int(_TRN.mjTRN_SO3),
-            )
-            if on_sites and (mj.actuator_trnid[i] >= 0).all():
-                for site in mj.actuator_trnid[i].tolist():
-                    add(site, self._of_actuator(i))
-            elif on_sites and mj.actuator_trntype[i] != int(_TRN.mjTRN_SO3):
-                add(int(mj.actuator_trnid[i, 0]), self._of_actuator(i))
         for i in range(mj.neq):
             if mj.eq_objtype[i] == int(_OBJ.mjOBJ_SITE):
                 for site in (int(mj.eq_obj1id[i]), int(mj.eq_obj2id[i])):
-                    add(site, self._of_equality(i))
+                    found[site] = found.get(site, NONE) | self._of_equality(i)
         return found
+
+    def _sites_of_tendons(self) -> Iterator[tuple[int, Trees]]:
+        """List the sites on the ways of tendons, and those that say on which side they pass."""
+        mj = self._mj
+        for tendon in range(mj.ntendon):
+            first, trees = int(mj.tendon_adr[tendon]), self._of_tendon(tendon)
+            for i in range(first, first + int(mj.tendon_num[tendon])):
+                if mj.wrap_type[i] == int(_WRAP.mjWRAP_SITE):
+                    yield int(mj.wrap_objid[i]), trees
+                elif mj.wrap_type[i] in _AROUND and mj.wrap_prm[i] >= 0:
+                    yield int(mj.wrap_prm[i]), trees
+
+    def _sites_of_actuators(self) -> Iterator[tuple[int, Trees]]:
+        """List the sites that actuators act on or refer to."""
+        mj = self._mj
+        for actuator in range(mj.nactuator):
+            ends = [int(end) for end in mj.actuator_trnid[actuator] if end >= 0]
+            kind = mujoco.mjtTrn(int(mj.actuator_trntype[actuator]))
+            joint = kind == _TRN.mjTRN_SO3 and len(ends) == 1
+            if kind in (_TRN.mjTRN_SITE, _TRN.mjTRN_SLIDERCRANK, _TRN.mjTRN_SO3) and not joint:
+                yield from ((end, self._of_actuator(actuator)) for end in ends)
 
     @cached_property
     def _wrapped(self) -> dict[int, Trees]:
         """Map shapes to the trees of the tendons that run around them."""
+        mj = self._mj
         found: dict[int, Trees] = {}
-        for i in range(self._mj.ntendon):
-            for kind, element, _ in self._path(i):
-                if kind in (int(_WRAP.mjWRAP_SPHERE), int(_WRAP.mjWRAP_CYLINDER)):
-                    found[element] = found.get(element, NONE) | self._of_tendon(i)
+        for tendon in range(mj.ntendon):
+            first = int(mj.tendon_adr[tendon])
+            for i in range(first, first + int(mj.tendon_num[tendon])):
+                if mj.wrap_type[i] in _AROUND:
+                    geom = int(mj.wrap_objid[i])
+                    found[geom] = found.get(geom, NONE) | self._of_tendon(tendon)
         return found
 
     def _held(self, bodies: set[int]) -> Trees:
