@@ -24,6 +24,7 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
+from scm_world.tasks.model import FILES
 from scm_world.world.start import whole_number
 
 _TASK = ("task", "arguments", "class", "model")
@@ -54,7 +55,7 @@ def bench_of(
     evaluation: Evaluation,
     *,
     policy: Any = None,
-    task: Task | None = None,
+    task: Task | str | None = None,
     trusted: Sequence[str] = (),
 ) -> Bench:
     """Prepare to play episodes of an evaluation again.
@@ -72,7 +73,7 @@ def bench_of(
         UnreadableFile: The file of a policy is another one by now.
     """
     about = evaluation.about
-    place = _place(about, task, trusted)
+    place = _place(about, task, trusted, known=bool(evaluation.policies))
     _same_versions(place, about["versions"])
     protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
     setup = Setup(
@@ -87,8 +88,16 @@ def bench_of(
     return Bench(setup, trusted)
 
 
-def _place(about: Mapping[str, Any], task: Task | None, trusted: Sequence[str]) -> Place:
+def _place(
+    about: Mapping[str, Any], task: Task | str | None, trusted: Sequence[str], *, known: bool
+) -> Place:
     """Find where the episodes happened.
+
+    Args:
+        about: What was evaluated.
+        task: Where, if that is given.
+        trusted: Packages whose functions may be called.
+        known: Whether it was evaluated in this process, so that its task may be made again.
 
     Raises:
         UnknownOption: Its task is one of the user's own, and is not given, or another one is.
@@ -102,15 +111,19 @@ def _place(about: Mapping[str, Any], task: Task | None, trusted: Sequence[str]) 
             made = about.get("class", about["task"])
             raise UnknownOption("task", task, (f"{made} with {about['arguments']}",))
         return place
-    if about["task"] not in tasks() and ("class" in about or about["arguments"]):
+    text = about["task"]
+    if ":" in text and not (known or text.partition(".")[0].partition(":")[0] in trusted):
+        advice = (f"task={text!r}", "trusted=(…) with its module, to run what is in there")
+        raise UnknownOption("task of an evaluation", text, advice)
+    if text not in tasks() and not text.endswith(FILES) and ":" not in text:
         allowed = (*tasks(), "one of your own, if it is given: task=")
         raise UnknownOption("task", about.get("class", about["task"]), allowed)
     if about["arguments"]:
         options["task_options"] = about["arguments"]
     place = Place(about["task"], options)
     if place.about().get("model") != about.get("model"):
-        allowed = (f"the file that was evaluated, whose content has the sum {about.get('model')}",)
-        raise UnknownOption("task", about["task"], allowed)
+        content = f"the file that was evaluated, whose content has the sum {about.get('model')}"
+        raise UnknownOption("task", about["task"], (content,))
     mine = place.about().get("class", place.name)
     if mine != about.get("class", place.name):
         made = about.get("class", place.name)
@@ -189,7 +202,7 @@ def check(
     episodes: int = 12,
     seed: int | None = None,
     policy: Any = None,
-    task: Task | None = None,
+    task: Task | str | None = None,
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Check:

@@ -141,7 +141,7 @@ def why(
     metric: str | None = None,
     versus: str | None = None,
     policy: Any = None,
-    task: Task | None = None,
+    task: Task | str | None = None,
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Explanation:

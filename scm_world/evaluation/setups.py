@@ -22,6 +22,7 @@ from scm_world.evaluation.protocols import Protocol, chosen
 from scm_world.evaluation.seats import Entry, Seat, entries_of, source_of
 from scm_world.models import Model
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import PACKAGE
 from scm_world.tasks import TASKS, Task, make_task, tasks
 from scm_world.world.start import whole_number
 
@@ -77,8 +78,9 @@ class Place:
             ModelError: Something of it cannot be written down.
         """
         arguments = {} if isinstance(self.task, str) else self.task.given
-        kind = tasks().get(self.task) if isinstance(self.task, str) else type(self.task)
-        own = {} if kind in (None, TASKS.get(self.name)) else {"class": _class(kind)}
+        kind = type(self.made)
+        is_ours = kind.__module__.partition(".")[0] == PACKAGE and isinstance(self.task, str)
+        own = {} if is_ours or kind is TASKS.get(self.name) else {"class": _class(kind)}
         system = getattr(self.made, "system", None)
         if isinstance(system, Model):
             arguments = {name: value for name, value in arguments.items() if name != "model"}

@@ -25,13 +25,13 @@ class Ended:
 
     Attributes:
         total: Sum of its rewards.
-        fraction: Fractional success at its last step.
-        success: Whether that counts as success.
+        fraction: Fractional success at its last step, if the task has that.
+        success: Whether it succeeded, if the task says so.
     """
 
     total: float
-    fraction: float
-    success: bool
+    fraction: float | None
+    success: bool | None
 
 
 @final
@@ -58,7 +58,8 @@ class Episodes(VectorWrapper):
         n = self.num_envs
         cuts = np.ceil(length * np.arange(1, n + 1) / n).astype(np.int64)
         self._cuts = np.where(cuts < length, cuts, 0) if staggered else np.zeros(n, np.int64)
-        self._actions = np.zeros((length + 1, n, 9), np.float32)
+        self._size = int(np.prod(env.single_action_space.shape or ()))
+        self._actions = np.zeros((length + 1, n, self._size), np.float32)
         self._lengths, self._totals = np.zeros(n, np.int64), np.zeros(n)
         self._rows = np.arange(n)
         self.ended: list[Ended] = []
@@ -88,8 +89,10 @@ class Episodes(VectorWrapper):
         return observations, rewards, terminated, truncated, infos
 
     def _finish(self, index: int, last: Mapping[str, Any]) -> None:
-        total, fraction = float(self._totals[index]), float(last[FRACTION][index])
-        self.ended.append(Ended(total, fraction, bool(last[FLAGS[0]][index])))
+        total = float(self._totals[index])
+        fraction = float(last[FRACTION][index]) if FRACTION in last else None
+        success = bool(last[FLAGS[0]][index]) if FLAGS[0] in last else None
+        self.ended.append(Ended(total, fraction, success))
         self._begin(index)
 
     def _begin(self, index: Any) -> None:
@@ -142,7 +145,8 @@ class Episodes(VectorWrapper):
         """
         n, lengths, actions = self.num_envs, arrays["lengths"], arrays["actions"]
         fits = all(arrays[name].shape == (n,) for name in ("lengths", "totals", "cuts"))
-        if not fits or actions.shape[1:] != (n, 9) or len(actions) >= len(self._actions):
+        fits = fits and actions.shape[1:] == (n, self._size)
+        if not fits or len(actions) >= len(self._actions):
             raise UnreadableFile("the running episodes", "they have another shape", ADVICE)
         seen = self._members.rerun(running, actions, lengths)
         self._actions[: len(actions)] = actions

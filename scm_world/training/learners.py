@@ -97,7 +97,8 @@ def make_learner(
         MissingExtra: Stable-Baselines3 is not installed.
         UnknownOption: There is no such device.
     """
-    own = {"ppo": _of_ppo, "sac": _of_sac, "td3": _of_td3}[recipe.algo](recipe)
+    size = int(vec_env.action_space.shape[0])
+    own = {"ppo": _of_ppo, "sac": _of_sac, "td3": _of_td3}[recipe.algo](recipe, size)
     if recipe.hindsight is not None:
         own |= _of_hindsight(recipe, length)
     kind = getattr(library(), recipe.algo.upper())
@@ -140,22 +141,22 @@ def _network(recipe: Recipe, vec_env: Any) -> dict[str, Any]:
     return found
 
 
-def _of_ppo(recipe: Recipe) -> dict[str, Any]:
+def _of_ppo(recipe: Recipe, size: int) -> dict[str, Any]:
     kept: Mapping[str, Any] = recipe.settings.model_dump()
     return dict(kept)
 
 
-def _of_sac(recipe: Recipe) -> dict[str, Any]:
+def _of_sac(recipe: Recipe, size: int) -> dict[str, Any]:
     return _sums(recipe)
 
 
-def _of_td3(recipe: Recipe) -> dict[str, Any]:
+def _of_td3(recipe: Recipe, size: int) -> dict[str, Any]:
     found = _sums(recipe)
     sigma = found.pop("noise")
     noise = library("common.noise").NormalActionNoise
     import numpy as np
 
-    found["action_noise"] = noise(np.zeros(9), np.full(9, sigma)) if sigma else None
+    found["action_noise"] = noise(np.zeros(size), np.full(size, sigma)) if sigma else None
     return found
 
 

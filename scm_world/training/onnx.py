@@ -74,7 +74,7 @@ def _model(onnx: Any, policy: NetworkPolicy) -> Any:
         ends = {"low": np.float32(-1.0), "high": np.float32(1.0)}
         weights += [onnx.numpy_helper.from_array(np.array(end), n) for n, end in ends.items()]
         nodes.append(helper.make_node("Clip", [seen, *ends], ["action"]))
-    output = helper.make_tensor_value_info("action", types.FLOAT, [None, 9])
+    output = helper.make_tensor_value_info("action", types.FLOAT, [None, policy.n_actions])
     graph = helper.make_graph(nodes, "policy", inputs, [output], weights)
     opset = helper.make_opsetid("", OPSET)
     return helper.make_model(

@@ -23,7 +23,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
-from scm_world.tasks import TASKS, tasks
+from scm_world.tasks import TASKS, Task, make_task, tasks
 from scm_world.training.paper import paper
 from scm_world.training.settings import (
     ALGORITHMS,
@@ -36,6 +36,7 @@ from scm_world.training.settings import (
     Settings,
     TaskName,
     Trials,
+    known_task,
     merged,
     nested,
     refused,
@@ -76,7 +77,7 @@ class Recipe(Frozen):
     """How an agent is trained.
 
     Attributes:
-        task: Name of the task.
+        task: Name of the task; a file, or ``"module:function"``, for one of a model.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
         name: Of the preset that it comes from.
         env: Options of the environment.
@@ -167,9 +168,8 @@ class Recipe(Frozen):
         if self.steps < self.round:
             least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
             raise UnknownOption("steps", self.steps, (least,))
-        protocols = protocols_of(self.task)
         if self.trials.protocols:
-            chosen(self.trials.protocols, protocols)
+            chosen(self.trials.protocols, protocols_of(made(self.task, self.env)))
         return self
 
     def but(self, **changes: Any) -> Recipe:
@@ -288,7 +288,9 @@ def recipe(
     """Make a recipe from a preset.
 
     Args:
-        task: Name of the task; of one's own after ``scm_world.tasks.register``.
+        task: Name of the task, of one's own after ``scm_world.tasks.register``; a model file, or
+            ``"module:function"`` for a function or class that gives a task. Then the presets say
+            nothing of the environment, and trials are in P0, A and B as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
         preset: ``"tuned"``: what we found to work best; ``"paper"``: the published settings.
         curriculum: See ``curriculum_of``; that of the preset if None.
@@ -307,8 +309,8 @@ def recipe(
         >>> Recipe.from_dict(made.as_dict()) == made
         True
     """
+    known_task(task)
     for what, given, known in (
-        ("task", task, tasks()),
         ("algorithm", algo, ALGORITHMS),
         ("preset", preset, PRESETS),
     ):
@@ -317,10 +319,21 @@ def recipe(
     fields: dict[str, Any] = {"task": task, "algo": algo, "name": preset}
     fields |= PRESETS[preset](task, algo)
     if task not in TASKS:
-        fields["trials"] = merged(fields.get("trials", {}), {"protocols": ("P0",)})
+        names: tuple[str, ...] = ("P0",)
+        if task not in tasks():
+            fields["env"] = {}
+            there = {protocol.name for protocol in protocols_of(made(task, changes.get("env")))}
+            names = tuple(name for name in ("P0", "A", "B") if name in there)
+        fields["trials"] = merged(fields.get("trials", {}), {"protocols": names})
     if curriculum is not None:
         fields["curriculum"] = curriculum
     return _made(_with_hindsight(changed(fields, changes), changes))
+
+
+def made(task: str, env: Mapping[str, Any] | None) -> Task | str:
+    """Make the task of a model; what is registered stays a name."""
+    options = (env or {}).get("task_options") or {}
+    return task if task in tasks() else make_task(task, **options)
 
 
 def changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -91,9 +91,10 @@ class Run:
             except OSError as error:
                 advice = "give a policy file to start from"
                 raise UnreadableFile(str(self.start), str(error), advice) from None
-        own = Place(self.recipe.task).about().get("class")
+        options = self.recipe.env.get("task_options")
+        about = Place(self.recipe.task, {"task_options": options}).about()
         return {
-            **({} if own is None else {"class": own}),
+            **{name: about[name] for name in ("class", "model") if name in about},
             "recipe": self.recipe.as_dict(),
             "seed": self.seed,
             "backend": self.backend,

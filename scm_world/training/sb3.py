@@ -14,13 +14,14 @@ from scm_world.env.batched import Crew, ScmWorldVectorEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph.exchange.libraries import load
 
-SUCCESS = "is_success"
+USUAL = ("is_success",)
+"""What is told of ``info`` if nothing else is asked for, where the task has it."""
 FINAL = ("final_obs", "final_info")
 
 Indices = int | Iterable[int] | None
 
 
-def sb3_vec_env(envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = (SUCCESS,)) -> Any:
+def sb3_vec_env(envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = USUAL) -> Any:
     """Give many worlds the interface of Stable-Baselines3's ``VecEnv``.
 
     Rewards, observations and flags are those that its ``DummyVecEnv`` makes of as many single
@@ -48,7 +49,7 @@ def sb3_vec_env(envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = (S
 
 
 def make_sb3(
-    env_id: str, num_envs: int, *, infos: Sequence[str] | None = (SUCCESS,), **options: Any
+    env_id: str, num_envs: int, *, infos: Sequence[str] | None = USUAL, **options: Any
 ) -> Any:
     """Make many worlds for Stable-Baselines3.
 
@@ -106,6 +107,7 @@ class _Adapted:
         self._names = None if infos is None else tuple(infos)
         if self._names is not None:
             form = self._crew.sheet.infos
+            self._names = tuple(n for n in self._names if n in form or n not in USUAL)
             for name in self._names:
                 if name not in form:
                     raise UnknownOption("info", name, form)

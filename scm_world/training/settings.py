@@ -9,17 +9,18 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.tasks import tasks
+from scm_world.tasks.model import FILES
 from scm_world.variables.spaces import Frozen
 
 
 def known_task(task: str) -> str:
-    """Check that there is a task of this name.
+    """Check that there is a task of this name, or that it may be a file or ``"module:function"``.
 
     Raises:
-        UnknownOption: There is none.
+        UnknownOption: It is neither.
     """
-    if task not in tasks():
-        raise UnknownOption("task", task, tasks())
+    if task not in tasks() and not task.endswith(FILES) and ":" not in task:
+        raise UnknownOption("task", task, (*tasks(), *(f"file{end}" for end in FILES), "module:f"))
     return task
 
 

@@ -13,7 +13,6 @@ from scm_world.evaluation.policies.weights import NetworkPolicy
 from scm_world.output.durable import made, write_whole
 from scm_world.training.recipe import Recipe
 
-METRIC = "last_fractional_success"
 SEED = 7_001
 """Of the noise; one that evaluations by hand hardly have, so that they meet other episodes."""
 
@@ -25,11 +24,13 @@ class Trial:
 
     Attributes:
         steps: Control steps of training until then.
-        scores: Mean last fractional success, by protocol.
+        scores: Means of the metric, by protocol.
+        metric: The first one of the task; see ``Evaluation.metric``.
     """
 
     steps: int
     scores: dict[str, float]
+    metric: str = "last_fractional_success"
 
     @property
     def mean(self) -> float:
@@ -38,7 +39,12 @@ class Trial:
 
     def write(self, folder: Path) -> None:
         """Write it as JSON."""
-        data = {"steps": self.steps, "metric": METRIC, "mean": self.mean, "scores": self.scores}
+        data = {
+            "steps": self.steps,
+            "metric": self.metric,
+            "mean": self.mean,
+            "scores": self.scores,
+        }
         write_whole(json.dumps(data, indent=2), made(folder) / f"{self.steps}.json")
 
 
@@ -62,5 +68,5 @@ def tried(policy: NetworkPolicy, recipe: Recipe, *, backend: str, steps: int) ->
         backend=backend,
         env=form,
     )
-    scores = {name: float(found.score(name, METRIC).value) for name in found.protocols}
-    return Trial(steps, scores)
+    scores = {name: float(found.score(name).value) for name in found.protocols}
+    return Trial(steps, scores, found.metric())

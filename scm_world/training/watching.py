@@ -157,9 +157,15 @@ class Watching:
             "std": said.get("train/std", float("nan")),
         }
         if ended:
-            row["return"] = sum(one.total for one in ended) / len(ended)
-            row["success"] = sum(one.success for one in ended) / len(ended)
-            row["last_fractional_success"] = sum(one.fraction for one in ended) / len(ended)
+            means: dict[str, list[Any]] = {
+                "return": [one.total for one in ended],
+                "success": [one.success for one in ended],
+                "last_fractional_success": [one.fraction for one in ended],
+            }
+            for name, values in means.items():
+                there = [value for value in values if value is not None]
+                if there:
+                    row[name] = sum(there) / len(there)
         ended.clear()
         if self._curve is not None:
             self._curve.add(row)

@@ -124,7 +124,7 @@ def test_who_learns_acts_but_does_not_teach() -> None:
 
 def test_hands_shake_as_much_as_was_asked() -> None:
     """The noise has, over episodes, a standard deviation between nothing and the largest one."""
-    hands = [Hands(lesson("picking", noise=0.1), np.random.default_rng(i)) for i in range(40)]
+    hands = [Hands(lesson("picking", noise=0.1), 9, np.random.default_rng(i)) for i in range(40)]
     for each in hands:
         for _ in range(10):  # the noise comes to its size
             each.action(np.zeros(9), None, None)

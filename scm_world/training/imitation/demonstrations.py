@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import ModelError, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.policies.weights import NetworkPolicy
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.recording import Recording
 from scm_world.output.durable import write_durably
 from scm_world.queries.policies import NAMED, Policy
+from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.imitation.lessons import Lesson
 
 Singles = NDArray[np.float32]
@@ -39,7 +40,7 @@ class Demonstrations:
 
     Attributes:
         observations: Shape (n, k).
-        actions: What the teacher would have done, shape (n, 9), in [-1, 1].
+        actions: What the teacher would have done, shape (n, n_actions), in [-1, 1].
         scores: Fractional success at the end of each episode, shape (episodes,).
         kept: Whether it is among the pairs, shape (episodes,).
     """
@@ -133,6 +134,7 @@ class School:
         self._env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
         self._arena = Arena(self._env)
         self.engine = self._env.world.engine
+        self._score = _score_of(self._env.world.model, lesson.task)
         try:
             self._env.reset(seed=seed)
             self._teacher()(self._env.world)
@@ -156,10 +158,10 @@ class School:
         parts = [self._episode(round_, number, learner) for number in numbers]
         seen, done, scores = zip(*parts, strict=True)
         kept = np.array(scores) >= self._lesson.keep
-        width = seen[0].shape[1]
+        width, size = seen[0].shape[1], done[0].shape[1]
         return Demonstrations(
             np.concatenate([np.empty((0, width), np.float32), *_where(kept, seen)]),
-            np.concatenate([np.empty((0, 9), np.float32), *_where(kept, done)]),
+            np.concatenate([np.empty((0, size), np.float32), *_where(kept, done)]),
             np.array(scores),
             kept,
         )
@@ -170,17 +172,19 @@ class School:
         protocol: Protocol = self._protocols[number % len(self._protocols)]
         turn, observation = self._arena.begin(protocol, seed=SEED + self._seed, episode=number)
         teacher = self._teacher()
-        hands = Hands(self._lesson, np.random.default_rng([self._seed, round_, number]))
-        seen, done, over, info = [], [], False, {"fractional_success": 0.0}
+        random = np.random.default_rng([self._seed, round_, number])
+        hands = Hands(self._lesson, self._env.world.declaration.n_actions, random)
+        seen, done, over, info = [], [], False, dict[str, Any]()
         while not over:
             action = np.clip(self._env.toward(teacher(self._env.world)), -1.0, 1.0)
             seen.append(np.array(observation, np.float32))
             done.append(action.astype(np.float32))
             given = hands.action(action, observation, learner)
-            observation, _, _, over, info = self._env.step(given)
+            observation, _, terminated, truncated, info = self._env.step(given)
+            over = terminated or truncated
             if not over and turn.step(self._env):
                 observation = self._env.observe()
-        return np.array(seen), np.array(done), float(info["fractional_success"])
+        return np.array(seen), np.array(done), float(info[self._score])
 
     def close(self) -> None:
         """Free the engine."""
@@ -193,20 +197,21 @@ class Hands:
 
     Args:
         lesson: How often the learner acts, and how much noise there is.
+        size: How many numbers an action has.
         random: What is drawn with.
     """
 
-    def __init__(self, lesson: Lesson, random: np.random.Generator) -> None:
+    def __init__(self, lesson: Lesson, size: int, random: np.random.Generator) -> None:
         self._random = random
         self._scale = lesson.noise * random.uniform()
         self._share = lesson.share * random.uniform(0.0, 2.0)
         self._turn = 1.0 / lesson.stretch
-        self._noise, self._learns = np.zeros(9), False
+        self._noise, self._learns = np.zeros(size), False
 
     def action(
         self, right: Floats, observation: Any, learner: NetworkPolicy | None
     ) -> NDArray[Any]:
-        """Give the action that is taken, shape (9,).
+        """Give the action that is taken, shape (n_actions,).
 
         Args:
             right: The teacher's.
@@ -215,10 +220,23 @@ class Hands:
         """
         if learner is not None and self._random.uniform() < self._turn:
             self._learns = self._random.uniform() < self._share
-        innovation = np.sqrt(1.0 - MEMORY**2) * self._random.standard_normal(9)
+        innovation = np.sqrt(1.0 - MEMORY**2) * self._random.standard_normal(len(self._noise))
         self._noise = MEMORY * self._noise + innovation
         chosen = right if learner is None or not self._learns else learner(observation)
         return np.clip(chosen + self._scale * self._noise, -1.0, 1.0)
+
+
+def _score_of(names: Container[str], task: str) -> str:
+    """Name what says how well an episode ended.
+
+    Raises:
+        UnknownOption: The task does not say it.
+    """
+    for name in (FRACTION, SUCCESS):
+        if name in names:
+            return name
+    allowed = f"a task with {FRACTION!r} or {SUCCESS!r}: only what ended well is learned from"
+    raise UnknownOption("task of a lesson", task, (allowed,))
 
 
 def recorded(recording: Recording, keep: float) -> Demonstrations:
@@ -231,13 +249,14 @@ def recorded(recording: Recording, keep: float) -> Demonstrations:
     Raises:
         ModelError: Nothing ended well enough, or was told of how it ended.
     """
-    if any("fractional_success" not in episode.infos for episode in recording):
-        problem = "the recording does not say how episodes ended: record 'fractional_success', too"
+    told = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in recording)]
+    if not told:
+        problem = f"the recording does not say how episodes ended: record {FRACTION!r}, too"
         raise ModelError([problem])
-    scores = np.array([float(e.infos["fractional_success"][-1]) for e in recording])
+    scores = np.array([float(episode.infos[told[0]][-1]) for episode in recording])
     kept = scores >= keep
     good = tuple(episode for episode, is_good in zip(recording, kept, strict=True) if is_good)
-    none = np.empty((0, 1), np.float32), np.empty((0, 9), np.float32)
+    none = np.empty((0, 1), np.float32), np.empty((0, 1), np.float32)
     pairs = Recording(recording.environment, good).pairs() if good else none
     return joined([Demonstrations(*pairs, scores, kept)])
 

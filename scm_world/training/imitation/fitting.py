@@ -60,7 +60,7 @@ def fitted(shown: Demonstrations, lesson: Lesson, *, seed: int) -> Fitted:
     done = lib.from_numpy(shown.actions / np.float32(UNIT))
     with lib.random.fork_rng(devices=[]):
         lib.manual_seed(seed)
-        network = _network(lib, lesson, seen.shape[1])
+        network = _network(lib, lesson, seen.shape[1], done.shape[1])
         loss = _optimized(lib, network, (seen, done), lesson)
     if not np.isfinite(loss):
         raise ModelError(["the loss is no finite number any more: take a smaller rate"])
@@ -93,14 +93,14 @@ def whitening(observations: NDArray[Any]) -> tuple[Floats, Floats]:
     return matrix, -matrix @ mean
 
 
-def _network(lib: Any, lesson: Lesson, inputs: int) -> Any:
-    """Make the network, shape (inputs,) to (9,)."""
+def _network(lib: Any, lesson: Lesson, inputs: int, outputs: int) -> Any:
+    """Make the network, shape (inputs,) to (outputs,)."""
     after = {"tanh": lib.nn.Tanh, "relu": lib.nn.ReLU}[lesson.network.activation]
     layers: list[Any] = []
     for width in lesson.network.hidden:
         layers += [lib.nn.Linear(inputs, width), after()]
         inputs = width
-    return lib.nn.Sequential(*layers, lib.nn.Linear(inputs, 9))
+    return lib.nn.Sequential(*layers, lib.nn.Linear(inputs, outputs))
 
 
 def _optimized(lib: Any, network: Any, pairs: tuple[Any, Any], lesson: Lesson) -> float:

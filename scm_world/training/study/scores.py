@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 
 from scm_world.evaluation import Evaluation, Interval, merge
-from scm_world.evaluation.results import SCORE
+from scm_world.evaluation.arena import FRACTIONS
 from scm_world.evaluation.statistics import aggregate
 from scm_world.training.study.cells import PROTOCOLS, Cell, Study
 from scm_world.training.study.published import Actor, published
@@ -193,7 +193,8 @@ def _ours(group: Mapping[int, Evaluation], protocol: str) -> Ours | None:
     if not played:
         return None
     scores = [
-        np.array([e.only(protocol=name).columns[SCORE] for name in names]) for e in played.values()
+        np.array([e.only(protocol=name).columns[FRACTIONS[0]] for name in names])
+        for e in played.values()
     ]  # (seeds, protocols, episodes)
     over = "seeds" if len(scores) > 1 else "episodes"
     means = np.array([one.mean(axis=-1) for one in scores])  # (seeds, protocols)
