@@ -53,9 +53,12 @@ class Scenario:
             on before. What else it gives is handed to ``act``.
         act: Gives an action, shape (n_actions,).
         steps: How many control steps are taken before the experiments; drawn from 0 to 2 if None.
+        fresh: Whether what was set counts as what was there: experiments then do not add up with
+            it to one intervention, and are faster.
     """
 
     name: str
     prepare: Callable[[Any, Dice], tuple[dict[str, Value], Any]]
     act: Callable[[Any, Any, Dice], Floats]
     steps: int | None = None
+    fresh: bool = False

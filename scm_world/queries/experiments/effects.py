@@ -93,6 +93,10 @@ class Effects:
             if self.responses is not None:
                 self._respond(self.responses, key, np.ravel(after), np.ravel(before))
 
+    def see_nothing(self, cause: str, effect: str, lag: int) -> None:
+        """Remember that a pair was looked at, and that nothing differed."""
+        self.largest.setdefault((cause, effect, lag), 0.0)
+
     def end_of_probe(self) -> None:
         """Count the pairs that answered in this probe state."""
         for key in self._answered:

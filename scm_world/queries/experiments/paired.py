@@ -18,6 +18,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
+from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import (
     RESOLUTION,
@@ -43,6 +44,42 @@ TRIED_ALONE = 8
 
 SEEN_ELSEWHERE = 8
 """How many earlier values of a readout are kept, to hand them to its children."""
+
+
+@final
+class _Kept:
+    """The values of an instant, and what differs from them.
+
+    Args:
+        world: As it is at that instant.
+
+    Attributes:
+        values: Copies.
+    """
+
+    def __init__(self, world: World) -> None:
+        self.values = world.values()
+        now, state = world.current()
+        self._vector = state.vector.copy()
+        self._slices = tuple(world.declaration.slices.items())
+        self._compared = (CONTROL_INDEX, *world.computed)  # the clock counts in place
+        moving = {*world.declaration.slices, *self._compared}
+        self._rest = {name: now[name] for name in world.model if name not in moving}
+
+    def differing(self, world: World) -> list[str]:
+        """Name what differs in a world of the same structure, in the order of the model."""
+        now = world.evaluate(world.computed)
+        apart = world.current()[1].vector != self._vector
+        found = set()
+        if apart.any():
+            found = {name for name, where in self._slices if apart[where].any()}
+        found |= {n for n, value in self._rest.items() if now[n] is not value and self._is(n, now)}
+        found |= {name for name in self._compared if self._is(name, now)}
+        return [name for name in world.model if name in found] if found else []
+
+    def _is(self, name: str, now: Values) -> bool:
+        """Tell whether a value differs."""
+        return gap(now[name], self.values[name]) > 0.0
 
 
 @final
@@ -109,9 +146,12 @@ class Paired:
     def run(self, number: int, probe: Probe) -> None:
         """Do all experiments of one probe state."""
         self._number, self._probe = number, probe
-        self._at_once = self._restored()
-        self._earlier = self._world.previous()
-        self._later, self._memory = self._advanced(probe.action)
+        self._world.restore(probe.snapshot)
+        self._before = _Kept(self._world)
+        self._at_once, self._earlier = self._before.values, self._world.previous()
+        self._memory = self._advanced(probe.action)
+        self._after = _Kept(self._world)
+        self._later = self._after.values
         for target in self.targets:
             self._experiment(target)
         for action in self.actions:
@@ -144,15 +184,11 @@ class Paired:
         """Say what is being done, so that what is seen can be told where it was seen."""
         self.effects.setting = Setting(self._number, self._probe.kind, change)
 
-    def _restored(self) -> dict[str, Value]:
-        self._world.restore(self._probe.snapshot)
-        return self._world.values()
-
-    def _advanced(self, action: Floats) -> tuple[dict[str, Value], dict[str, Value]]:
-        """Step once; give the values afterwards, and those that they remember."""
+    def _advanced(self, action: Floats) -> dict[str, Value]:
+        """Step once; give the values that are remembered of the instant before."""
         self._world.step(action)
         self.effects.rollouts += 1
-        return self._world.values(), self._world.previous()
+        return self._world.previous()
 
     def _experiment(self, target: str) -> None:
         steps = (*FAR, *STEPS) if self._number % 4 == 3 else STEPS
@@ -224,16 +260,14 @@ class Paired:
 
     def _within_the_instant(self, target: str, value: Value, deciding: tuple[str, ...]) -> None:
         """Find the effects at once and one step later, in the structure that there is."""
-        world = self._world
-        reached = world.values()
-        moved = [n for n in reached if n != target and gap(reached[n], self._at_once[n]) > 0.0]
-        held = [n for n in moved if n not in self._computed]
-        alone = reached
+        moved = [name for name in self._before.differing(self._world) if name != target]
+        held = [name for name in moved if name not in self._computed]
         if held:
             self._see_settable(target, value, held, deciding)
             self._hold(target, value, (*deciding, *held))
-            alone = world.values()
-        self._see_computed(target, [n for n in moved if n in self._computed], alone)
+        computed = [name for name in moved if name in self._computed]
+        if computed:
+            self._see_computed(target, computed, self._world.values())
         self._see_later(target)
 
     def _in_another_structure(self, target: str, value: Value) -> None:
@@ -243,7 +277,8 @@ class Paired:
             moved += further
             self._see_settable(target, value, moved)
             self._hold(target, value, moved)
-        after, _ = self._advanced(self._probe.action)
+        self._advanced(self._probe.action)
+        after = self._world.values()
         for name in self._states.intersection(after):
             self.effects.see(target, name, 1, after[name], self._later[name])
 
@@ -293,15 +328,16 @@ class Paired:
     def _evaluate(self, name: str, known: Values, previous: Values) -> Value:
         return self._world.model.solve(known, previous=previous, only=(name,))[name]
 
-    def _see_later(self, target: str) -> None:
-        """Step with everything as it was but the target, and compare with the base run."""
-        after, memory = self._advanced(self._probe.action)
-        self._compare_later(target, after, memory)
-
-    def _compare_later(self, cause: str, after: Values, memory: Values) -> None:
-        for name in after:
-            if name in self._states:
-                self.effects.see(cause, name, 1, after[name], self._later[name])
+    def _see_later(self, cause: str, action: Floats | None = None) -> None:
+        """Step with everything as it was but the cause, and compare with the base run."""
+        memory = self._advanced(self._probe.action if action is None else action)
+        moved = frozenset(self._after.differing(self._world))
+        now = self._world.current()[0]
+        for name in self._states:
+            if name in moved:
+                self.effects.see(cause, name, 1, now[name], self._later[name])
+            else:
+                self.effects.see_nothing(cause, name, 1)
         self._see_memory(cause, memory)
 
     def _see_memory(self, cause: str, memory: Values) -> None:
@@ -321,8 +357,9 @@ class Paired:
         self._world.do({target: value})
         self._world.do({target: self._at_once[target]})
         self.effects.undone.add(target)
-        after, _ = self._advanced(self._probe.action)
-        worst = max(gap(after[name], self._later[name]) for name in after)
+        self._advanced(self._probe.action)
+        moved, now = self._after.differing(self._world), self._world.current()[0]
+        worst = max((gap(now[name], self._later[name]) for name in moved), default=0.0)
         self.effects.floor = max(self.effects.floor, worst)
 
     def _vary_action(self, name: str) -> None:
@@ -336,14 +373,14 @@ class Paired:
         action[where] = _elsewhere(present, 0.1 * (unit - 0.5), low, high)
         self._doing(action[where] - present)
         try:
-            after, memory = self._advanced(action)
+            self._see_later(name, action)
         except EngineFailure:
             return
-        self._compare_later(name, after, memory)
-        self._see_memory(name, {name: after[name]})
+        taken = np.array(self._world.current()[0][name])
+        self._see_memory(name, {name: taken})
         for reader, causes in self._readers[0].items():
             if name in causes:
-                value = self._evaluate(reader, {**self._later, name: after[name]}, self._memory)
+                value = self._evaluate(reader, {**self._later, name: taken}, self._memory)
                 self.effects.see(name, reader, 0, value, self._later[reader])
 
     def _vary_readout(self, cause: str) -> None:

@@ -9,7 +9,7 @@ the same, whatever ran before.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar, final
 
 import numpy as np
@@ -100,6 +100,8 @@ def _made(world: World, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
         world.step(action)
     action = scenario.act(world, extra, dice)
     snapshot = world.snapshot()
+    if scenario.fresh:
+        snapshot = replace(snapshot, instant=None)
     world.step(action)
     if not np.isfinite(world.current()[1].vector).all():
         raise EngineFailure("the state is lost", world.backend.name)
@@ -278,15 +280,16 @@ def _at_random(world: World, extra: None, dice: Dice) -> Floats:
 
 
 AT_START = Scenario("start", start, _at_random, steps=0)
-_ANYWHERE = Scenario("anywhere", anywhere, _at_random)
-_OTHERWISE = Scenario("anywhere, other parameters", _with_others(anywhere), _at_random)
+_ANYWHERE = Scenario("anywhere", anywhere, _at_random, fresh=True)
+_OTHERWISE = Scenario("anywhere, others", _with_others(anywhere), _at_random, fresh=True)
 _ONWARD = Scenario("onward", onward, _at_random, steps=0)
-_ON_OTHERWISE = Scenario("onward, other parameters", _with_others(onward), _at_random, steps=0)
+_ON_OTHERWISE = Scenario("onward, others", _with_others(onward), _at_random, steps=0)
 _ON_TOUCHING = Scenario("onward, touching", onward_touching, _at_random, steps=0)
-_TOUCHING = Scenario("touching", touching, _at_random, steps=0)
+_TOUCHING = Scenario("touching", touching, _at_random, steps=0, fresh=True)
 _TOUCH_OTHERWISE = Scenario(
-    "touching, other parameters", _with_others(touching), _at_random, steps=0
+    "touching, others", _with_others(touching), _at_random, steps=0, fresh=True
 )
+"""Where parameters have other values, too, it says ``others``."""
 
 
 def _kinds(world: World, *, settled: bool) -> tuple[Scenario, ...]:
