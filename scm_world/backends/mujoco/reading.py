@@ -14,7 +14,14 @@ import numpy as np
 
 from scm_world._types import Integers
 from scm_world.backends.mujoco.bodies import describe
-from scm_world.backends.mujoco.fields import MEDIUM, Field, element_names, table
+from scm_world.backends.mujoco.fields import (
+    MEDIUM,
+    Field,
+    control_unit,
+    element_names,
+    servo,
+    table,
+)
 from scm_world.backends.mujoco.readouts import find_readouts
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
@@ -28,6 +35,12 @@ _DSBL, _JNT, _TRN, _INT = (
     mujoco.mjtTrn,
     mujoco.mjtIntegrator,
 )
+_CONTROLS = {
+    "position": "Position that the servo goes to.",
+    "velocity": "Velocity that the servo keeps to.",
+    "damper": "How much the actuator damps.",
+    "": "What the actuator makes a force of, with its gain and gear.",
+}
 _CALLBACKS = ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
 
 
@@ -80,7 +93,7 @@ def read_model(
     names = element_names(mj)
     states, inputs = tuple(_states(mj, names, trees)), tuple(_inputs(mj, names, trees))
     placed = [
-        (row, state.array, state.numbers, state.index if state.kind == "joint" else -1)
+        (row, state.array, state.numbers, state.number if state.kind == "joint" else -1)
         for row, state in zip(states, _moving(mj, names), strict=True)
     ]
     patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
@@ -220,7 +233,8 @@ def _exposed(fields: Sequence[Field], patterns: Sequence[str] | None) -> set[str
 
 def _parameter(mj: mujoco.MjModel, data: mujoco.MjData | None, field: Field) -> Parameter:
     """Describe a field with what it is in the model as it was given."""
-    assert field.slot is not None
+    if field.slot is None:
+        raise TypeError(f"{field.name} has no place")
     slot = field.slot(mj, data)
     default = slot.read()
     always, contact = field.effect()
@@ -280,7 +294,7 @@ class _Moving(NamedTuple):
     array: str
     numbers: list[int]
     kind: str
-    index: int
+    number: int
     element: str
     attribute: str
     unit: str
@@ -353,10 +367,10 @@ def _states(
         plain = f"{state.element}.{state.attribute}"
         default = getattr(data, state.array)[state.numbers]
         if state.kind == "joint":
-            tree = trees.tree(int(mj.jnt_bodyid[state.index]))
+            tree = trees.tree(int(mj.jnt_bodyid[state.number]))
             always, contact = trees.always([tree])
         else:
-            tree, always, contact = _of_actuator(trees, state.index, stateful=True)
+            tree, always, contact = _of_actuator(trees, state.number, stateful=True)
         scalar = len(state.numbers) == 1
         rotation = state.attribute == "orientation"
         yield StateRow(
@@ -395,7 +409,7 @@ def _inputs(
     for actuator in range(mj.nactuator):
         name = names["actuator"][actuator]
         first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
-        unit, doc = _control(mj, actuator)
+        unit, doc = control_unit(mj, actuator), _CONTROLS[servo(mj, actuator)]
         stateful = bool(mj.actuator_actnum[actuator])
         _, always, contact = _of_actuator(trees, actuator, stateful=stateful)
         for i in range(count):
@@ -412,26 +426,6 @@ def _inputs(
                 always=always,
                 contact=contact,
             )
-
-
-def _control(mj: mujoco.MjModel, actuator: int) -> tuple[str, str]:
-    """Give the unit of the control of an actuator, and what it means."""
-    joint = mj.actuator_trntype[actuator] == int(_TRN.mjTRN_JOINT)
-    kind = int(mj.jnt_type[mj.actuator_trnid[actuator, 0]]) if joint else -1
-    turns = {int(_JNT.mjJNT_HINGE): True, int(_JNT.mjJNT_SLIDE): False}.get(kind)
-    gear = float(mj.actuator_gear[int(mj.actuator_outadr[actuator]), 0])
-    gain, bias = mj.actuator_gainprm[actuator], mj.actuator_biasprm[actuator]
-    plain = mj.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
-    affine = mj.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    if plain and affine and gain[0] > 0.0 and bias[1] == -gain[0]:
-        unit = {True: "rad", False: "m"}.get(turns, "1") if gear == 1.0 else "1"
-        return unit, "Position that the servo goes to."
-    if plain and affine and gain[0] > 0.0 and bias[2] == -gain[0] and not bias[1]:
-        unit = {True: "rad/s", False: "m/s"}.get(turns, "1") if gear == 1.0 else "1"
-        return unit, "Velocity that the servo keeps to."
-    if plain and gain[0] == 1.0 and gear == 1.0 and not mj.actuator_dyntype[actuator]:
-        return {True: "N m", False: "N"}.get(turns, "1"), "Force of the actuator."
-    return "1", "Control of the actuator; gear and gain make it a force."
 
 
 def contact_bodies(mj: mujoco.MjModel) -> tuple[str, ...]:

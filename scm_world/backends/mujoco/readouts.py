@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fields import clean, element_names, places, tendon_unit
+from scm_world.backends.mujoco.fields import clean, element_names, slots_of, tendon_unit
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.sources import Source, realized
 from scm_world.backends.mujoco.trees import disabled
@@ -48,7 +48,7 @@ def _scratch(
     data = mujoco.MjData(mj)
     for each in (data, other := mujoco.MjData(mj)):
         each.warning.number[:] = 1  # no warnings on the console
-    return mj, data, other, places(mj, keys, data) if keys else {}
+    return mj, data, other, slots_of(mj, keys, data) if keys else {}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,152 @@
+"""A row of the table of parameters, and what rows are made from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, final
+
+import mujoco
+import numpy as np
+
+from scm_world.backends.mujoco.fields.kinds import Place, Repeated, Turn
+from scm_world.backends.mujoco.slots import Slot
+from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect, disabled
+from scm_world.models.model import Numbers
+from scm_world.models.scene import ParameterKey
+
+SMALLEST = 1e-9
+"""Below this no mass [kg], time [s] or length [m] is accepted."""
+
+FREE, BALL, SLIDE, HINGE = (
+    int(kind)
+    for kind in (
+        mujoco.mjtJoint.mjJNT_FREE,
+        mujoco.mjtJoint.mjJNT_BALL,
+        mujoco.mjtJoint.mjJNT_SLIDE,
+        mujoco.mjtJoint.mjJNT_HINGE,
+    )
+)
+OFF = mujoco.mjtDisableBit
+
+Slots = Callable[[mujoco.MjModel, mujoco.MjData | None], Slot]
+"""Finds a place in a model and its data."""
+
+
+@final
+@dataclass(frozen=True)
+class Field:
+    """A parameter of one element of a compiled model.
+
+    Attributes:
+        kind: Of the element: ``"body"``, ``"joint"``, ..., or ``"option"``.
+        element: Its name, ``""`` for an option.
+        attribute: What it is.
+        unit: SI unit.
+        doc: One sentence.
+        slot: Finds its place in a model and its data.
+        effect: The trees it acts on.
+        low: Lower bound.
+        high: Upper bound.
+        nature: The kind of its values.
+        usual: Whether it is exposed unless something else is asked for.
+        visual: Whether it acts on pictures only.
+        refusal: Why it cannot be set, to be read after its name; empty if it can.
+        name: Unique in the model.
+    """
+
+    kind: str
+    element: str
+    attribute: str
+    unit: str
+    doc: str
+    slot: Slots | None
+    effect: Callable[[], Effect] = lambda: NOTHING
+    low: Numbers = -math.inf
+    high: Numbers = math.inf
+    nature: Literal["real", "rotation", "inertia"] = "real"
+    usual: bool = True
+    visual: bool = False
+    refusal: str = ""
+    name: str = ""
+
+    @property
+    def plain_name(self) -> str:
+        """The name, if no other element has the same."""
+        return f"{self.element}.{self.attribute}" if self.element else self.attribute
+
+    @property
+    def key(self) -> ParameterKey:
+        """How engines know it."""
+        element, _, attribute = self.name.rpartition(".")
+        return element, attribute
+
+
+@final
+@dataclass(frozen=True)
+class Scope:
+    """A compiled model, which is only read.
+
+    Attributes:
+        mj: The model.
+        names: Of its elements.
+        trees: Its trees.
+        fluid: Whether a medium acts, or may be made to act.
+    """
+
+    mj: mujoco.MjModel
+    names: Mapping[str, tuple[str, ...]]
+    trees: Couplings
+    fluid: bool
+
+    def rows(self, kind: str, index: int, effect: Callable[[], Effect]) -> Callable[..., Field]:
+        """Give what makes the fields of one element, from the attribute on."""
+        return partial(Field, kind, self.names[kind][index], effect=effect)
+
+    def off(self, flag: mujoco.mjtDisableBit, what: str) -> str:
+        """Say that a flag of the model disables something, if it does."""
+        return f"acts on nothing: the model disables {what}" if disabled(self.mj, flag) else ""
+
+
+def at(array: str, *index: Any, constant: bool = False) -> Slots:
+    """Find a place in an array of the model; constants of the model may have to follow it."""
+    return lambda mj, _: Place(getattr(mj, array)[(*index, ...)], constant)
+
+
+def turn_at(array: str, index: int) -> Slots:
+    """Find a quaternion; constants of the model follow it."""
+    return lambda mj, _: Turn(getattr(mj, array)[index], constant=True)
+
+
+def repeated_at(array: str, first: int, count: int, *, constant: bool = False) -> Slots:
+    """Find the same number in several rows of an array."""
+    return lambda mj, _: Repeated(getattr(mj, array)[first : first + count], constant)
+
+
+def least(value: Any) -> float:
+    """Give a lower bound for what has to be positive."""
+    return min(SMALLEST, float(np.min(value)))
+
+
+def solver_rows(
+    row: Callable[..., Field], mj: mujoco.MjModel, prefix: str, index: int, **rest: Any
+) -> tuple[Field, Field]:
+    """Give how stiff and how hard a constraint is: its ``solref`` and ``solimp``."""
+    suffix = rest.pop("suffix", "")
+    reference = getattr(mj, f"{prefix}_solref")[index]
+    if (reference < 0.0).any():
+        doc, low, high = "Stiffness and damping of the constraint, both negative.", -math.inf, 0.0
+        bounds: dict[str, Any] = {"low": low, "high": high}
+    else:
+        doc = "Time constant [s] and damping ratio of the constraint."
+        bounds = {"low": (least(reference[0]), least(reference[1]))}
+    impedance = row(
+        f"solimp{suffix}", "1",
+        "Smallest and largest impedance, width of the transition, its midpoint and power.",
+        at(f"{prefix}_solimp", index), low=(0.0, 0.0, 0.0, 0.0, 1.0),
+        high=(1.0, 1.0, math.inf, 1.0, math.inf), **rest,
+    )  # fmt: skip
+    slot = at(f"{prefix}_solref", index)
+    return row(f"solref{suffix}", "1", doc, slot, **bounds, **rest), impedance
