@@ -7,6 +7,7 @@ that those before it have moved.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +15,8 @@ from typing import Any, Literal, NamedTuple, final
 
 from scm_world._types import Floats
 from scm_world.models.scene import ParameterKey
+
+UNIT = 1e-14  # a squared length this near to 1 is taken as it is
 
 Vector = tuple[float, float, float]
 Rotation = tuple[float, float, float, float]
@@ -278,9 +281,19 @@ class Bodies:
 
 
 def _with_part(row: Any, part: Part, value: Any) -> Any:
-    """Give a field of a row with another value, or with one other number in it."""
-    if part.component is None:
+    """Give a field of a row with another value, or with one other number in it.
+
+    Raises:
+        ValueError: It is a direction or a rotation without length.
+    """
+    if part.component is not None:
+        numbers = list(getattr(row, part.field))
+        numbers[part.component] = part.sign * value
+        return tuple(numbers)
+    if part.field not in ("orientation", "axis"):
         return value
-    numbers = list(getattr(row, part.field))
-    numbers[part.component] = part.sign * value
-    return tuple(numbers)
+    squared = sum(number * number for number in value)
+    if squared == 0.0:
+        raise ValueError(f"the {part.field} of {row.name!r} has no length")
+    length = 1.0 if abs(squared - 1.0) < UNIT else math.sqrt(squared)
+    return tuple(number / length for number in value)

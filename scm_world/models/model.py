@@ -183,7 +183,7 @@ class Model:
             ModelError: Nobody can describe them.
         """
         if self.describe is None:
-            raise ModelError([f"the bodies of {self.name!r} are not described; read it from a file"])
+            raise ModelError([f"{self.name!r} does not describe its bodies; read it from a file"])
         return self.describe(self)
 
     def empty_state(self) -> State:

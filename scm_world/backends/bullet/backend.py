@@ -16,6 +16,7 @@ from scm_world.backends.bullet.client import Client
 from scm_world.backends.bullet.engine import load, version
 from scm_world.backends.bullet.history import History, Record, SavedState, relive
 from scm_world.backends.bullet.model.client import ModelClient
+from scm_world.backends.bullet.model.support import supports
 from scm_world.backends.bullet.trifinger.client import TriFingerClient
 from scm_world.backends.bullet.values import Instant, Values
 from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
@@ -138,7 +139,9 @@ class BulletBackend(Backend):
         """Change structure, parameters and state without advancing time.
 
         Raises:
+            ModelError: The engine cannot honour the new structure.
             UnknownOption: The scene has no such parameter.
+            NotIntervenable: The engine has no such parameter.
             EngineFailure: A value is not finite, or the engine refused. The world is as it was.
         """
         present = self._described()
@@ -291,6 +294,10 @@ class BulletBackend(Backend):
     def contacts(self) -> tuple[Contact, ...]:
         """List the contact points of the last physics step."""
         return self._last().contacts()
+
+    def supports(self, structure: Structure, key: ParameterKey) -> bool:
+        """Tell whether a parameter of a structure can be set."""
+        return not isinstance(structure, Model) or supports(structure, key)
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""

@@ -67,7 +67,7 @@ class Client(ABC):
 
         Raises:
             ModelError: Something in the structure.
-            UnknownOption: A parameter that is not as the structure has it.
+            NotIntervenable: A parameter that is not as in the structure.
         """
 
     @staticmethod

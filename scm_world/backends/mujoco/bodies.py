@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -93,8 +94,9 @@ _TABLES = {
 }
 
 
+@lru_cache(maxsize=32)
 def describe(mj: mujoco.MjModel) -> Bodies:
-    """Describe the bodies of a compiled model."""
+    """Describe the bodies of a compiled model, which must not be changed afterwards."""
     names = element_names(mj)
     couplings = Couplings(mj)
     joints, start = [], 0
@@ -314,7 +316,7 @@ def _missing(mj: mujoco.MjModel, names: dict[str, tuple[str, ...]]) -> Iterator[
         yield f"a fluid (density {mj.opt.density:g}, viscosity {mj.opt.viscosity:g})"
     for i in range(mj.nactuator):
         if _works(mj, i) and _odd_actuator(mj, i):
-            yield f"the actuator {names['actuator'][i]!r}: it {_odd_actuator(mj, i)}"
+            yield f"the actuator {names['actuator'][i]!r}, which {_odd_actuator(mj, i)}"
     yield from _missing_of_bodies(mj, names)
 
 

@@ -8,7 +8,9 @@ of their own, and no link has two of them. A shape that cannot move is a body by
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, final
 
 import numpy as np
@@ -152,11 +154,21 @@ def build(engine: Any, client: int, bodies: Bodies) -> Built:
     return built
 
 
+def matrix_of(turn: Sequence[float] | Floats) -> Floats:
+    """Give the rotation matrix of a quaternion, which is remembered: it must not be changed."""
+    return _matrix_of(*map(float, turn))
+
+
+@lru_cache(maxsize=4096)
+def _matrix_of(x: float, y: float, z: float, w: float) -> Floats:
+    return rotation_matrix((x, y, z, w))
+
+
 def _composed(
     position: Floats, turn: Floats, offset: Any, orientation: Any
 ) -> tuple[Floats, Floats]:
     """Give in the outer frame what is given in the frame at a position, turned so."""
-    moved: Floats = position + rotation_matrix(turn) @ np.array(offset)
+    moved: Floats = position + matrix_of(turn) @ np.array(offset)
     return moved, quaternion_product(turn, np.array(orientation))
 
 
@@ -225,7 +237,7 @@ def _add_tree(
             for joint in joints:
                 row = bodies.joints[joint]
                 anchor = np.array(row.position)
-                position = start + rotation_matrix(turn) @ (anchor - at)
+                position = start + matrix_of(turn) @ (anchor - at)
                 link = links.add(link, position, turn, kind=_kind(engine, row), axis=row.axis)
                 joint_links[joint] = link
                 start, turn, at = np.zeros(3), _UNTURNED, anchor
@@ -355,7 +367,7 @@ def solid(bodies: Bodies, body: int) -> tuple[Floats, Floats]:
     added = [bodies.joints[joint] for joint in bodies.joints_of(body)]
     if not (added and added[0].kind == "hinge" and added[0].armature):
         return moments, axes
-    turn, axis = rotation_matrix(axes), np.array(added[0].axis)
+    turn, axis = matrix_of(axes), np.array(added[0].axis)
     tensor = turn @ np.diag(moments) @ turn.T + added[0].armature * np.outer(axis, axis)
     moments, turn = np.linalg.eigh(tensor)
     turn[:, 2] *= np.sign(np.linalg.det(turn))

@@ -12,17 +12,12 @@ from scm_world._types import Floats
 from scm_world.backends.base import Contact
 from scm_world.backends.bullet.client import SOLVER_ITERATIONS, Client
 from scm_world.backends.bullet.model.build import Built, build, solid
-from scm_world.backends.bullet.model.forces import DOFS, Forces
-from scm_world.backends.bullet.model.frames import Frame
-from scm_world.backends.bullet.model.friction import shares
-from scm_world.backends.bullet.model.support import (
-    parameters_without,
-    rebuilt,
-    supports,
-    unsupported,
-)
+from scm_world.backends.bullet.model.forces import Forces
+from scm_world.backends.bullet.model.frames import Ball, Frame
+from scm_world.backends.bullet.model.friction import shares, usual_friction
+from scm_world.backends.bullet.model.support import changes, unsupported
 from scm_world.backends.bullet.values import Values, normalize, plain_state
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError, NotIntervenable, UnknownOption
 from scm_world.models.bodies import Bodies
 from scm_world.models.model import Model
 from scm_world.models.scene import ControlMode, ParameterKey
@@ -44,19 +39,17 @@ class Scalars(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Joints of one multibody that are told forces.
+    """Hinges and slides of one multibody that are told forces.
 
     Attributes:
         multibody: Its number.
         links: Their links.
-        dofs: Their degrees of freedom; three for each ball.
-        balls: Whether they are balls.
+        dofs: Their degrees of freedom.
     """
 
     multibody: int
     links: list[int]
     dofs: list[int]
-    balls: bool
 
 
 @lru_cache(maxsize=64)
@@ -94,26 +87,29 @@ class ModelClient(Client):
 
         Raises:
             ModelError: All of it that is in the model.
-            UnknownOption: A parameter that the engine lacks is not as in the model.
+            NotIntervenable: A parameter that the engine lacks is not as in the model.
         """
         problems = unsupported(structure)
         if problems:
             advice = "take it out of the model, or use backend='mujoco'"
             raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
-        lacking, defaults = parameters_without(structure), _defaults(structure)
-        for key in lacking:
-            if parameters[key] != defaults[key]:
-                others = (".".join(row.key) for row in structure.parameters)
-                raise UnknownOption(
-                    "parameter on bullet",
-                    ".".join(key),
-                    (name for name in others if name),
+        known = changes(structure.bodies)
+        for row in structure.parameters:
+            if row.visual or row.key in known:
+                continue
+            default, value = np.array(row.default), parameters[row.key]
+            if not np.array_equal(np.broadcast_to(default, row.shape), value):
+                raise NotIntervenable(
+                    row.name,
+                    f"is no parameter on Bullet: there it keeps its default {row.default}; use "
+                    "backend='mujoco'",
                 )
 
     @staticmethod
     def heavy(structure: Model) -> Iterable[ParameterKey]:
         """List the parameters that need new bodies."""
-        return rebuilt(structure)
+        known = changes(structure.bodies)
+        return [row.key for row in structure.parameters if known.get(row.key) == "rebuilt"]
 
     @staticmethod
     def settle(structure: Model, given: State) -> list[float]:
@@ -142,7 +138,7 @@ class ModelClient(Client):
 
     def construct(self, structure: Model, parameters: Values) -> None:
         """Make everything anew, unless only other parameters differ from what is there."""
-        inside = {key: parameters[key] for key in rebuilt(structure)}
+        inside = {key: parameters[key] for key in self.heavy(structure)}
         if self._model == structure and self._inside == inside:
             return
         self._model, self._inside = structure, inside
@@ -150,7 +146,7 @@ class ModelClient(Client):
         self.furnish()
         self.applied = dict(parameters)
         self._bodies = bodies = structure.bodies.with_parameters(
-            {key: value for key, value in parameters.items() if self._acts(key)}
+            {key: value for key, value in parameters.items() if key in changes(structure.bodies)}
         )
         self._built = build(self.engine, self.handle, bodies)
         self._find(bodies, self._built, structure.layout.size)
@@ -162,21 +158,20 @@ class ModelClient(Client):
         self._set_world()
         self._follow()
 
-    def _acts(self, key: ParameterKey) -> bool:
-        """Tell whether a parameter is more than a color or a default."""
-        return key in self._model.bodies.places and supports(self._model, key)
-
     def _find(self, bodies: Bodies, built: Built, size: int) -> None:
         """Remember how states are written and read."""
         self._size = size
-        self._frames, self._balls = [], []
+        self._frames: list[Frame] = []
+        self._ball_joints: dict[int, Ball] = {}
         scalars: dict[int, Scalars] = {}
-        for joint, (multibody, link) in zip(bodies.joints, built.joints, strict=True):
+        for number, joint in enumerate(bodies.joints):
+            multibody, link = built.joints[number]
             if joint.kind == "free":
                 body = bodies.bodies[joint.body]
                 self._frames.append(Frame(multibody, joint.start, body.center, body.axes))
             elif joint.kind == "ball":
-                self._balls.append((multibody, link, joint.start))
+                _, axes = solid(bodies, joint.body)
+                self._ball_joints[number] = Ball(multibody, link, joint.start, axes.tolist())
             else:
                 found = scalars.setdefault(multibody, Scalars(multibody, [], []))
                 found.links.append(link)
@@ -190,13 +185,10 @@ class ModelClient(Client):
             for link, (start, reference) in zip(links, places, strict=True):
                 value, speed = state[start] - reference, state[start + 1]
                 engine.resetJointState(multibody, link, value, speed, physicsClientId=handle)
-        for multibody, link, start in self._balls:
+        for ball in self._ball_joints.values():
+            turn, spin = ball.to_engine(state)
             engine.resetJointStateMultiDof(
-                multibody,
-                link,
-                state[start : start + 4],
-                state[start + 4 : start + 7],
-                physicsClientId=handle,
+                ball.multibody, ball.link, turn, spin, physicsClientId=handle
             )
         for frame in self._frames:
             position, turn, linear, angular = frame.to_engine(state)
@@ -214,9 +206,9 @@ class ModelClient(Client):
             rows = engine.getJointStates(multibody, links, physicsClientId=handle)
             for (start, reference), row in zip(places, rows, strict=True):
                 state[start], state[start + 1] = row[0] + reference, row[1]
-        for multibody, link, start in self._balls:
-            row = engine.getJointStateMultiDof(multibody, link, physicsClientId=handle)
-            state[start : start + 4], state[start + 4 : start + 7] = row[0], row[1]
+        for ball in self._ball_joints.values():
+            row = engine.getJointStateMultiDof(ball.multibody, ball.link, physicsClientId=handle)
+            state[ball.start : ball.start + 7] = ball.from_engine(row[0], row[1])
         for frame in self._frames:
             pose = engine.getBasePositionAndOrientation(frame.multibody, physicsClientId=handle)
             twist = engine.getBaseVelocity(frame.multibody, physicsClientId=handle)
@@ -227,7 +219,7 @@ class ModelClient(Client):
 
     def write(self, key: ParameterKey, value: Any) -> None:
         """Set one parameter of live bodies; forces follow from all of them, see ``written``."""
-        if not self._acts(key):
+        if key not in changes(self._model.bodies):
             return
         self._bodies = self._bodies.with_parameters({key: value})
         table, row, parts = self._bodies.places[key]
@@ -284,7 +276,7 @@ class ModelClient(Client):
     def _follow(self) -> None:
         """Let forces and frictions follow from the parameters."""
         bodies, built = self._bodies, self._built
-        numbers = shares(bodies)
+        numbers = shares(bodies, usual_friction(self._model.bodies))
         for handle, share, before in zip(
             built.geoms, numbers, self._shares or [-1.0] * len(numbers), strict=True
         ):
@@ -294,21 +286,24 @@ class ModelClient(Client):
                 )
         self._shares = numbers
         self._forces = forces = Forces(bodies)
-        drives: dict[tuple[int, bool], Drive] = {}
+        self._driven_balls = [
+            (ball, forces.dofs[number])
+            for number, ball in self._ball_joints.items()
+            if number in forces.driven
+        ]
+        drives: dict[int, Drive] = {}
         for number in forces.driven:
             multibody, link = built.joints[number]
-            kind, first = bodies.joints[number].kind, forces.dofs[number]
-            found = drives.setdefault(
-                (multibody, kind == "ball"), Drive(multibody, [], [], kind == "ball")
-            )
-            found.links.append(link)
-            found.dofs.extend(range(first, first + DOFS[kind]))
+            if number not in self._ball_joints:
+                found = drives.setdefault(multibody, Drive(multibody, [], []))
+                found.links.append(link)
+                found.dofs.append(forces.dofs[number])
         self._drives = list(drives.values())
 
     def parameter(self, key: ParameterKey) -> Floats:
         """Ask the engine for a parameter: mass, inertia, gravity and step; it has no others."""
         value = np.array(self.applied[key])
-        if not self._acts(key):
+        if key not in changes(self._model.bodies):
             return value
         engine, handle = self.engine, self.handle
         _, row, parts = self._bodies.places[key]
@@ -340,30 +335,24 @@ class ModelClient(Client):
 
     def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
         """Hold a command for some physics steps."""
-        engine, handle, forces, drives = self.engine, self.handle, self._forces, self._drives
-        step, state, total = engine.stepSimulation, [0.0] * self._size, []
-        if drives and forces.constant:
-            total = forces(state, command)
+        engine, handle, forces = self.engine, self.handle, self._forces
+        ask, step, tell = self.ask, engine.stepSimulation, engine.setJointMotorControlArray
+        driven, torque_control = bool(forces.driven), engine.TORQUE_CONTROL
+        total = forces([0.0] * self._size, command) if driven and forces.constant else []
         for _ in range(substeps):
-            if drives and not forces.constant:
-                total = forces(self.ask(), command)
-            for multibody, links, dofs, balls in drives:
-                if balls:
-                    engine.setJointMotorControlMultiDofArray(
-                        multibody,
-                        links,
-                        engine.TORQUE_CONTROL,
-                        forces=[total[dof : dof + 3] for dof in dofs[::3]],
-                        physicsClientId=handle,
-                    )
-                else:
-                    engine.setJointMotorControlArray(
-                        multibody,
-                        links,
-                        engine.TORQUE_CONTROL,
-                        forces=[total[dof] for dof in dofs],
-                        physicsClientId=handle,
-                    )
+            if driven and not forces.constant:
+                total = forces(ask(), command)
+            for multibody, links, dofs in self._drives:
+                each = [total[dof] for dof in dofs]
+                tell(multibody, links, torque_control, forces=each, physicsClientId=handle)
+            for ball, dof in self._driven_balls:
+                engine.setJointMotorControlMultiDof(
+                    ball.multibody,
+                    ball.link,
+                    torque_control,
+                    force=ball.torque(total[dof : dof + 3]),
+                    physicsClientId=handle,
+                )
             step(physicsClientId=handle)
         return []
 
@@ -381,9 +370,3 @@ class ModelClient(Client):
             for point in self.engine.getContactPoints(physicsClientId=self.handle)
             if point[8] <= 0.0 or point[9] > 0.0
         )
-
-
-@lru_cache(maxsize=64)
-def _defaults(model: Model) -> dict[ParameterKey, Any]:
-    """Give the parameters as they are in the model, as plain numbers."""
-    return {key: value.tolist() for key, value in model.default_parameters().items()}

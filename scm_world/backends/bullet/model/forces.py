@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.bullet.model.build import places_of_fixed, solid
+from scm_world.backends.bullet.model.build import matrix_of, places_of_fixed, solid
 from scm_world.backends.bullet.vectors import (
     applied,
     cross,
@@ -27,7 +27,7 @@ from scm_world.backends.bullet.vectors import (
     turned,
     vector,
 )
-from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
+from scm_world.geometry.rotations import rotation_kernel
 from scm_world.models.bodies import Bodies
 
 HINGE, SLIDE, BALL, FREE = range(4)
@@ -127,7 +127,6 @@ class Forces:
         joints, actuators = bodies.joints, bodies.actuators
         sizes = [DOFS[joint.kind] for joint in joints]
         self.dofs: list[int] = np.cumsum([0, *sizes])[:-1].tolist()
-        self._n_dofs = sum(sizes)
         moved = {actuator.joint for actuator in actuators}
         self.driven = tuple(
             number
@@ -138,9 +137,8 @@ class Forces:
         self.constant = not any(any(servo) for servo in servos) and not any(
             joint.stiffness or joint.damping for joint in joints
         )
-        self._brakes = any(joint.damping for joint in joints) or any(
-            servo[1] or servo[3] for servo in servos
-        )
+        brakes = any(joint.damping for joint in joints)
+        brakes = brakes or any(servo[1] or servo[3] for servo in servos)
         infinite = (-math.inf, math.inf)
         self._joints = Joints(
             np.array([KINDS[joint.kind] for joint in joints], dtype=np.int64),
@@ -167,7 +165,7 @@ class Forces:
                 4,
             ),
         )
-        self._links = _links(bodies, self._joints) if self._brakes else None
+        self._links = _links(bodies, self._joints, brakes)
         self._gravity, self._timestep = np.array(bodies.gravity), bodies.timestep
 
     def __call__(self, state: Sequence[float], command: Sequence[float]) -> list[float]:
@@ -177,30 +175,25 @@ class Forces:
             state: All numbers of the state; what they are does not matter if ``constant``.
             command: All numbers of the command.
         """
-        numbers, slopes = np.array(state), np.zeros(self._n_dofs)
-        forces = _exerted(numbers, np.array(command), self._joints, self._actuators, slopes)
-        if self._links is not None:
-            _brake(
-                numbers,
-                forces,
-                slopes,
-                self._joints,
-                self._links,
-                self._gravity,
-                self._timestep,
-            )
-        result: list[float] = forces.tolist()
-        return result
+        forces: list[float] = _forces(
+            np.array(state),
+            np.array(command),
+            self._joints,
+            self._actuators,
+            self._links,
+            self._gravity,
+            self._timestep,
+        ).tolist()
+        return forces
 
 
 def _rows(rows: list[tuple[float, ...]], width: int) -> Floats:
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
-def _links(bodies: Bodies, joints: Joints) -> Links:
-    """Describe what moves by arrays."""
-    roots = bodies.roots
-    moving = [number for number, root in enumerate(roots) if root]
+def _links(bodies: Bodies, joints: Joints, needed: bool) -> Links:
+    """Describe what moves by arrays; none if that is not needed."""
+    moving = [number for number, root in enumerate(bodies.roots) if root and needed]
     row = {number: i for i, number in enumerate(moving)}
     places = places_of_fixed(bodies)
     n_dofs = int(sum(DOFS[joint.kind] for joint in bodies.joints))
@@ -218,16 +211,16 @@ def _links(bodies: Bodies, joints: Joints) -> Links:
             for dof in range(first, first + DOFS[bodies.joints[joint].kind]):
                 above[dof], owners[dof], before = before, row[number], dof
         last[number] = before
-        offset, turn = np.array(body.position), rotation_matrix(body.orientation)
+        offset, turn = np.array(body.position), matrix_of(body.orientation)
         if body.parent not in row:
             position, orientation = places[body.parent]
-            around = rotation_matrix(orientation)
+            around = matrix_of(orientation)
             offset, turn = position + around @ offset, around @ turn
         moments, axes = solid(bodies, number)
-        frame = rotation_matrix(axes)
+        frame = matrix_of(axes)
         offsets.append(offset)
         turns.append(turn)
-        inertias.append(frame @ np.diag(moments) @ frame.T)
+        inertias.append((frame * moments) @ frame.T)
     return Links(
         np.array([row.get(bodies.bodies[n].parent, -1) for n in moving], dtype=np.int64),
         np.array(offsets).reshape(-1, 3),
@@ -242,25 +235,48 @@ def _links(bodies: Bodies, joints: Joints) -> Links:
 
 
 @njit(cache=True)
-def _exerted(
-    state: Floats, command: Floats, joints: Joints, actuators: Actuators, slopes: Floats
+def _forces(
+    state: Floats,
+    command: Floats,
+    joints: Joints,
+    actuators: Actuators,
+    links: Links,
+    gravity: Floats,
+    timestep: float,
 ) -> Floats:
-    """Compute the forces of actuators, springs and dampers with the speeds before the step.
+    """Compute the forces on all degrees of freedom, shape (n_dofs,) [N m] or [N].
 
-    Args:
-        state: Where everything is and how it moves.
-        command: What the actuators are told.
-        joints: What they act on.
-        actuators: What acts.
-        slopes: How much of each force is lost with more speed; is added to, shape (n_dofs,).
+    With mass matrix M, bias b, forces f and slopes D, the implicit step has the acceleration
+    ``a = (M + h D)^-1 (f - b)``; the engine's explicit step has the same with ``f - h D a``.
+    """
+    forces, slopes = np.zeros(len(links.above)), np.zeros(len(links.above))
+    _act(state, command, joints, actuators, forces, slopes)
+    _resist(state, joints, forces, slopes)
+    if len(links.parents):
+        matrix, right = _dynamics(state, joints, links, gravity)
+        for dof in range(len(forces)):
+            matrix[dof, dof] += timestep * slopes[dof]
+            right[dof] = forces[dof] - right[dof]
+        _solve(matrix, links.above, right)
+        for dof in range(len(forces)):
+            forces[dof] -= timestep * slopes[dof] * right[dof]
+    return forces
 
-    Returns:
-        Shape (n_dofs,) [N m] or [N].
+
+@njit(cache=True)
+def _act(
+    state: Floats,
+    command: Floats,
+    joints: Joints,
+    actuators: Actuators,
+    forces: Floats,
+    slopes: Floats,
+) -> None:
+    """Write the forces of actuators, and how much of them is lost with each unit of speed.
 
     Source:
-        MuJoCo, *Computation, Actuation model* and *Passive forces*.
+        MuJoCo, *Computation, Actuation model*.
     """
-    forces, brakes = np.zeros(len(slopes)), np.zeros(len(slopes))
     for i in range(len(actuators.joints)):
         joint = actuators.joints[i]
         start, dof = joints.starts[joint], joints.dofs[joint]
@@ -276,46 +292,30 @@ def _exerted(
             force, slope = min(max(force, weakest), strongest), 0.0
         for k in range(3 if joints.kinds[joint] == BALL else 1):
             forces[dof + k] += gear[k] * force
-            brakes[dof + k] -= gear[k] * gear[k] * slope
+            slopes[dof + k] -= gear[k] * gear[k] * slope
+
+
+@njit(cache=True)
+def _resist(state: Floats, joints: Joints, forces: Floats, slopes: Floats) -> None:
+    """Cut the forces of actuators, and add those of springs and dampers.
+
+    Source:
+        MuJoCo, *Computation, Passive forces*.
+    """
     for joint in range(len(joints.kinds)):
         start, dof = joints.starts[joint], joints.dofs[joint]
         kind, damping = joints.kinds[joint], joints.damping[joint]
         if kind in (HINGE, SLIDE):
             weakest, strongest = joints.efforts[joint]
             if forces[dof] < weakest or forces[dof] > strongest:
-                forces[dof], brakes[dof] = min(max(forces[dof], weakest), strongest), 0.0
+                forces[dof], slopes[dof] = min(max(forces[dof], weakest), strongest), 0.0
             stiffness, rest = joints.springs[joint]
             forces[dof] += stiffness * (rest - state[start]) - damping * state[start + 1]
-            slopes[dof] += max(brakes[dof], 0.0) + damping
+            slopes[dof] = max(slopes[dof], 0.0) + damping
         elif kind == BALL:
             for k in range(3):
                 forces[dof + k] -= damping * state[start + 4 + k]
-                slopes[dof + k] += damping
-    return forces
-
-
-@njit(cache=True)
-def _brake(
-    state: Floats,
-    forces: Floats,
-    slopes: Floats,
-    joints: Joints,
-    links: Links,
-    gravity: Floats,
-    timestep: float,
-) -> None:
-    """Let what brakes do so with the speeds at the end of the step, in place.
-
-    With mass matrix M, bias b, forces f and slopes D, the implicit step has the acceleration
-    ``a = (M + h D)^-1 (f - b)``; the engine's explicit step has the same with ``f - h D a``.
-    """
-    mass_matrix, right = _dynamics(state, joints, links, gravity)
-    for dof in range(len(forces)):
-        mass_matrix[dof, dof] += timestep * slopes[dof]
-        right[dof] = forces[dof] - right[dof]
-    _solve(mass_matrix, links.above, right)
-    for dof in range(len(forces)):
-        forces[dof] -= timestep * slopes[dof] * right[dof]
+                slopes[dof + k] = damping
 
 
 @njit(cache=True)

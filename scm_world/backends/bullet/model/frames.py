@@ -1,6 +1,6 @@
-"""Free bodies: their own frames, and the frames of their principal axes, which the engine has.
+"""Frames of bodies, and those of their principal axes of inertia, which the engine has.
 
-In plain floats: it runs for every free body whenever a state is set or read.
+In plain floats: it runs for every free body and ball joint whenever a state is set or read.
 """
 
 from __future__ import annotations
@@ -60,6 +60,38 @@ class Frame:
             *_carried(linear, spin, arm, -1.0),
             *rotated(back, spin),
         ]
+
+
+@final
+class Ball:
+    """A ball joint. The engine has it about the principal axes of the body.
+
+    Args:
+        multibody: Its number in the engine.
+        link: Its link.
+        start: Where it begins in the state.
+        axes: From the principal axes of inertia to the frame of the body (x, y, z, w).
+    """
+
+    def __init__(self, multibody: int, link: int, start: int, axes: Numbers) -> None:
+        self.multibody, self.link, self.start = multibody, link, start
+        self._axes = axes
+        self._back = (-axes[0], -axes[1], -axes[2], axes[3])
+
+    def to_engine(self, state: list[float]) -> tuple[Numbers, Numbers]:
+        """Turn the state of the joint into orientation and angular velocity in the engine."""
+        at = self.start
+        turn, spin = state[at : at + 4], state[at + 4 : at + 7]
+        return composed(composed(self._back, turn), self._axes), rotated(self._back, spin)
+
+    def from_engine(self, turn: Numbers, spin: Numbers) -> list[float]:
+        """Turn what the engine has into the state of the joint."""
+        own = composed(composed(self._axes, turn), self._back)
+        return [*own, *rotated(self._axes, spin)]
+
+    def torque(self, torque: Numbers) -> Numbers:
+        """Turn a torque in the frame of the body into one about the principal axes."""
+        return rotated(self._back, torque)
 
 
 def rotated(turn: Numbers, v: Numbers) -> Numbers:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
+from typing import Literal
 
 from scm_world.backends.bullet.model.friction import worst_pairs
-from scm_world.models.bodies import Bodies, Place
+from scm_world.models.bodies import Bodies, Joint
 from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey
 
@@ -30,26 +31,28 @@ LIVE = {
 """What live bodies can take on."""
 
 
-@lru_cache(maxsize=64)
 def unsupported(model: Model) -> tuple[str, ...]:
-    """List everything in a model that the engine cannot honour, one sentence each."""
-    bodies = model.bodies
-    found = [f"{what} has no counterpart" for what in bodies.missing]
-    found += _of_joints(bodies)
+    """List everything in a model that the engine cannot honour."""
+    return _unsupported(model.bodies)
+
+
+@lru_cache(maxsize=64)
+def _unsupported(bodies: Bodies) -> tuple[str, ...]:
     roots = bodies.roots
+    found = [*bodies.missing, *_of_joints(bodies)]
     for coupling in bodies.couplings:
         one, other = bodies.joints[coupling.joint], bodies.joints[coupling.leader]
         if roots[one.body] != roots[other.body]:
             found.append(
-                f"the equality constraint {coupling.name!r} joins two trees, {one.name!r} and "
-                f"{other.name!r}: couplings work within one"
+                f"the equality constraint {coupling.name!r}, which joins {one.name!r} and "
+                f"{other.name!r} of two trees"
             )
     for root in sorted(set(roots) - {0}):
         links = _links(bodies, [n for n, other in enumerate(roots) if other == root])
         if links > MOST_LINKS:
             found.append(
-                f"the tree of {bodies.bodies[root].name!r} needs {links} links; there is room "
-                f"for {MOST_LINKS}"
+                f"the {links} links that {bodies.bodies[root].name!r} and all that hangs on it "
+                f"need: there is room for {MOST_LINKS}"
             )
     return tuple(found)
 
@@ -60,8 +63,8 @@ def _of_joints(bodies: Bodies) -> Iterator[str]:
         scalar = joint.kind in ("hinge", "slide")
         if joint.armature and not takes_armature(bodies, joint.body):
             yield (
-                f"armature of the joint {joint.name!r}: only a hinge that alone carries a body on "
-                "the world can have it"
+                f"armature of the joint {joint.name!r}, which is not a hinge that alone carries a "
+                "body on the world"
             )
         if joint.range is not None and not scalar:
             yield f"limits of the {joint.kind} joint {joint.name!r}"
@@ -89,7 +92,6 @@ def _links(bodies: Bodies, members: list[int]) -> int:
     return links
 
 
-@lru_cache(maxsize=64)
 def deviations(model: Model) -> tuple[str, ...]:
     """List what the engine does in another way than the file says, one sentence each."""
     bodies = model.bodies
@@ -113,53 +115,38 @@ def deviations(model: Model) -> tuple[str, ...]:
 
 
 def supports(model: Model, key: ParameterKey) -> bool:
-    """Tell whether a parameter of a model can be set."""
-    return key not in _lacking(model)
+    """Tell whether a parameter of a model can be set: the engine has it, or only pictures do."""
+    return key in changes(model.bodies) or any(
+        row.key == key and row.visual for row in model.parameters
+    )
 
 
 def parameters_without(model: Model) -> tuple[ParameterKey, ...]:
     """List the parameters of a model that the engine lacks: they keep their defaults."""
-    return tuple(_lacking(model))
+    return tuple(row.key for row in model.parameters if not supports(model, row.key))
 
 
 @lru_cache(maxsize=64)
-def _lacking(model: Model) -> dict[ParameterKey, None]:
-    bodies = model.bodies
-    return {
-        row.key: None
-        for row in model.parameters
-        if not row.visual and not _is_known(bodies, bodies.places.get(row.key))
-    }
+def changes(bodies: Bodies) -> Mapping[ParameterKey, Literal["live", "rebuilt"]]:
+    """Map the parameters that the engine has to what a change of them takes."""
+    found: dict[ParameterKey, Literal["live", "rebuilt"]] = {}
+    for key, place in bodies.places.items():
+        fields = {part.field for part in place.parts}
+        if fields <= set(REBUILT.get(place.table, ())):
+            found[key] = "rebuilt"
+        elif fields <= set(LIVE.get(place.table, ())):
+            turns = place.table == "bodies" and "inertia" in fields
+            solid = turns and takes_armature(bodies, place.row)  # armature is part of its inertia
+            found[key] = "rebuilt" if solid else "live"
+        if place.table == "joints" and not _is_of(bodies, bodies.joints[place.row], fields):
+            found.pop(key, None)
+    return found
 
 
-def _is_known(bodies: Bodies, place: Place | None) -> bool:
-    """Tell whether the engine has something at a place of the description."""
-    if place is None:
-        return False
-    names = (*LIVE.get(place.table, ()), *REBUILT.get(place.table, ()))
-    if any(part.field not in names for part in place.parts):
-        return False
-    if place.table != "joints":
-        return True
-    joint, field = bodies.joints[place.row], place.parts[0].field
-    if field == "armature":
+def _is_of(bodies: Bodies, joint: Joint, fields: set[str]) -> bool:
+    """Tell whether a joint can have something."""
+    if "armature" in fields:
         return takes_armature(bodies, joint.body)
-    if field in ("stiffness", "friction"):
+    if fields & {"stiffness", "friction"}:
         return joint.kind in ("hinge", "slide")
-    return field != "damping" or joint.kind != "free"
-
-
-@lru_cache(maxsize=64)
-def rebuilt(model: Model) -> tuple[ParameterKey, ...]:
-    """List the parameters that need new bodies."""
-    bodies = model.bodies
-    found = []
-    for row in model.parameters:
-        place = bodies.places.get(row.key)
-        if place is None or not supports(model, row.key):
-            continue
-        field = place.parts[0].field
-        turns = field == "inertia" and takes_armature(bodies, place.row)
-        if turns or field in REBUILT.get(place.table, ()):
-            found.append(row.key)
-    return tuple(found)
+    return "damping" not in fields or joint.kind != "free"
