@@ -31,6 +31,9 @@ from scm_world.variables import (
     Variable,
 )
 
+TIMESTEP = "timestep"
+FINEST = 20.0
+"""How many times finer than in the file the physics step can be set."""
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
 
@@ -73,7 +76,7 @@ class ModelComposition(Composition):
 
     def timestep(self, values: Mapping[str, Any]) -> float:
         """Give the physics step [s], which is a parameter where it is exposed."""
-        return float(values.get("timestep", self._model.timestep))
+        return float(values.get(TIMESTEP, self._model.timestep))
 
 
 class ModelTask(Task):
@@ -215,7 +218,7 @@ class ModelTask(Task):
         """Declare what the tables have, and what counts."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
         parameters: list[Variable] = [
-            ties.pop(row.name) if row.name in ties else self._parameter(row)
+            ties.pop(row.name) if row.name in ties else self._parameter(row, timing.control_period)
             for row in system.parameters
         ]
         actions = [self._action(row) for row in system.inputs]
@@ -253,10 +256,13 @@ class ModelTask(Task):
         }
         return fields
 
-    def _parameter(self, row: Any) -> Exogenous:
+    def _parameter(self, row: Any, control_period: float) -> Exogenous:
         given = self.spaces.get(row.name, {})
+        fields = self._fields(row, row.kind)
+        if row.name == TIMESTEP and "bounds" not in given:  # at least one in a control step
+            fields["bounds"] = Box(self.system.timestep / FINEST, control_period)
         return Exogenous(
-            **self._fields(row, row.kind),
+            **fields,
             default=_spread(given.get("default", row.default), row.shape),
             distribution=_space(given.get("distribution")),
         )
