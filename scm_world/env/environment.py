@@ -24,7 +24,7 @@ from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.direct import direct
-from scm_world.scene.camera import OVERVIEW, Camera
+from scm_world.scene.camera import Camera
 from scm_world.scene.kinematics import scaled_clip_kernel
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
@@ -415,14 +415,19 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene, shape (480, 640, 3); None without ``render_mode="rgb_array"``.
 
-        With ``render_mode="human"`` the window shows every step by itself.
+        With ``render_mode="human"`` the window shows every step by itself. A model is drawn by
+        MuJoCo where it can, and its camera follows what moves.
+
+        Raises:
+            ModelError: There is nothing to draw: a step function has no shapes.
         """
         if self.render_mode != "rgb_array":
             self._show()
             return None
-        from scm_world.backends.renderer import render
+        from scm_world.backends.renderer import picture
 
-        return render(self.world.scene(), OVERVIEW).rgb
+        scene = self.world.scene()
+        return picture(scene, self._camera_of(scene))
 
     def close(self) -> None:
         """Free the engine and the window."""

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from scm_world.env.observer import Observer
 from scm_world.errors import UnknownOption
+from scm_world.models import Scene
 from scm_world.scene.camera import OVERVIEW, Camera
+from scm_world.tasks import TriFingerTask
 from scm_world.world import World
 
 
@@ -21,6 +23,7 @@ class Looks:
     world: World
     _observer: Observer
     _modes: tuple[str, str]
+    _automatic: Camera | None = None
 
     @property
     def observation_mode(self) -> str:
@@ -42,19 +45,26 @@ class Looks:
         """Where each variable stands in the privileged context; empty without one."""
         return dict(self._observer.layouts.get("context", {}))
 
-    def _camera(self, camera: Camera | str) -> Camera:
+    def _camera(self, camera: Camera | str | None) -> Camera:
         if isinstance(camera, Camera):
             return camera
+        if not isinstance(self.world.task, TriFingerTask):
+            from scm_world.backends.renderer import scene_camera
+
+            return scene_camera(self.world.scene(), camera)
+        camera = OVERVIEW.name if camera is None else camera
         known = {one.name: one for one in (*self.world.cameras(), OVERVIEW)}
         if camera not in known:
             raise UnknownOption("camera", camera, known)
         return known[camera]
 
-    def depth(self, camera: Camera | str = OVERVIEW) -> NDArray[np.float32]:
+    def depth(self, camera: Camera | str | None = None) -> NDArray[np.float32]:
         """Measure how far away everything is, shape (h, w) [m].
 
         Args:
-            camera: Any, or the name of one: ``"60"``, ``"120"``, ``"300"``, ``"overview"``.
+            camera: Any, or the name of one: of the robot's tasks ``"60"``, ``"120"``, ``"300"``,
+                ``"overview"``, of a model one in its file, or ``"automatic"``. The last one if
+                None.
         """
         from scm_world.backends.renderer import depth_and_segmentation
 
@@ -62,8 +72,18 @@ class Looks:
         found: NDArray[np.float32] = depth_and_segmentation(scene, cameras)[0][0]
         return found
 
+    def _camera_of(self, scene: Scene) -> Camera:
+        """Give the camera of pictures for people: of a model it follows what moves."""
+        if isinstance(self.world.task, TriFingerTask):
+            return OVERVIEW
+        from scm_world.backends.renderer import following_camera, scene_camera
+
+        if self._automatic is None:
+            self._automatic = scene_camera(self.world.structure.default_scene())
+        return following_camera(self._automatic, scene)
+
     def segmentation(
-        self, camera: Camera | str = OVERVIEW
+        self, camera: Camera | str | None = None
     ) -> tuple[NDArray[np.int32], tuple[str, ...]]:
         """Tell which body every pixel shows.
 

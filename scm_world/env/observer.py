@@ -126,7 +126,11 @@ def observer(
     main: Observer
     if how.goals and goals is None:
         raise UnknownOption("goal_env", True, (f"False: {declaration.task.name} has no goals",))
-    if how.mode == "pixel":
+    if how.mode == "pixel" and not isinstance(declaration.task, TriFingerTask):
+        from scm_world.env.pixels import ModelPixels
+
+        main = ModelPixels(world, how.cameras, how.image_size)
+    elif how.mode == "pixel":
         from scm_world.env.pixels import Pixels, chosen, followed
 
         original = world.conventions.published_observation

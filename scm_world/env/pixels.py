@@ -11,13 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Values
-from scm_world.backends.renderer import ORIGINAL, PLAIN, goal_pixels, now_pixels
+from scm_world.backends.renderer import (
+    ORIGINAL,
+    PLAIN,
+    following_camera,
+    goal_pixels,
+    now_pixels,
+    scene_camera,
+)
 from scm_world.env.vector import Layouts
 from scm_world.errors import UnknownOption
+from scm_world.models import Scene
 from scm_world.scene.camera import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW, Camera
 from scm_world.world import World
 
 Size = int | tuple[int, int]
+
+AUTOMATIC = "automatic"
+"""A camera that looks at what moves in a model, and follows it."""
 
 
 def chosen(
@@ -39,6 +50,11 @@ def chosen(
     if isinstance(cameras, str) or (cameras is not None and not len(cameras)):
         raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
     found = [_camera(camera, known) for camera in (own if cameras is None else cameras)]
+    return _sized(found, size)
+
+
+def _sized(found: Sequence[Camera], size: Size | None) -> tuple[Camera, ...]:
+    """Give cameras pictures of one size."""
     if size is not None:
         height, width = _height_and_width(size)
         found = [replace(camera, height=height, width=width) for camera in found]
@@ -142,3 +158,68 @@ def followed(cameras: Sequence[str | Camera] | None, *, original: bool) -> tuple
     own = [camera.name for camera in CAMERAS]
     asked = own if cameras is None else cameras
     return tuple(not original and isinstance(c, str) and c in own for c in asked)
+
+
+@final
+class ModelPixels:
+    """What cameras see of a model.
+
+    Args:
+        world: That is observed.
+        cameras: Cameras; names of those in the file, which stand where they stand now; or
+            ``"automatic"``, which is what None stands for.
+        size: Height and width of the pictures, or both in one [pixels]; 128 if None.
+
+    Attributes:
+        names: The variables that have to be computed: none.
+        layouts: Where variables stand in vectors: there are none.
+        space: uint8, shape (n, 3, h, w).
+
+    Raises:
+        UnknownOption: There is no such camera, or the sizes are none or differ.
+        ModelError: The world has no shapes.
+    """
+
+    names: tuple[str, ...] = ()
+
+    def __init__(
+        self, world: World, cameras: Sequence[str | Camera] | None, size: Size | None
+    ) -> None:
+        given = (AUTOMATIC,) if cameras is None else cameras
+        if isinstance(given, str) or not len(given):
+            raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
+        self._world, self._given = world, tuple(given)
+        usual = Camera("", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+        scene, shape = world.structure.default_scene(), (usual.height, usual.width)
+        found = [scene_camera(scene, c, shape if isinstance(c, str) else None) for c in given]
+        self._cameras = _sized(found, size)
+        self.layouts: Layouts = {}
+        self._shape = (len(given), 3, self._cameras[0].height, self._cameras[0].width)
+        self.space: gymnasium.Space[NDArray[np.uint8]] = gymnasium.spaces.Box(
+            0, 255, self._shape, np.uint8
+        )
+
+    def observe(self, now: Values) -> NDArray[np.uint8]:
+        """Draw."""
+        scene = self._world.scene()
+        pictures: Any = np.empty(self._shape, dtype=np.uint8)
+        pairs = zip(self._given, self._cameras, strict=True)
+        cameras = [placed(scene, given, camera) for given, camera in pairs]
+        now_pixels(scene, cameras, pictures)
+        found: NDArray[np.uint8] = pictures
+        return found
+
+
+def placed(scene: Scene, given: str | Camera, camera: Camera) -> Camera:
+    """Put a camera of a model where it is now.
+
+    Args:
+        scene: Of the present.
+        given: What was asked for.
+        camera: The same, as it is in the default scene.
+    """
+    if given == AUTOMATIC:
+        return following_camera(camera, scene)
+    if isinstance(given, str):
+        return scene_camera(scene, given, (camera.height, camera.width))
+    return camera
