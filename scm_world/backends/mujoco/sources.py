@@ -161,6 +161,7 @@ def read_source(
     files = _located(spec, folder, where)
     if urdf:
         _repair(spec, where)
+        _add_motors(spec)
     return _sealed(*_written(spec, files, where), b"", chosen), name, where
 
 
@@ -302,6 +303,30 @@ def _repair(spec: mujoco.MjSpec, where: str) -> None:
         if "inertia" not in str(error):
             raise
         spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
+
+
+def _add_motors(spec: mujoco.MjSpec) -> None:
+    """Give every hinge and slide of a URDF a motor, as its joints are meant to be driven.
+
+    The control is the torque or force of the joint [N m] or [N], within the effort that the URDF
+    allows; it is not limited where there is none. A joint that mimics another one has none.
+    """
+    mimics = {equality.name1 for equality in spec.equalities}
+    for joint in spec.joints:
+        driven = joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        if not driven or joint.name in mimics:
+            continue
+        low, high = joint.actfrcrange
+        motor = spec.add_actuator(
+            name=joint.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=joint.name,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_NONE,
+        )
+        motor.gainprm[0] = 1.0
+        if low < high:
+            motor.ctrllimited, motor.ctrlrange = True, (low, high)
 
 
 def _written(
