@@ -83,10 +83,10 @@ class Tampered:
 
 def tampered_world(monkeypatch: pytest.MonkeyPatch, tamper: Tampered) -> World:
     """Build a pushing world that declares something false about its physics."""
-    from scm_world.entities import Composition
+    from scm_world.entities import BlockWorld
 
-    honest = Composition.variables
-    monkeypatch.setattr(Composition, "variables", lambda self: tuple(tamper(honest(self))))
+    honest = BlockWorld.variables
+    monkeypatch.setattr(BlockWorld, "variables", lambda self: tuple(tamper(honest(self))))
     return World("pushing")
 
 

@@ -83,12 +83,12 @@ def test_what_decides_the_structure_is_held_like_any_other() -> None:
 
 def test_a_false_edge_into_a_mechanism_is_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cause that a mechanism ignores is listed as missed, whatever it is set to."""
-    from scm_world.entities import Composition
+    from scm_world.entities import BlockWorld
 
-    honest = Composition.variables
+    honest = BlockWorld.variables
     extra = Parent("floor_friction", 0)
 
-    def tampered(self: Composition) -> tuple[Any, ...]:
+    def tampered(self: BlockWorld) -> tuple[Any, ...]:
         return tuple(
             v.model_copy(update={"parents": (*v.parents, extra), "mechanism": Function(first)})
             if v.name == "tool_level_0_num_0.mass"
@@ -96,7 +96,7 @@ def test_a_false_edge_into_a_mechanism_is_missed(monkeypatch: pytest.MonkeyPatch
             for v in honest(self)
         )
 
-    monkeypatch.setattr(Composition, "variables", tampered)
+    monkeypatch.setattr(BlockWorld, "variables", tampered)
     report = found("stacked_blocks", "fake", 1, SMALL["stacked_blocks"])
     assert ("floor_friction", "tool_level_0_num_0.mass", 0) in report.score.missed
     assert ("blocks_mass", "tool_level_0_num_0.mass", 0) in report.found
