@@ -21,6 +21,7 @@ from scm_world.errors import ModelError
 from scm_world.variables.spaces import Frozen
 
 Constant = float | tuple[float, ...]
+PACKAGE = __name__.partition(".")[0]
 
 
 @final
@@ -53,6 +54,31 @@ class Stacked:
     def __call__(self, *parents: Value, **constants: Any) -> Any:
         """Compute from values of the parents."""
         return self.kernel(np.concatenate([np.ravel(parent) for parent in parents]), **constants)
+
+
+@final
+class Unboxed:
+    """A function that a user compiled with numba, which computes with numbers.
+
+    Values without a dimension are arrays here; the function is given the numbers in them.
+
+    Args:
+        kernel: The function.
+
+    Attributes:
+        kernel: The same.
+    """
+
+    def __init__(self, kernel: Callable[..., Any]) -> None:
+        self.kernel = kernel
+
+    def __call__(self, *parents: Value, **constants: Any) -> Any:
+        """Compute from values of the parents."""
+        return self.kernel(*map(_number, parents), **{k: _number(v) for k, v in constants.items()})
+
+
+def _number(value: Any) -> Any:
+    return value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
 
 
 @final
@@ -129,6 +155,8 @@ class Function(Frozen):
     def bind(self) -> Callable[..., Any]:
         """Give a callable with the constants filled in."""
         function = self.resolve()
+        if hasattr(function, "py_func") and function.__module__.partition(".")[0] != PACKAGE:
+            function = Unboxed(function)
         if not self.constants:
             return function
         constants = {

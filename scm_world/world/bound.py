@@ -15,7 +15,7 @@ from scm_world.geometry.direct import direct
 from scm_world.geometry.gather import gather_into, places
 from scm_world.graph import SCM
 from scm_world.variables import Action, Measured, Parent
-from scm_world.variables.mechanisms import Stacked
+from scm_world.variables.mechanisms import Stacked, Unboxed
 
 Now = dict[str, Value]
 
@@ -100,13 +100,18 @@ class _Rule:
         self._moves = [
             k not in model or isinstance(model.declared(k), Measured | Action) for k in self.keys
         ]
-        self._numbers = all(_is_number(model.declared(p.name)) for p in parents)
+        self._are_numbers = [_is_number(model.declared(p.name)) for p in parents]
+        self._unboxed = self._function if isinstance(self._function, Unboxed) else None
+        if self._unboxed is not None:
+            self._function = self._unboxed.kernel
 
     def step(self) -> _Step:
         """Bind it to what is looked up in every step."""
         function, keys = self._function, self.keys
-        if self._numbers:
+        if all(self._are_numbers):
             function = direct(function, *(0.0 for _ in keys), *self._constants)
+        elif self._unboxed is not None:
+            function = self._unboxed
         pick = itemgetter(*keys) if len(keys) > 1 else partial(_only, keys[0])
         return self.name, function, pick, self._constants
 
@@ -117,7 +122,13 @@ class _Rule:
             return _Stack(function, given, self._moves, constants)
         if self.writes:
             return _Written(function.into, (*given, *constants, written))
-        return partial(direct(function, *given, *constants), *given, *constants)
+        like = given
+        if (
+            self._unboxed is not None
+        ):  # it computes with numbers, where ours take arrays of no dimension too
+            pairs = zip(self._are_numbers, given, strict=True)
+            like = [0.0 if is_number else value for is_number, value in pairs]
+        return partial(direct(function, *like, *constants), *given, *constants)
 
 
 @final
@@ -191,7 +202,7 @@ def _place(view: Any, vector: Any) -> slice:
 def positional(function: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
     """Split a bound function of some parents into the function and its constants, in order.
 
-    Compiled functions take positional arguments faster. Others keep their constants.
+    Unboxed functions take positional arguments faster. Others keep their constants.
 
     Args:
         function: As ``bind`` of a mechanism gives it.
@@ -200,6 +211,8 @@ def positional(function: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
     if not isinstance(function, partial):
         return function, ()
     inner = function.func
+    if isinstance(inner, Unboxed):
+        inner = inner.kernel
     if isinstance(inner, Stacked):
         count, inner = 1, inner.kernel
     compiled = getattr(inner, "py_func", None)

@@ -16,7 +16,7 @@ from scm_world.geometry.rows import VECTOR, Each, move_columns
 from scm_world.graph import SCM
 from scm_world.variables import Linear, Parent
 from scm_world.variables.kinds import Variable
-from scm_world.variables.mechanisms import Stacked
+from scm_world.variables.mechanisms import Stacked, Unboxed
 from scm_world.world.bound import called, key, positional
 
 _types: Any = types  # numba is untyped
@@ -253,6 +253,8 @@ def _compiled(
     if variable.parts:
         return Copied(columns, place)
     function, constants = positional(variable.mechanism.bind(), len(columns))
+    if isinstance(function, Unboxed):
+        function = function.kernel
     stacked = isinstance(function, Stacked)
     if stacked:
         function, shapes = function.kernel, [(sum(c.stop - c.start for c in columns),)]
