@@ -184,7 +184,8 @@ class _Finder:
         element, _, attribute = plain.rpartition(".")
         taken = [row.name for row in (*self._parameters, *(row for row, *_ in self._states))]
         if name in taken:
-            return f"it is a variable already; write a kind before it, as in 'body:{name}'"
+            kinds = [f"{kind}:{name}" for kind in _OBJECTS if clean(element) in self._names[kind]]
+            return "it is a variable already" + (f"; write {kinds[0]!r}" if kinds else "")
         if attribute == "value":
             return self._sensor(name, element)
         if attribute not in _POSES:

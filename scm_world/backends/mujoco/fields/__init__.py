@@ -40,8 +40,8 @@ from scm_world.backends.mujoco.trees import Couplings, Effect
 from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey
 
-MEDIUM = ("density", "viscosity", "wind")
-"""Options that act once a medium does."""
+MEDIUM = ("density", "viscosity")
+"""Options that make a medium act, and wind with it."""
 
 
 def table(mj: mujoco.MjModel, *, fluid: bool = False) -> list[Field]:

@@ -17,7 +17,7 @@ from scm_world.backends.mujoco.fields.rows import (
     solver_rows,
     turn_at,
 )
-from scm_world.backends.mujoco.trees import Effect
+from scm_world.backends.mujoco.trees import NOTHING, Effect
 
 _GEOM = mujoco.mjtGeom
 _SIZES = {
@@ -115,7 +115,7 @@ def _form(scope: Scope, geom: int) -> Iterator[Field]:
         yield row("size", "m", "", None, refusal=reason)
     yield row(
         "color", "1", "Red, green, blue and opacity of the shape.",
-        _color(geom, int(mj.geom_matid[geom])), low=0.0, high=1.0,
+        _color(geom, int(mj.geom_matid[geom])), effect=lambda: NOTHING, low=0.0, high=1.0,
         usual=mj.geom_group[geom] < _SHOWN, visual=True,
     )  # fmt: skip
     yield from _pose("geom", geom, row)

@@ -1,0 +1,85 @@
+"""Models that nobody here wrote, in the packages that are installed, and small ones."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+GYMNASIUM = "gymnasium/envs/mujoco/assets/"
+SUITE = "dm_control/suite/"
+ROBOTS = "robosuite/models/assets/robots/"
+URDFS = "pybullet_data/"
+
+QUICK = (
+    *(f"{GYMNASIUM}{name}.xml" for name in ("ant", "half_cheetah", "pusher_v5", "reacher")),
+    f"{GYMNASIUM}inverted_double_pendulum.xml",
+    *(f"{SUITE}{name}.xml" for name in ("ball_in_cup", "cartpole", "cheetah", "finger", "fish")),
+    *(f"{URDFS}{name}.urdf" for name in ("cartpole", "kuka_iiwa/model", "franka_panda/panda")),
+)
+LONG = (
+    *(f"{GYMNASIUM}{name}.xml" for name in ("hopper", "humanoid", "humanoidstandup", "point")),
+    *(f"{GYMNASIUM}{name}.xml" for name in ("inverted_pendulum", "pusher", "swimmer", "walker2d")),
+    f"{GYMNASIUM}walker2d_v5.xml",
+    *(f"{SUITE}{name}.xml" for name in ("acrobot", "dog", "hopper", "humanoid", "humanoid_CMU")),
+    *(f"{SUITE}{name}.xml" for name in ("manipulator", "pendulum", "point_mass", "quadruped")),
+    *(f"{SUITE}{name}.xml" for name in ("reacher", "stacker", "swimmer", "walker")),
+    *(f"{ROBOTS}{name}/robot.xml" for name in ("baxter", "gr1", "iiwa", "jaco", "kinova3")),
+    *(f"{ROBOTS}{name}/robot.xml" for name in ("panda", "sawyer", "spot", "spot_arm", "tiago")),
+    *(f"{ROBOTS}{name}/robot.xml" for name in ("ur5e", "xarm7")),
+    *(f"{URDFS}{name}.urdf" for name in ("a1/a1", "aliengo/aliengo", "humanoid/humanoid", "r2d2")),
+    *(f"{URDFS}{name}.urdf" for name in ("laikago/laikago", "pendulum5", "racecar/racecar")),
+    *(f"{URDFS}{name}.urdf" for name in ("mini_cheetah/mini_cheetah", "quadruped/minitaur")),
+    *(f"{URDFS}{name}.urdf" for name in ("xarm/xarm6_with_gripper", "differential/diff_ring")),
+)
+
+PENDULUM = """
+<mujoco model="pendulum">
+  <worldbody>
+    <body name="pole" pos="0 0 1">
+      <joint name="hinge" axis="0 1 0" range="-90 90" limited="true" damping="0.1"/>
+      <geom name="rod" type="capsule" size="0.02" fromto="0 0 0 0 0 -0.5"/>
+      <site name="tip" pos="0 0 -0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-2 2"/></actuator>
+  <sensor><jointpos name="angle" joint="hinge"/><touch name="touch" site="tip"/></sensor>
+</mujoco>
+"""
+
+
+def model_file(name: str) -> Path:
+    """Find a file in an installed package, without importing it."""
+    package, _, inside = name.partition("/")
+    found = importlib.util.find_spec(package)
+    if found is None:
+        pytest.skip(f"{package} is not installed")
+    return Path(next(iter(found.submodule_search_locations))) / inside
+
+
+def arrays(mj: mujoco.MjModel) -> dict[str, bytes]:
+    """Copy all numbers of a compiled model, as bytes."""
+    parts = {"": mj, "opt.": mj.opt, "stat.": mj.stat}
+    return {
+        f"{prefix}{name}": np.asarray(getattr(part, name)).tobytes()
+        for prefix, part in parts.items()
+        for name in dir(part)
+        if not name.startswith("_")
+        and name not in ("signature", "paths", "mesh_pathadr")
+        and isinstance(getattr(part, name), np.ndarray | float | int)
+    }
+
+
+def pile(n: int = 4, options: str = "") -> str:
+    """Write bodies of different shapes that lie on one another."""
+    shapes = ("box", "sphere", "capsule", "cylinder", "ellipsoid")
+    bodies = "".join(
+        f'<body name="b{i}" pos="{0.05 * i} {0.03 * (i % 2)} {0.12 + 0.21 * i}"><freejoint/>'
+        f'<geom name="g{i}" type="{shapes[i % 5]}" size="0.1 0.1 0.1"/></body>'
+        for i in range(n)
+    )
+    floor = '<geom name="floor" type="plane" size="5 5 0.1"/>'
+    return f"<mujoco>{options}<worldbody>{floor}{bodies}</worldbody></mujoco>"

@@ -1,0 +1,489 @@
+"""Reading model files: tables, names, sources and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from model_files import LONG, PENDULUM, QUICK, SUITE, URDFS, arrays, model_file, pile
+
+from scm_world.backends import read_model
+from scm_world.backends.mujoco.fields import slots
+from scm_world.backends.mujoco.reading import compiled, contact_bodies, permutation
+from scm_world.backends.mujoco.sources import realized
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.models import Model
+
+FILES = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
+NAME = re.compile(r"((\w+:)?[\w-]+\.)?\w+")
+
+
+@pytest.fixture(params=FILES)
+def model(request: pytest.FixtureRequest) -> Model:
+    """A model that nobody here wrote."""
+    return read_model(model_file(request.param))
+
+
+def value(row: Any, numbers: Any) -> Any:
+    """Give every component of a row its number."""
+    return np.array(np.broadcast_to(numbers, row.shape), dtype=np.float64)
+
+
+# --- every file --------------------------------------------------------------------------------
+
+
+def test_every_file_gives_complete_tables(model: Model) -> None:
+    """Names are unique and legal, units are given, and defaults lie within their bounds."""
+    rows = (*model.parameters, *model.states, *model.inputs)
+    names = [row.name for row in rows]
+    assert len(set(names)) == len(names)
+    for row in rows:
+        default, low, high = (value(row, n) for n in (row.default, row.low, row.high))
+        assert NAME.fullmatch(row.name)
+        assert row.unit
+        assert row.doc.endswith(".")
+        assert (low <= default).all(), row.name
+        assert (default <= high).all(), row.name
+        assert row.always | row.contact <= set(range(len(model.trees)))
+        assert not row.always & row.contact
+    assert all(row.tree in row.always for row in model.states)
+    assert not any(name in dict(model.refused) for name in names)
+
+
+def test_writing_and_undoing_leaves_no_trace(model: Model) -> None:
+    """Every parameter is read back as written, and its default restores every array to the bit."""
+    mj = copy.copy(compiled(model))
+    data, scratch = mujoco.MjData(mj), mujoco.MjData(mj)
+    before, places = arrays(mj), slots(mj, model, data)
+    assert places.keys() == {row.key for row in model.parameters}
+    for row in model.parameters:
+        slot, default = places[row.key], value(row, row.default)
+        assert np.array_equal(slot.read(), default)
+        slot.write(default * 0.9 if default.any() else default + 0.01)
+        assert slot.constant == (row.change == "constants")
+        if slot.constant:
+            mujoco.mj_setConst(mj, scratch)
+        written = default * 0.9 if default.any() else default + 0.01
+        np.testing.assert_allclose(slot.read(), written, rtol=0.0, atol=1e-6 * row.visual)
+        slot.write(default)
+    mujoco.mj_setConst(mj, scratch)
+    after = arrays(mj)
+    assert [name for name in before if after[name] != before[name]] == []
+
+
+def test_the_state_vector_is_a_permutation(model: Model) -> None:
+    """Every number of MuJoCo's state stands in exactly one place of the vector."""
+    mj, places = compiled(model), permutation(compiled(model))
+    data, start = mujoco.MjData(mj), model.empty_state().vector
+    assert sorted(np.concatenate(places).tolist()) == list(range(mj.nq + mj.nv + mj.na))
+    assert np.array_equal(start[places.positions], data.qpos)
+    assert np.array_equal(start[places.velocities], data.qvel)
+    assert np.array_equal(start[places.activations], data.act)
+
+
+def test_a_model_goes_to_another_process(model: Model) -> None:
+    """A pickled model is equal, and compiles to the same arrays."""
+    if len(model.source.assets) > 30:
+        pytest.skip("tens of megabytes of meshes")
+    again = pickle.loads(pickle.dumps(model))  # noqa: S301 # our own
+    assert again == model
+    first = arrays(compiled(model))
+    realized.cache_clear()
+    assert arrays(compiled(again)) == first
+
+
+def test_the_compiled_model_is_that_of_the_file(model: Model, request: Any) -> None:
+    """All numbers but the options are what MuJoCo itself makes of the file, to the bit."""
+    name = request.node.callspec.params["model"]
+    if not name.endswith(".xml"):
+        pytest.skip("MuJoCo alone does not find the meshes of a URDF")
+    theirs = arrays(mujoco.MjModel.from_xml_path(str(model_file(name))))
+    ours = arrays(compiled(model))
+    assert [n for n in theirs if not n.startswith("opt.") and ours[n] != theirs[n]] == []
+
+
+# --- tables ------------------------------------------------------------------------------------
+
+
+def test_a_pendulum_has_the_variables_one_expects() -> None:
+    """Names are elements and attributes in the words of MJCF."""
+    model = read_model(PENDULUM)
+    assert model.name == "pendulum"
+    assert [(row.name, row.unit) for row in model.parameters] == [
+        ("pole.mass", "kg"),
+        ("pole.inertia", "kg m^2"),
+        ("hinge.damping", "N m s/rad"),
+        ("hinge.armature", "kg m^2"),
+        ("hinge.frictionloss", "N m"),
+        ("hinge.stiffness", "N m/rad"),
+        ("rod.color", "1"),
+        ("motor.gear", "1"),
+        ("gravity", "m/s^2"),
+        ("timestep", "s"),
+    ]
+    assert [(row.name, row.unit) for row in model.states] == [
+        ("hinge.position", "rad"),
+        ("hinge.velocity", "rad/s"),
+    ]
+    assert (model.states[0].low, model.states[0].high) == pytest.approx((-np.pi / 2, np.pi / 2))
+    (motor,) = model.inputs
+    assert (motor.name, motor.unit, motor.low, motor.high) == ("motor.control", "N m", -2.0, 2.0)
+
+
+def test_states_of_all_kinds_of_joints() -> None:
+    """Free bodies, balls, slides and activations have the names and shapes of their kind."""
+    model = read_model(
+        """<mujoco><worldbody>
+        <body name="cube"><freejoint name="any"/><geom size="0.1"/></body>
+        <body name="b"><joint name="ball" type="ball"/><geom size="0.1" pos="0.2 0 0"/></body>
+        <body name="s"><joint name="slide" type="slide"/><geom size="0.1"/></body>
+        </worldbody><actuator><position name="servo" joint="slide" kp="3" timeconst="0.1"/>
+        </actuator></mujoco>"""
+    )
+    assert [(row.name, row.shape, row.kind) for row in model.states] == [
+        ("cube.cartesian_position", (3,), "real"),
+        ("cube.orientation", (4,), "rotation"),
+        ("cube.linear_velocity", (3,), "real"),
+        ("cube.angular_velocity", (3,), "real"),
+        ("ball.orientation", (4,), "rotation"),
+        ("ball.angular_velocity", (3,), "real"),
+        ("slide.position", (), "real"),
+        ("slide.velocity", (), "real"),
+        ("servo.activation", (), "real"),
+    ]
+    assert model.states[1].default == (0.0, 0.0, 0.0, 1.0)
+    assert model.trees == ("cube", "b", "s")
+
+
+def test_elements_without_names_get_stable_ones() -> None:
+    """They are named after their body or target, and by their number in it."""
+    model = read_model(
+        """<mujoco><worldbody><body><joint/><geom size="0.1"/><geom size="0.1" pos="1 0 0"/>
+        <body name="fore arm.1"><joint axis="1 0 0"/><joint axis="0 1 0"/><geom size="0.1"/></body>
+        </body></worldbody><actuator><motor joint="left/hand"/></actuator></mujoco>""".replace(
+            '<joint axis="0 1 0"/>', '<joint name="left/hand" axis="0 1 0"/>'
+        )
+    )
+    names = {row.name for row in (*model.parameters, *model.states, *model.inputs)}
+    assert {"world_body_0.mass", "world_body_0.position", "world_body_0_geom_1.color"} <= names
+    assert {"fore_arm_1.mass", "fore_arm_1_joint_0.velocity", "left_hand.control"} <= names
+
+
+def test_only_what_collides_is_told_apart_by_its_kind() -> None:
+    """A body and a shape of one name keep plain names, unless they share an attribute."""
+    model = read_model(
+        PENDULUM.replace('name="rod"', 'name="pole"').replace('name="motor"', 'name="hinge"'),
+        expose=["*", "*.position", "*.armature"],
+    )
+    names = {row.name for row in (*model.parameters, *model.inputs)}
+    assert {"pole.mass", "pole.color", "hinge.damping", "hinge.gear", "hinge.control"} <= names
+    assert {"body:pole.position", "geom:pole.position", "hinge.armature"} <= names
+    assert "actuator:hinge.armature" in names
+
+
+def test_fields_that_act_on_nothing_are_not_exposed() -> None:
+    """They are refused with the reason, to be read after the name."""
+    refused = dict(read_model(PENDULUM).refused)
+    assert refused["wind"] == "acts on nothing: density and viscosity are zero"
+    assert refused["rod.friction"] == "acts on nothing: the shape touches nothing"
+    assert refused["rod.contype"].startswith("is a whole number")
+    assert refused["hinge.range"] == "is not exposed; name it in expose=[…]"
+    still = read_model(
+        PENDULUM.replace("<worldbody>", '<option><flag gravity="disable"/></option><worldbody>')
+    )
+    assert dict(still.refused)["gravity"] == "acts on nothing: the model disables gravity"
+
+
+@pytest.mark.parametrize(
+    ("patterns", "names"),
+    [
+        ("*.mass", ["pole.mass"]),
+        (["pole.*", "hinge.range"], ["pole.mass", "pole.inertia", "hinge.range"]),
+        (["density"], ["density"]),
+        (["*.solreflimit", "gravity"], ["hinge.solreflimit", "gravity"]),
+    ],
+)
+def test_patterns_choose_what_is_exposed(patterns: Any, names: list[str]) -> None:
+    """Attributes beyond the usual ones are exposed where they are named."""
+    assert [row.name for row in read_model(PENDULUM, expose=patterns).parameters] == names
+
+
+def test_a_medium_that_may_come_makes_wind_act() -> None:
+    """Exposing the density exposes the wind, and lets the size of shapes act at all times."""
+    text = PENDULUM.replace('name="rod"', 'name="rod" fluidshape="ellipsoid"')
+    model = read_model(text, expose=["density", "wind", "*.size"])
+    assert {row.name: set(row.always) for row in model.parameters} == {
+        "density": {0},
+        "wind": {0},
+        "rod.size": {0},
+    }
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("pole.mas", "names no parameter; did you mean 'pole.mass'?"),
+        ("wind", "'wind' acts on nothing: density and viscosity are zero"),
+    ],
+)
+def test_patterns_that_name_nothing_are_errors(pattern: str, message: str) -> None:
+    """The error has the nearest name, or says why it is refused."""
+    with pytest.raises(ModelError, match=re.escape(message)):
+        read_model(PENDULUM, expose=["*", pattern])
+
+
+def test_servos_have_gains_instead_of_numbered_slots() -> None:
+    """A gain that MuJoCo keeps in two places is one parameter, and both follow."""
+    text = PENDULUM.replace("<motor", '<position kp="5" kv="0.5"')
+    model = read_model(text, expose=["motor.*"])
+    assert [(row.name, row.default, row.unit) for row in model.parameters] == [
+        ("motor.gear", 1.0, "1"),
+        ("motor.kp", 5.0, "N m/rad"),
+        ("motor.kv", 0.5, "N m s/rad"),
+    ]
+    mj = copy.copy(compiled(model))
+    slots(mj, model)["motor", "kp"].write(np.array(7.0))
+    assert (mj.actuator_gainprm[0, 0], mj.actuator_biasprm[0, 1]) == (7.0, -7.0)
+
+
+def test_a_color_is_that_of_the_material_until_it_is_set() -> None:
+    """Setting it to the color of the material undoes it to the bit."""
+    text = PENDULUM.replace(
+        "<worldbody>", '<asset><material name="red" rgba="0.9 0.1 0.2 1"/></asset><worldbody>'
+    )
+    model = read_model(text.replace('name="rod"', 'name="rod" material="red"'), expose="*.color")
+    mj = copy.copy(compiled(model))
+    before, slot = arrays(mj), slots(mj, model)["rod", "color"]
+    assert model.parameters[0].default == (0.9, 0.1, 0.2, 1.0)
+    for color in ([0.3, 0.4, 0.5, 1.0], [0.5, 0.5, 0.5, 1.0]):
+        slot.write(np.array(color))
+        np.testing.assert_allclose(slot.read(), color, atol=1e-6)
+    slot.write(np.array([0.9, 0.1, 0.2, 1.0]))
+    assert arrays(mj) == before
+
+
+def test_sizes_act_as_in_a_model_that_is_compiled_with_them() -> None:
+    """A new size with derived constants gives the trajectory of a new compilation, to the bit."""
+    wide = pile(5).replace('size="0.1 0.1 0.1"', 'size="0.13 0.11 0.12"')
+    model, other = read_model(pile(5)), read_model(wide)
+    mj = copy.copy(compiled(model))
+    places = slots(mj, model)
+    for row in other.parameters:
+        places[row.key].write(value(row, row.default))
+    mujoco.mj_setConst(mj, mujoco.MjData(mj))
+    runs = []
+    for each in (mj, compiled(other)):
+        data = mujoco.MjData(each)
+        mujoco.mj_step(each, data, 300)
+        runs.append(data.qpos.copy())
+    assert np.array_equal(*runs)
+
+
+def test_mocap_bodies_have_a_pose_that_can_be_set() -> None:
+    """It lives in the data, acts at once, and moves what is welded to it."""
+    model = read_model(
+        """<mujoco><worldbody><body name="hand" mocap="true" pos="0 0 1"/>
+        <body name="held" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody>
+        <equality><weld body1="hand" body2="held"/></equality></mujoco>"""
+    )
+    row = next(row for row in model.parameters if row.name == "hand.position")
+    assert (row.default, row.change, row.always) == ((0.0, 0.0, 1.0), "live", {0})
+    mj = copy.copy(compiled(model))
+    data = mujoco.MjData(mj)
+    slots(mj, model, data)[row.key].write(np.array([0.0, 0.3, 1.0]))
+    mujoco.mj_step(mj, data, 500)
+    assert data.body("held").xpos[1] == pytest.approx(0.3, abs=0.05)
+    with pytest.raises(TypeError, match="needs the MjData"):
+        slots(mj, model)
+
+
+def test_contacts_name_bodies() -> None:
+    """The world's own shapes belong to the world."""
+    assert contact_bodies(compiled(read_model(pile(2)))) == ("world", "b0", "b1")
+
+
+# --- settings ----------------------------------------------------------------------------------
+
+
+def test_exact_settings_are_in_force() -> None:
+    """Islands on; warm start, autoreset and sleep off."""
+    flags = '<option><flag warmstart="enable" island="disable" sleep="enable"/></option>'
+    mj = compiled(read_model(PENDULUM.replace("<worldbody>", f"{flags}<worldbody>")))
+    off = mujoco.mjtDisableBit
+    assert mj.opt.disableflags & int(off.mjDSBL_WARMSTART)
+    assert mj.opt.disableflags & int(off.mjDSBL_AUTORESET)
+    assert not mj.opt.disableflags & int(off.mjDSBL_ISLAND)
+    assert not mj.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+
+
+@pytest.mark.parametrize(
+    ("text", "integrator", "notes"),
+    [
+        (PENDULUM, "EULER", 0),
+        (pile(2), "IMPLICITFAST", 1),
+        (pile(2, '<option integrator="RK4"/>'), "RK4", 0),
+        (pile(2, '<option integrator="RK4" solver="PGS"/>'), "RK4", 1),
+    ],
+)
+def test_only_several_trees_change_the_integrator(text: str, integrator: str, notes: int) -> None:
+    """Euler's implicit damping, and dual solvers with a dense Jacobian, would tie them together."""
+    model = read_model(text)
+    mj = compiled(model)
+    assert mj.opt.integrator == int(getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}"))
+    assert len(model.notes) == notes
+    assert mujoco.mj_isSparse(mj) == ("PGS" in text)
+
+
+def test_settings_replace_options_of_the_file() -> None:
+    """They are part of what decides whether two models are equal."""
+    model = read_model(PENDULUM, settings={"timestep": 0.001, "integrator": "RK4"})
+    assert model.timestep == 0.001
+    assert compiled(model).opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
+    assert model != read_model(PENDULUM)
+    assert read_model(PENDULUM) == read_model(PENDULUM)
+    assert read_model(PENDULUM) != read_model(PENDULUM, expose="*.mass")
+    for settings in ({"timestap": 0.001}, {"integrator": "euclid"}):
+        with pytest.raises(UnknownOption):
+            read_model(PENDULUM, settings=settings)
+
+
+# --- sources -----------------------------------------------------------------------------------
+
+
+def test_path_text_spec_and_compiled_model_are_one(tmp_path: Path) -> None:
+    """They compile to the same arrays; what is given is not changed."""
+    path = tmp_path / "pendulum.mjcf"
+    path.write_text(PENDULUM)
+    spec, mj = mujoco.MjSpec.from_string(PENDULUM), mujoco.MjModel.from_xml_string(PENDULUM)
+    untouched = arrays(mj)
+    sources = (path, str(path), PENDULUM, spec, mj)
+    models = [read_model(source) for source in sources]
+    assert len({model.digest for model in models[:4]}) == 1
+    assert all(arrays(compiled(model)) == arrays(compiled(models[0])) for model in models)
+    assert [model.name for model in models] == ["pendulum"] * 5
+    again = pickle.loads(pickle.dumps(models[4]))  # noqa: S301 # our own
+    assert again.parameters == models[0].parameters
+    assert arrays(mj) == untouched
+
+
+def test_a_model_needs_its_files_only_once(tmp_path: Path) -> None:
+    """Includes and meshes are inside: the files can go."""
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "part.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    (tmp_path / "body.xml").write_text(
+        '<mujoco><worldbody><body name="part"><freejoint/><geom type="mesh" mesh="part"/></body>'
+        "</worldbody></mujoco>"
+    )
+    path = tmp_path / "main.xml"
+    path.write_text(
+        '<mujoco><compiler meshdir="meshes"/><asset><mesh name="part" file="part.obj"/></asset>'
+        '<include file="body.xml"/></mujoco>'
+    )
+    model = read_model(path)
+    assert model.name == "main"
+    for file in (path, tmp_path / "body.xml", tmp_path / "meshes" / "part.obj"):
+        file.unlink()
+    realized.cache_clear()
+    assert compiled(model).nmesh == 1
+
+
+def test_the_root_of_a_urdf_can_be_free() -> None:
+    """MuJoCo fixes it to the world, and then the mass of the root counts for nothing."""
+    path = model_file(f"{URDFS}franka_panda/panda.urdf")
+    fixed, free = read_model(path), read_model(path, fixed_base=False)
+    assert fixed.trees == ("panda_link1",)
+    assert free.trees == ("panda_link0",)
+    assert free.layout.names[:2] == ("panda_link0.cartesian_position", "panda_link0.orientation")
+    masses = [
+        sum(row.default for row in model.parameters if row.name.endswith(".mass"))
+        for model in (fixed, free)
+    ]
+    assert masses == pytest.approx([15.06, 17.96])
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "message"),
+    [
+        ("nowhere.xml", UnreadableFile, "'nowhere.xml' cannot be read: no such file"),
+        (3, ModelError, "3 is no model: give the path of an .xml, .mjcf or .urdf file"),
+        ("<html/>", ModelError, "begins with <html>: give MJCF"),
+        ("<mujoco><worldbody>", ModelError, "MuJoCo cannot read the XML text: XML parse error"),
+        ("<mujoco><wordbody/></mujoco>", ModelError, "unrecognized element"),
+        ('<mujoco><include file="no.xml"/></mujoco>', ModelError, "put the file there"),
+        ("<mujoco/>", ModelError, "has no joint, so that nothing in it can move"),
+        (
+            '<mujoco><asset><mesh file="a.stl"/></asset></mujoco>',
+            ModelError,
+            "names the file 'a.stl', which is not in",
+        ),
+        (
+            PENDULUM.replace("<motor", '<general gaintype="user"'),
+            ModelError,
+            "the actuator 'motor' needs a callback",
+        ),
+        (
+            PENDULUM.replace("<motor", '<motor delay="0.01" nsample="6"'),
+            ModelError,
+            "the actuator 'motor' acts with a delay",
+        ),
+        (
+            PENDULUM.replace("damping=", 'stiffness="1" springyield="0.1" damping='),
+            ModelError,
+            "whose rest shape is a hidden state",
+        ),
+    ],
+)
+def test_what_is_no_model_is_one_typed_error(source: Any, error: Any, message: str) -> None:
+    """The error names the file and what to do."""
+    with pytest.raises(error, match=re.escape(message)):
+        read_model(source)
+
+
+def test_plugins_are_refused_by_name() -> None:
+    """What a plugin acts on is unknown."""
+    plugin = '<plugin plugin="mujoco.pid"><instance name="p"/></plugin>'
+    text = PENDULUM.replace("<worldbody>", f"<extension>{plugin}</extension><worldbody>")
+    text = text.replace("<motor", '<plugin plugin="mujoco.pid" instance="p"')
+    with pytest.raises(ModelError, match=r"uses 1 plugin\(s\) \(mujoco.pid\)"):
+        read_model(text)
+
+
+def test_callbacks_are_refused() -> None:
+    """What a callback acts on is unknown."""
+    mujoco.set_mjcb_control(lambda mj, data: None)
+    try:
+        with pytest.raises(ModelError, match=r"call mujoco.set_mjcb_control\(None\)"):
+            read_model(PENDULUM)
+    finally:
+        mujoco.set_mjcb_control(None)
+
+
+def test_flexes_act_without_variables() -> None:
+    """Their vertices are states, their material is mentioned in a note."""
+    model = read_model(
+        """<mujoco><worldbody><flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1"
+        dim="2" radius="0.01"><edge equality="true"/></flexcomp></worldbody></mujoco>"""
+    )
+    assert any("flex" in note for note in model.notes)
+    assert len(model.states) == 2 * 3 * 9
+    assert all(row.always == set(range(9)) for row in model.states)
+    assert not any(row.name.startswith("cloth_1") for row in model.parameters)
+
+
+@pytest.mark.slow
+def test_every_other_suite_model_is_read() -> None:
+    """Also those with a skin and hundreds of variables."""
+    model = read_model(model_file(f"{SUITE}dog.xml"))
+    assert any("skin" in note for note in model.notes)
+    assert len(model.parameters) > 1000

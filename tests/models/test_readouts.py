@@ -1,0 +1,149 @@
+"""What follows from states at once: poses, velocities and sensors."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import re
+import threading
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from model_files import GYMNASIUM, PENDULUM, SUITE, model_file
+
+from scm_world.backends import read_model
+from scm_world.backends.mujoco.fields import element_names
+from scm_world.backends.mujoco.reading import compiled, permutation
+from scm_world.errors import ModelError
+from scm_world.models import Model, Readout
+
+POSES = ("position", "orientation", "linear_velocity", "angular_velocity")
+
+
+def only(model: Model) -> Readout:
+    """Give the readout of a model that has one."""
+    (readout,) = model.readouts
+    return readout
+
+
+def test_the_tip_of_a_pendulum_follows_the_formula() -> None:
+    """Its place, orientation and velocity are functions of the angle and its speed alone."""
+    wanted = [f"tip.{attribute}" for attribute in POSES]
+    place, turn, speed, spin = read_model(PENDULUM, readouts=wanted).readouts
+    angle, rate = 0.4, 1.5
+    assert place.parents == turn.parents == ("hinge.position",)
+    assert speed.parents == spin.parents == ("hinge.position", "hinge.velocity")
+    assert [readout.unit for readout in (place, turn, speed, spin)] == ["m", "1", "m/s", "rad/s"]
+    x, z = -0.5 * math.sin(angle), -0.5 * math.cos(angle)
+    np.testing.assert_allclose(place.function(angle), [x, 0.0, 1.0 + z], atol=1e-15)
+    half = [0.0, math.sin(angle / 2), 0.0, math.cos(angle / 2)]
+    np.testing.assert_allclose(turn.function(angle), half, atol=1e-15)
+    np.testing.assert_allclose(speed.function(angle, rate), [rate * z, 0.0, -rate * x], atol=1e-15)
+    np.testing.assert_allclose(spin.function(angle, rate), [0.0, rate, 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("name", [f"{SUITE}fish.xml", f"{SUITE}finger.xml", f"{GYMNASIUM}ant.xml"])
+def test_readouts_are_what_the_engine_computes(name: str) -> None:
+    """In random states they equal the numbers of ``mj_forward``, also after pickling."""
+    names = element_names(mujoco.MjModel.from_xml_path(str(model_file(name))))
+    wanted = [f"{kind}:{names[kind][-1]}.{a}" for kind in ("body", "geom") for a in POSES]
+    sensors = [s for s in names["sensor"] if "touch" not in s]
+    model = read_model(model_file(name), readouts=[*wanted, *(f"{s}.value" for s in sensors)])
+    model = pickle.loads(pickle.dumps(model))  # noqa: S301 # our own
+    mj = compiled(model)
+    data, places, rng = mujoco.MjData(mj), permutation(mj), np.random.default_rng(0)
+    mujoco.mj_integratePos(mj, data.qpos, rng.normal(size=mj.nv), 0.1)
+    data.qvel[:] = rng.normal(size=mj.nv)
+    mujoco.mj_forward(mj, data)
+    vector = np.empty(model.layout.size)
+    vector[places.positions], vector[places.velocities] = data.qpos, data.qvel
+    given: dict[str, Any] = {
+        row.name: np.array(row.default).reshape(row.shape) for row in model.parameters
+    }
+    for row in model.states:
+        given[row.name] = vector[model.layout.slices[row.name]].reshape(row.shape)
+    for readout in model.readouts:
+        found = readout.function(*(given[parent] for parent in readout.parents))
+        element, _, attribute = readout.name.rpartition(":")[2].rpartition(".")
+        assert np.shape(found) == readout.shape
+        if attribute == "value":
+            expected = data.sensor(element).data.reshape(readout.shape)
+        elif attribute == "position":
+            kind = readout.name.partition(":")[0]
+            index = names[kind].index(element)
+            expected = {"body": data.xpos, "geom": data.geom_xpos}[kind][index]
+        else:
+            continue
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
+
+
+def test_a_readout_is_a_function() -> None:
+    """The same values give the same bits, in any order of calls and in any thread."""
+    place = only(read_model(PENDULUM, readouts=["tip.position"])).function
+    first = place(0.4)
+    place(1.0)
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(place(0.4)))
+    thread.start()
+    thread.join()
+    assert np.array_equal(first, place(0.4))
+    assert np.array_equal(first, found[0])
+
+
+def test_parameters_that_move_things_are_parents() -> None:
+    """An axis, or a place in a parent, that is exposed decides where the tip is."""
+    text = PENDULUM.replace('<body name="pole"', '<body name="pole" simple="false"')
+    exposed = ["hinge.axis", "hinge.anchor", "hinge.damping", "*.position"]
+    model = read_model(text, readouts=["site:tip.position"], expose=exposed)
+    assert set(only(model).parents) == {
+        "hinge.position",
+        "hinge.axis",
+        "hinge.anchor",
+        "pole.position",
+        "tip.position",
+    }
+    assert model.parameters[-1].name == "tip.position"
+
+
+def test_the_parameters_of_a_readout_count() -> None:
+    """Moving the body moves its site by as much; undoing it gives the same bits as before."""
+    model = read_model(PENDULUM, readouts=["site:tip.position"], expose=["pole.position"])
+    place = only(model).function
+    before = place(0.4, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(place(0.4, np.array([0.0, 2.0, 1.0])) - before, [0.0, 2.0, 0.0])
+    assert np.array_equal(place(0.4, np.array([0.0, 0.0, 1.0])), before)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("tpi.position", "no site, body or shape is called 'tpi'; did you mean 'tip'?"),
+        ("tip.place", "'place' is nothing that can be computed; there are: position, orientation"),
+        ("hinge.position", "it is a variable already"),
+        ("touch.value", "it measures forces or accelerations"),
+        ("angel.value", "no sensor is called 'angel'; did you mean 'angle'?"),
+    ],
+)
+def test_what_cannot_be_computed_is_an_error(name: str, message: str) -> None:
+    """The error says why, or what is nearest."""
+    with pytest.raises(ModelError, match=re.escape(message)):
+        read_model(PENDULUM, readouts=["tip.position", name])
+
+
+def test_a_sensor_of_a_joint_follows_from_that_joint() -> None:
+    """Nothing else is its parent."""
+    readout = only(read_model(PENDULUM, readouts=["angle.value"]))
+    assert (readout.parents, readout.unit, readout.shape) == (("hinge.position",), "rad", ())
+    assert readout.function(0.3) == 0.3
+
+
+def test_readouts_leave_the_compiled_model_alone() -> None:
+    """They compute on a copy."""
+    model = read_model(PENDULUM, readouts=["tip.position"], expose=["pole.position"])
+    mj = compiled(model)
+    before = copy.copy(mj)
+    only(model).function(0.1, np.array([1.0, 1.0, 1.0]))
+    assert np.array_equal(mj.body_pos, before.body_pos)
