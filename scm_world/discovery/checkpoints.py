@@ -46,7 +46,7 @@ class Checkpoint:
                 largest={(str(c), str(e), int(lag)): float(x) for c, e, lag, x in data["largest"]},
                 states={(str(c), str(e), int(lag)): int(n) for c, e, lag, n in data["states"]},
                 floor=float(data["floor"]),
-                resolution=paired.effects.resolution,
+                exact=paired.effects.exact,
                 undone=set(map(str, data["undone"])),
                 rollouts=int(data["rollouts"]),
                 refused={str(name): int(n) for name, n in data["refused"].items()},

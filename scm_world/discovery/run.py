@@ -120,9 +120,8 @@ def _report(
     about: dict[str, str],
     started: float,
 ) -> DiscoveryReport:
-    threshold = effects.threshold
-    found = effects.found(threshold)
     declared = {edge.key for edge in model.edges}
+    found = effects.edges(declared)
     inert = [size for key, size in effects.largest.items() if key not in found]
     return DiscoveryReport(
         task=about["task"],
@@ -134,7 +133,7 @@ def _report(
         rollouts=effects.rollouts,
         bound=done * bounds.paired_single_target(len(effects.undone) or len(list(model))),
         floor=effects.floor,
-        threshold=threshold,
+        threshold=effects.threshold,
         inert=max(inert, default=0.0),
         score=score(found, declared),
         found=tuple(sorted(found)),

@@ -158,7 +158,8 @@ def paired_truth(world: World, action: ArrayLike) -> LocalTruth:
     def after(start: Scene, engine: Any = world.backend) -> PhysicalState:
         world.backend.build(start)
         engine.step(heard.mode, heard.command, len(heard.contacts))
-        return world.backend.state()
+        found: PhysicalState = world.backend.state()
+        return found
 
     bodies, effects, rollouts = movers(world), dict[Pair, float](), 2
     try:

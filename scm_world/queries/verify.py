@@ -187,14 +187,17 @@ def _verified(
     series = Series(paired, probes, progress)
     series.run(probe_states(world, probes, seed), watch)
     effects, done = series.effects, series.done
-    found = effects.found(effects.threshold)
+    found = effects.edges(set(declared))
     interrupted = done < probes and (bool(watch.missing) or done < least)
-    left = {*found, *declared} - (found & set(declared))
-    again: set[EdgeKey] = set()
-    held_out = 0
-    if generated and left and not interrupted:
-        again, held_out = _held_out(world, left, seed, effects, watch, done)
-        found, interrupted = found | again, held_out < HELD_OUT
+    open_ = found.symmetric_difference(declared)
+    held_out: Series | None = None
+    if generated and open_ and not interrupted:
+        causes = {cause for cause, _, _ in open_}
+        held_out = _held_out(world, causes, seed, lambda new, more: watch(new, done + more))
+        interrupted = held_out.done < HELD_OUT
+        effects.take(held_out.effects, done)
+        found = effects.edges(set(declared))
+    again = None if held_out is None else held_out.effects.edges(set(declared))
     colors = {edge for edge in {*found, *declared} if _is_color(edge[0]) and edge[1] in measured}
     local = None if interrupted else _local(world, seed)
     return Verification(
@@ -204,7 +207,7 @@ def _verified(
         seed=seed,
         generated=generated,
         probes=done,
-        held_out=held_out,
+        held_out=0 if held_out is None else held_out.done,
         planned=probes,
         interrupted=interrupted,
         rollouts=effects.rollouts,
@@ -215,7 +218,7 @@ def _verified(
         fired=tuple(_fired(key, effects, watch) for key in sorted(found & set(declared))),
         never_fired=tuple(sorted(set(declared) - found)),
         undeclared=tuple(
-            _undeclared(key, effects, key in again if held_out else None)
+            _undeclared(key, effects, None if again is None else key in again)
             for key in sorted(found - set(declared))
         ),
         colors=tuple(sorted(colors)),
@@ -226,38 +229,25 @@ def _verified(
 
 
 def _held_out(
-    world: World,
-    left: Collection[EdgeKey],
-    seed: int,
-    effects: Effects,
-    watch: _Watch,
-    done: int,
-) -> tuple[set[EdgeKey], int]:
-    """Look again for what was left open, in probe states of another seed.
+    world: World, causes: Collection[str], seed: int, watch: Callable[[Effects, int], bool]
+) -> Series:
+    """Experiment with some causes again, in probe states of another seed.
 
     Args:
         world: To experiment with.
-        left: Declared edges that were never seen, and others that were.
+        causes: Of the edges that were left open.
         seed: Of the first probe states.
-        effects: What was seen in these; what is new is added.
-        watch: Is told of the edges that are seen now.
-        done: How many probe states there were.
-
-    Returns:
-        The edges that were seen now, of all causes that were experimented with, and the number
-        of probe states.
+        watch: Told what was seen, after each probe state.
     """
-    causes = {cause for cause, _, _ in left}
     series = Series(Paired(world, seed + OTHER, causes=causes), HELD_OUT)
 
-    def told(new: Effects, count: int) -> bool:
-        watch(new, done + count)
+    def told(effects: Effects, done: int) -> bool:
+        watch(effects, done)
         return False
 
     with contextlib.suppress(KeyboardInterrupt):
         series.run(probe_states(world, HELD_OUT, seed + OTHER), told)
-    effects.take(series.effects, done)
-    return series.effects.found(effects.threshold), series.done
+    return series
 
 
 def _local(world: World, seed: int) -> LocalShare | None:

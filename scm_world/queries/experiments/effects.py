@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass, field, replace
 from typing import final
 
@@ -13,7 +14,7 @@ EdgeKey = tuple[str, str, int]
 """Cause, effect, lag."""
 
 RESOLUTION = 1e-12
-"""Differences below it count as none, where the floor is zero; of generated graphs, all count."""
+"""Differences below it are not told from rounding, where the floor itself is exactly zero."""
 
 FACTOR = 10.0
 """How far above the floor an effect must lie."""
@@ -59,9 +60,9 @@ class Effects:
     Attributes:
         largest: By cause, effect and lag.
         settings: Where the largest effect of each pair was seen, if it is not zero.
-        states: In how many probe states each pair answered at all.
+        states: In how many probe states each pair answered, beyond rounding.
         floor: Largest difference after something was done and undone.
-        resolution: An effect must exceed it, however small the floor is.
+        exact: Whether any difference counts, rounding too, where no edge is declared.
         undone: Targets that were changed and put back.
         rollouts: Control steps simulated in an experiment of their own.
         refused: Targets for which no feasible value was found, with how often.
@@ -73,7 +74,7 @@ class Effects:
     settings: dict[EdgeKey, Setting] = field(default_factory=dict)
     states: dict[EdgeKey, int] = field(default_factory=dict)
     floor: float = 0.0
-    resolution: float = RESOLUTION
+    exact: bool = False
     undone: set[str] = field(default_factory=set)
     rollouts: int = 0
     refused: dict[str, int] = field(default_factory=dict)
@@ -88,10 +89,10 @@ class Effects:
             self.largest[key] = size
             if size > 0.0 and self.setting is not None:
                 self.settings[key] = self.setting
-        if size > 0.0:
+        if size > RESOLUTION:
             self._answered.add(key)
-            if self.responses is not None:
-                self._respond(self.responses, key, np.ravel(after), np.ravel(before))
+        if self.responses is not None and size > 0.0:
+            self._respond(self.responses, key, np.ravel(after), np.ravel(before))
 
     def see_nothing(self, cause: str, effect: str, lag: int) -> None:
         """Remember that a pair was looked at, and that nothing differed."""
@@ -135,11 +136,20 @@ class Effects:
     @property
     def threshold(self) -> float:
         """What an effect must exceed, given the floor."""
-        return max(FACTOR * self.floor, self.resolution)
+        return max(FACTOR * self.floor, RESOLUTION)
 
     def found(self, threshold: float) -> set[EdgeKey]:
         """List the pairs whose effect exceeds a threshold."""
         return {key for key, size in self.largest.items() if size > threshold}
+
+    def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
+        """List the edges that were seen: declared ones beyond rounding, and others."""
+        least = FACTOR * self.floor if self.exact else self.threshold
+        return {
+            key
+            for key, size in self.largest.items()
+            if size > (self.threshold if key in declared else least)
+        }
 
     def copy(self) -> Effects:
         """Keep what was seen so far."""

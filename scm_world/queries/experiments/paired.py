@@ -21,7 +21,6 @@ from scm_world._types import Floats, Value, Values
 from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import (
-    RESOLUTION,
     EdgeKey,
     Effects,
     Response,
@@ -111,7 +110,7 @@ class Paired:
         kept: dict[tuple[EdgeKey, int], Response] = {}
         self.effects = Effects(
             responses=kept if responses else None,
-            resolution=0.0 if world.task.generated_graph else RESOLUTION,
+            exact=world.task.generated_graph,
         )
         model = world.model
         self.targets = tuple(

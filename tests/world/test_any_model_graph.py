@@ -1,0 +1,184 @@
+"""Graphs that were generated from models nobody here wrote hold to the last bit."""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scm_world import World, discover, verify
+from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import probes
+from scm_world.queries.verification import Verification
+
+FOLDERS = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "robosuite": "models/assets"}
+
+FAST = (
+    "gymnasium/inverted_double_pendulum.xml",
+    "gymnasium/reacher.xml",
+    "gymnasium/half_cheetah.xml",
+    "dm_control/cartpole.xml",
+    "dm_control/ball_in_cup.xml",
+)
+SLOW = (
+    "gymnasium/pusher.xml",
+    "gymnasium/ant.xml",
+    "gymnasium/hopper.xml",
+    "gymnasium/humanoid.xml",
+    "gymnasium/swimmer.xml",
+    "gymnasium/walker2d_v5.xml",
+    "dm_control/acrobot.xml",
+    "dm_control/cheetah.xml",
+    "dm_control/finger.xml",
+    "dm_control/fish.xml",
+    "dm_control/humanoid.xml",
+    "dm_control/manipulator.xml",
+    "dm_control/point_mass.xml",
+    "robosuite/robots/panda/robot.xml",
+    "robosuite/robots/baxter/robot.xml",
+    "robosuite/robots/ur5e/robot.xml",
+)
+
+
+def asset(name: str) -> str:
+    """Find a model file of an installed package; the test is skipped where it is not."""
+    package, _, rest = name.partition("/")
+    found = importlib.util.find_spec(package)
+    if found is None or found.origin is None:
+        pytest.skip(f"{package} is not installed")
+    return str(Path(found.origin).parent / FOLDERS[package] / rest)
+
+
+def holds(found: Verification) -> None:
+    """Check that nothing but declared edges showed, and that undoing left no trace."""
+    assert found.floor == 0.0
+    assert found.undeclared == ()
+    assert found.untried == ()
+    assert found.passed
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_nothing_undeclared_shows(name: str) -> None:
+    """From four drawn states, and eight of another seed, whatever differs has an edge."""
+    found = verify(World(asset(name)), least=4)
+    holds(found)
+    assert found.share > 0.7
+    assert found.generated
+    assert (found.probes, found.held_out) == (4, 8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SLOW)
+def test_nothing_undeclared_shows_in_larger_models(name: str) -> None:
+    """Likewise, from sixteen states."""
+    holds(verify(World(asset(name))))
+
+
+def test_the_first_graph_of_a_file_takes_seconds() -> None:
+    """From the file of a cart-pole to a verified graph."""
+    started = time.perf_counter()
+    path = asset("dm_control/cartpole.xml")
+    world = World(path)
+    report, found = discover(world, probes=16), verify(world)
+    assert time.perf_counter() - started < 15.0
+    assert report.floor == found.floor == 0.0
+    assert set(report.found) <= set(report.declared) == set(found.declared)
+    assert set(found.found) <= set(found.declared)
+    assert found.seconds < 15.0
+
+
+# --- what shows where -----------------------------------------------------------------------------
+
+TWO = """
+<mujoco model="two">
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1"/>
+    <body name="one" pos="0 0 .2"><freejoint/><geom name="one" size=".1" mass="1"/></body>
+    <body name="other" pos="0 .4 .2"><freejoint/><geom name="other" size=".1" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def two() -> Verification:
+    """Verify two balls on a floor."""
+    return verify(World.from_mjcf(TWO))
+
+
+def test_what_touches_acts(two: Verification) -> None:
+    """Each ball acts on the other one in some states, on itself in all."""
+    states = {edge.key: edge.states for edge in two.fired}
+    between = states["one.mass", "other.linear_velocity", 1]
+    alone = states["one.linear_velocity", "one.cartesian_position", 1]
+    assert 0 < between < alone == two.probes + (two.held_out if between else 0) or alone >= 16
+
+
+def test_an_edge_that_never_shows_is_a_finding() -> None:
+    """The mass of what falls freely moves nothing: that is told, and no failure."""
+    falls = TWO.replace('<geom name="floor" type="plane" size="5 5 .1"/>', "")
+    found = verify(World.from_mjcf(falls.replace("size=", 'contype="0" size=')), least=4)
+    assert ("one.mass", "one.linear_velocity", 1) in found.never_fired
+    assert ("gravity", "one.linear_velocity", 1) in {edge.key for edge in found.fired}
+    assert found.held_out > 0
+    assert found.passed
+    assert "never seen" in str(found)
+
+
+def test_probe_states_of_a_model_do_not_depend_on_how_many() -> None:
+    """Probe i of a seed is the same in a longer run, a later one, and another world."""
+    world = World.from_mjcf(TWO)
+    long = list(probes(world, 8, 5))
+    kinds = [probe.kind for probe in long]
+    assert kinds[:4] == ["start", "touching", "onward, touching", "anywhere"]
+    for again in (list(probes(world, 3, 5)), list(probes(World.from_mjcf(TWO), 3, 5))):
+        for one, other in zip(long, again, strict=False):
+            assert _state(world, one.snapshot) == _state(world, other.snapshot)
+    (late,) = probes(world, 7, 5, first=6)
+    assert _state(world, late.snapshot) == _state(world, long[6].snapshot)
+
+
+def _state(world: World, snapshot: object) -> bytes:
+    world.restore(snapshot)  # type: ignore[arg-type]
+    return world.current()[1].vector.tobytes()
+
+
+def test_some_probe_states_have_other_parameters() -> None:
+    """Values of declared spaces, or near those of the file."""
+    spaces = {"one.mass": {"a": (2.0, 3.0), "b": (4.0, 5.0)}}
+    world = World.from_mjcf(TWO, spaces=spaces)
+    masses = {"one.mass": set(), "other.mass": set()}  # type: dict[str, set[float]]
+    for probe in probes(world, 24, 0):
+        world.restore(probe.snapshot)
+        for name, found in masses.items():
+            found.add(float(world[name]))
+        if "others" not in probe.kind:
+            assert world["one.mass"] == world["other.mass"] == 1.0
+    assert len(masses["one.mass"]) > 2
+    assert all(m == 1.0 or 2.0 <= m <= 5.0 for m in masses["one.mass"])
+    assert all(0.8 <= m <= 1.2 for m in masses["other.mass"])
+
+
+def test_an_action_without_bounds_is_varied() -> None:
+    """Each actuator is moved by itself, and its effects are its own."""
+    arms = "".join(
+        f'<body name="{n}" pos="{x} 0 0"><joint name="{n}" axis="0 1 0"/>'
+        '<geom size=".01" fromto="0 0 0 0 0 .5" type="capsule"/></body>'
+        for n, x in (("left", -2), ("right", 2))
+    )
+    motors = "".join(f'<motor name="{n}_motor" joint="{n}"/>' for n in ("left", "right"))
+    world = World.from_mjcf(
+        f"<mujoco><worldbody>{arms}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+    paired = Paired(world, 0, causes=("left_motor.control",))
+    for number, probe in enumerate(probes(world, 2, 0)):
+        paired.run(number, probe)
+    assert paired.targets == ()
+    assert paired.actions == ("left_motor.control",)
+    moved = {effect for cause, effect, _ in paired.effects.found(0.0)}
+    assert moved == {"left.position", "left.velocity"}
+    assert all(np.isfinite(size) for size in paired.effects.largest.values())
