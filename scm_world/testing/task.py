@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Value
 from scm_world.entities import SENSOR_NOISE
 from scm_world.errors import Infeasible
 from scm_world.graph import from_json, to_json
@@ -83,16 +83,13 @@ class TaskConformance(WorldConformance):
             source = variable.space(space)
             if source is None:
                 continue
-            target = world.model.declared(world.model.target(variable.name))
+            targets = world.model.targets(variable.name)
             for episode in range(20):
-                value = noise.draw(source, variable.name, variable.shape, values, episode=episode)[
-                    0
-                ]
-                assert variable.in_space(value, space, values), variable.name
-                if target is not variable:
-                    value = np.asarray(_inverse(variable)(value))
-                bounds = target.bounds
-                assert bounds is None or bounds.contains(value, values), variable.name
+                drawn = noise.draw(source, variable.name, variable.shape, values, episode=episode)
+                assert variable.in_space(drawn[0], space, values), variable.name
+                for target, value in zip(targets, _meant(variable, drawn[0]), strict=True):
+                    bounds = world.model.declared(target).bounds
+                    assert bounds is None or bounds.contains(value, values), variable.name
 
     def test_the_model_survives_json(self, world: World) -> None:
         """Written and read again it is the same model."""
@@ -259,6 +256,12 @@ def _moves_differently(world: World, before: WorldSnapshot) -> bool:
     return bool(ends[0] != ends[1])
 
 
-def _inverse(variable: Variable) -> Any:
-    inverse: Any = getattr(variable, "inverse", None)
-    return inverse.bind()
+def _meant(variable: Variable, value: Value) -> tuple[Value, ...]:
+    """Give the values of the quantities that a value in other coordinates, or a bundle, means."""
+    meant: Any = variable
+    if variable.parts:
+        parts: tuple[Value, ...] = meant.mechanism.split(value)
+        return parts
+    if getattr(variable, "inverse", None) is not None:
+        return (np.asarray(meant.inverse.bind()(value)),)
+    return (value,)

@@ -21,8 +21,9 @@ def quantities(world: World) -> list[str]:
         name
         for name in model
         if model.declared(name).settable
+        and model.declared(name).role != "action"
         and model.target(name) == name
-        and name not in ("action", CONTROL_INDEX)
+        and name != CONTROL_INDEX
     ]
 
 

@@ -105,10 +105,10 @@ def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
         act: Which has been checked.
     """
     parts = variable.parts
-    mechanism: Any = getattr(variable, "mechanism", None)
+    if not parts:
+        return {variable.name: act}
+    mechanism: Any = variable.mechanism  # type: ignore[attr-defined]
     match act:
-        case _ if not parts:
-            return {variable.name: act}
         case Draw() | Mechanism():
             return dict.fromkeys(parts, act.model_copy(update={"of": variable.name}))
         case Hard(value=numbers) | Shift(by=numbers) | Scale(by=numbers):
@@ -119,6 +119,6 @@ def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
             return dict.fromkeys(parts, act)
 
 
-def whole_of(act: Intervention, name: str) -> str:
+def whole_of(act: Any, name: str) -> str:
     """Name the bundle that an intervention is a part of; the variable itself if there is none."""
-    return getattr(act, "of", None) or name
+    return (isinstance(act, Draw | Mechanism) and vars(act).get("of")) or name

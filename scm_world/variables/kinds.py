@@ -126,10 +126,7 @@ class Variable(Frozen):
 
         An intervention on a bundle is one on each of its parts.
         """
-        mechanism = getattr(self, "mechanism", None)
-        if not isinstance(mechanism, Concatenation):
-            return ()
-        return tuple(parent.name for parent in self.all_parents)
+        return ()
 
     @property
     def role(self) -> Role:
@@ -264,6 +261,11 @@ class Derived(Variable):
         """The edges into this variable."""
         return self.parents
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parents of a bundle; nothing for other variables."""
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
+
     @model_validator(mode="after")
     def _fits(self) -> Derived:
         if self.inverse is not None and len(self.parents) != 1:
@@ -306,6 +308,11 @@ class Measured(Variable):
     def all_parents(self) -> tuple[Parent, ...]:
         """The edges into this variable."""
         return self.parents
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parents of a bundle; nothing for other variables."""
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
 
     @property
     def role(self) -> Role:

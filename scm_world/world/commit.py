@@ -242,7 +242,7 @@ def commit(
     before = dict(world.current()[0])
     moved_before = {}
     if change.state is not None:
-        states = (name for name in world.slices if not world.model.declared(name).parts)
+        states = (name for name in world.slices if name not in world.declaration.bundles)
         moved_before = {name: np.array(before[name]) for name in states}
     declaration, index, state = world.declaration, world.index, world.current()[1].copy()
     model, static = world.graph, {name: before[name] for name in declaration.static_names}
@@ -357,18 +357,17 @@ def _report(
     for name in proposal.asked:
         applied, back = _asked(world, proposal, name)
         entries[name] = Applied(name, flat[name], applied, back)
-    parts = {target for name in entries for target in world.model.declared(name).parts}
+    bundles = world.declaration.bundles
+    known = {*entries, *(part for name in entries if name in bundles for part in bundles[name])}
     followed = {
         name: (before[name], value)
         for name, value in proposal.static.items()
         if value is not before.get(name, value)
-        and name not in entries
-        and name not in parts
+        and name not in known
         and not _same(value, before[name])
     }
     for name, old in moved_before.items():
-        known = name in entries or name in parts
-        if name in now and not known and not same(old, now[name]):
+        if name in now and name not in known and not same(old, now[name]):
             followed[name] = (old, np.array(now[name]))
     engine = {
         body: (old, world.backend.inertia(body.removesuffix(".inertia")))

@@ -99,7 +99,8 @@ class Declaration:
             there one after another.
         whole: States that are whole numbers.
         actions: Where each action stands in the vector of all actions.
-        commanded: The same, with the bundles of actions.
+        bundles: The parts of each bundle.
+        commanded: Where each action stands, with the bundles of actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
         computed: Variables that are computed from what moves, causes before effects.
@@ -118,9 +119,10 @@ class Declaration:
         for action in (v for v in self.model.variables if isinstance(v, Action)):
             first = self.n_actions
             self.actions[action.name] = slice(first, first + int(np.prod(action.shape)))
-        self.commanded = {**self.actions, **_in_a_row(self.model, self.actions)}
+        self.bundles = {v.name: v.parts for v in self.model.variables if v.parts}
+        self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
         states = self.composition.slices()
-        self.slices = {**states, **_in_a_row(self.model, states)}
+        self.slices = {**states, **_in_a_row(self.bundles, states)}
         self._places = [
             (name, where, self.model.declared(name).shape) for name, where in self.slices.items()
         ]
@@ -239,12 +241,14 @@ class Declaration:
         return Scene(structure, parameters, state, made.goals(values), made.light(values))
 
 
-def _in_a_row(model: SCM, places: Mapping[str, slice]) -> dict[str, slice]:
+def _in_a_row(
+    bundles: Mapping[str, tuple[str, ...]], places: Mapping[str, slice]
+) -> dict[str, slice]:
     """Give the place of each bundle whose parts stand one after another in a vector."""
     found: dict[str, slice] = {}
-    for variable in model.variables:
-        parts = [places[name] for name in variable.parts if name in places]
-        whole = bool(parts) and len(parts) == len(variable.parts)
-        if whole and all(one.stop == other.start for one, other in pairwise(parts)):
-            found[variable.name] = slice(parts[0].start, parts[-1].stop)
+    for name, parts in bundles.items():
+        there = [places[part] for part in parts if part in places]
+        whole = len(there) == len(parts)
+        if whole and all(one.stop == other.start for one, other in pairwise(there)):
+            found[name] = slice(there[0].start, there[-1].stop)
     return found

@@ -9,7 +9,7 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.entities import CONTROL_INDEX
-from scm_world.errors import InterventionError, WrongShape
+from scm_world.errors import InterventionError, NotFinite, OutOfBounds, WrongShape
 from scm_world.graph import Moment
 from scm_world.variables import (
     SOFT,
@@ -30,7 +30,7 @@ from scm_world.world.compare import same
 from scm_world.world.following import followed, refuse_continuous, what_follows
 
 if TYPE_CHECKING:
-    from scm_world.world.proposal import Instant
+    from scm_world.world.proposal import Accepted, Instant
 
 Requests = dict[str, tuple[str, Intervention]]
 """By target: the name that was asked for (the target, or coordinates of it) and the act."""
@@ -51,7 +51,7 @@ class Draft:
     def __init__(
         self,
         instant: Instant,
-        accepted: Requests,
+        accepted: Accepted,
         requests: Requests,
         moment: Moment,
         earlier: Draft | None,
@@ -284,13 +284,13 @@ class Draft:
             return self._world.view(name, self.instant.state)
         return self.instant.static[name]
 
-    def check(self, asked: tuple[str, ...], space: AnyRegion | None) -> list[InterventionError]:
+    def check(self, space: AnyRegion | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
         problems = self._problems
         if space is None or problems:
             return problems
         context = self._context()
-        for name in asked:
+        for name in self.accepted.asked:
             requested = self._world.model.declared(name)
             try:
                 value = self._held(name) if self._is_action(name) else self._coordinates(name)
@@ -298,6 +298,24 @@ class Draft:
             except InterventionError as problem:
                 problems.append(problem)
         return problems
+
+    def as_asked(self, problems: list[InterventionError]) -> list[InterventionError]:
+        """Say of a bundle, if that was asked for, what is wrong with its parts."""
+        found = list(problems)
+        for name in self.accepted.asked:
+            bundle = self._world.model.declared(name)
+            wrong = {p.variable: p for p in found if isinstance(p, OutOfBounds | NotFinite)}
+            if wrong.keys().isdisjoint(bundle.parts):
+                continue
+            parts = [
+                np.asarray(wrong[p].value) if p in wrong else self._value(p) for p in bundle.parts
+            ]
+            try:
+                check_bounds(bundle, self._world.in_coordinates(name, *parts), self.static)
+            except InterventionError as problem:
+                found = [p for p in found if p not in [wrong.get(part) for part in bundle.parts]]
+                found.append(problem)
+        return found
 
     def _context(self) -> Values:
         return {**self.static, **self._world.states(self.state)}
@@ -307,7 +325,7 @@ class Draft:
 
     def _held(self, name: str) -> Value:
         """Give the action that is to be taken from now on."""
-        acts = [self.accepted[target][1] for target in self._world.model.targets(name)]
+        acts = [self.accepted.requests[target][1] for target in self._world.model.targets(name)]
         if all(isinstance(act, Hard) for act in acts):
             values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
             return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])

@@ -10,7 +10,7 @@ import numpy as np
 from scm_world._types import Value, Values
 from scm_world.errors import InterventionError
 from scm_world.graph import SCM
-from scm_world.variables import Intervention, Mechanism, Variable
+from scm_world.variables import Intervention, Mechanism, Variable, whole_of
 from scm_world.variables.checks import coerce
 
 if TYPE_CHECKING:
@@ -35,10 +35,11 @@ def refuse_continuous(
         if target in actions:
             moving, who, what = [p.name for p in act.parents if p.lag], "an action", "the present"
         if moving:
+            asked = whole_of(act, name)
             raise InterventionError(
-                f"do({name}): {who} can follow {what} only, not {', '.join(moving)}; let a plan "
+                f"do({asked}): {who} can follow {what} only, not {', '.join(moving)}; let a plan "
                 "set it step by step instead",
-                variable=name,
+                variable=asked,
                 value=act,
             )
 

@@ -24,7 +24,7 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.draft import Draft, Requests
 from scm_world.world.restructure import restructured
 
-__all__ = ["Instant", "Proposal", "Requests", "accept", "propose"]
+__all__ = ["Accepted", "Instant", "Proposal", "Requests", "accept", "propose"]
 
 if TYPE_CHECKING:
     from scm_world.world.declaration import Declaration
@@ -86,9 +86,23 @@ class Proposal:
     draft: Draft | None = None
 
 
-def accept(
-    instant: Instant, request: Mapping[str, Any]
-) -> tuple[Requests, list[InterventionError]]:
+@final
+@dataclass(frozen=True)
+class Accepted:
+    """A request that was checked by itself.
+
+    Attributes:
+        requests: What is right in it.
+        asked: The names that this was asked under.
+        problems: What is wrong in it.
+    """
+
+    requests: Requests
+    asked: tuple[str, ...]
+    problems: list[InterventionError]
+
+
+def accept(instant: Instant, request: Mapping[str, Any]) -> Accepted:
     """Check names, types and shapes; keep what is right and list what is wrong.
 
     What is asked of a bundle is asked of its parts.
@@ -104,10 +118,11 @@ def accept(
             continue  # it is there
         try:
             act = _accept(instant, name, value)
-            for target in model.targets(name):
-                if target in asked:
-                    raise ConflictingTargets((asked[target], name), target)
-                asked[target] = name
+            targets = model.targets(name)
+            twice = next((target for target in targets if target in asked), None)
+            if twice is not None:
+                raise ConflictingTargets((asked[twice], name), twice)
+            asked |= dict.fromkeys(targets, name)
             for part, own in divided(model.declared(name), act).items():
                 accepted[model.target(part)] = (part, own)
         except InterventionError as problem:
@@ -115,7 +130,7 @@ def accept(
             if reason is not None and isinstance(problem, UnknownVariable):
                 problem = NotIntervenable(name, reason)
             problems.append(problem)
-    return accepted, problems
+    return Accepted(accepted, tuple(dict.fromkeys(asked.values())), problems)
 
 
 def _accept(instant: Instant, name: str, value: Any) -> Intervention:
@@ -161,23 +176,19 @@ def propose(
     moment = replace(world.moment(instant.index), attempt=attempt, kept=kept)
     earlier = None if last is None or _restructures(world, request) else last.draft
     instant = earlier.instant if earlier else restructured(world.family, instant, request, moment)
-    accepted, problems = (earlier.accepted, []) if earlier else accept(instant, request)
-    requests: Requests = {**instant.requests, **accepted}
+    accepted = earlier.accepted if earlier else accept(instant, request)
+    problems = [*accepted.problems]
+    requests: Requests = {**instant.requests, **accepted.requests}
     model = instant.declaration.model
     # What was asked of bodies that are gone waits for them, should they come back at once.
     mine = {t: act for t, act in requests.items() if t in model}
-    asked = tuple(
-        name
-        for name in flatten(request)
-        if name in model and all(target in accepted for target in model.targets(name))
-    )
     draft = Draft(instant, accepted, mine, moment, earlier)
     with np.errstate(all="ignore"):  # what is not finite is refused by name
         draft.solve_parameters()
         if not (draft.is_impossible and len(world.family.head)):
             problems += draft.set_states()  # else bodies and layouts may not go together
-        problems += draft.check(asked, space)
-    raise_all(problems)
+        problems += draft.check(space)
+    raise_all(draft.as_asked(problems) if problems else problems)
     nulls = {n: (n, act) for n, act in flatten(request).items() if isinstance(act, Null)}
     frozen: Requests = {
         target: draft.frozen(target, *named) if target in model else named
@@ -190,7 +201,7 @@ def propose(
         draft.state,
         draft.index,
         frozen,
-        asked,
+        accepted.asked,
         draft,
     )
 

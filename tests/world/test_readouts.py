@@ -16,7 +16,7 @@ from scm_world.geometry.direct import direct
 from scm_world.tasks import TASKS
 from scm_world.tasks.building import filled
 from scm_world.tasks.reaching import minus_norm
-from scm_world.variables import Linear
+from scm_world.variables import Concatenation, Linear
 from scm_world.variables.mechanisms import Stacked
 
 
@@ -30,7 +30,7 @@ def test_a_control_step_evaluates_compiled_functions_only(task: str) -> None:
         function = mechanism.bind()
         function = function.func if isinstance(function, partial) else function
         kernel = function.kernel if isinstance(function, Stacked) else function
-        assert isinstance(mechanism, Linear) or is_jitted(kernel), name
+        assert isinstance(mechanism, Linear | Concatenation) or is_jitted(kernel), name
 
 
 def test_every_readout_is_that_of_the_model() -> None:

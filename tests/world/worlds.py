@@ -107,7 +107,7 @@ def other(world: World, name: str) -> np.ndarray:
     if quantity in _PLACES:
         return _PLACES[quantity]
     if quantity in _MOVES:
-        return world[name] + _MOVES[quantity]
+        return world[name] + np.resize(_MOVES[quantity], world[name].shape)
     variable, present = world.model.declared(name), world[name]
     if isinstance(variable.bounds, Categories):
         return np.array(next(m for m in variable.bounds.members if m != present))
@@ -122,7 +122,8 @@ def other(world: World, name: str) -> np.ndarray:
 def settable(world: World) -> list[str]:
     """Name everything that do accepts, but for the action."""
     model = world.model
-    return [n for n in model if model.declared(model.target(n)).settable and n != "action"]
+    quantities = ((name, model.declared(model.target(name))) for name in model)
+    return [name for name, one in quantities if one.settable and one.role != "action"]
 
 
 def story(backend: str, task: str) -> str:
