@@ -97,7 +97,21 @@ def make_backend(name: str) -> Backend:
 
 
 def read_model(source: Any, **options: Any) -> Model:
-    """Read a model from a file; see ``scm_world.backends.mujoco.reading.read_model``."""
+    """Read a model from a file; see ``scm_world.backends.mujoco.reading.read_model``.
+
+    Raises:
+        MissingEngine: MuJoCo, which reads the files for all engines, is not installed.
+        UnreadableFile: There is no such file, or it is no text.
+        ModelError: It is no model, or one that cannot be a causal model.
+
+    Example:
+        >>> ball = "<body name='ball'><freejoint/><geom size='0.1'/></body>"
+        >>> read_model(f"<mujoco><worldbody>{ball}</worldbody></mujoco>").layout.names[:2]
+        ('ball.cartesian_position', 'ball.orientation')
+    """
+    from scm_world.backends.mujoco import check_installation
+
+    check_installation()
     from scm_world.backends.mujoco.reading import read_model as read
 
     return read(source, **options)

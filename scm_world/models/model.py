@@ -75,7 +75,7 @@ class Parameter(Row):
 @final
 @dataclass(frozen=True)
 class StateRow(Row):
-    """Something that physics moves. ``always`` and ``contact`` contain its own tree.
+    """Something that physics moves. Its own tree is in ``always``.
 
     Attributes:
         tree: Number of the kinematic tree it belongs to.

@@ -61,14 +61,15 @@ def model_file(name: str) -> Path:
 
 
 def arrays(mj: mujoco.MjModel) -> dict[str, bytes]:
-    """Copy all numbers of a compiled model, as bytes."""
+    """Copy all numbers of a compiled model but the paths of its files, as bytes."""
     parts = {"": mj, "opt.": mj.opt, "stat.": mj.stat}
     return {
         f"{prefix}{name}": np.asarray(getattr(part, name)).tobytes()
         for prefix, part in parts.items()
         for name in dir(part)
         if not name.startswith("_")
-        and name not in ("signature", "paths", "mesh_pathadr")
+        and name not in ("signature", "nbuffer")
+        and "path" not in name
         and isinstance(getattr(part, name), np.ndarray | float | int)
     }
 
