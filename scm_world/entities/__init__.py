@@ -3,7 +3,7 @@
 from scm_world.entities.base import PRESET_NAMES, BlockWorld, Commands, Composition, Entity, State
 from scm_world.entities.blocks import ToolBlock, block_mass, block_size
 from scm_world.entities.goals import GoalBlock, GoalSphere, goal_orientation, goal_position
-from scm_world.entities.looks import Looks, cameras
+from scm_world.entities.looks import Looks
 from scm_world.entities.obstacles import Obstacle
 from scm_world.entities.robot import ACTIONS, ACTUATOR_NOISE, RESOLUTIONS, Robot
 from scm_world.entities.stage import CONTROL_INDEX, SENSOR_NOISE, Clock, Stage
@@ -30,7 +30,6 @@ __all__ = [
     "ToolBlock",
     "block_mass",
     "block_size",
-    "cameras",
     "goal_orientation",
     "goal_position",
 ]

@@ -20,6 +20,7 @@ from scm_world.models import (
 )
 from scm_world.scene import PRESETS, preset
 from scm_world.scene import Structure as SceneStructure
+from scm_world.scene.camera import Camera
 from scm_world.scene.feasibility import Overlap, overlaps
 from scm_world.scene.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.variables import Function, Measured, Parent, Space, Variable
@@ -153,6 +154,10 @@ class Entity(ABC):  # every hook has a sensible empty default
         """Describe the light that this entity is, if it is one."""
         return None
 
+    def cameras(self, values: Values) -> tuple[Camera, ...]:
+        """Describe the cameras that this entity is."""
+        return ()
+
     def commands(self) -> Commands | None:
         """Give what turns actions into commands, if this entity does."""
         return None
@@ -234,6 +239,10 @@ class Composition(ABC):
     def light(self, values: Values) -> Light:
         """Describe the light of pictures."""
         return Light()
+
+    def cameras(self, values: Values) -> tuple[Camera, ...]:
+        """Describe the cameras whose places are variables."""
+        return tuple(camera for entity in self.entities for camera in entity.cameras(values))
 
 
 @final

@@ -83,6 +83,18 @@ class Looks(Entity):
         x, y, z = values["light_direction"].tolist()
         return Light((x, y, z), float(values["light_ambient"]))
 
+    def cameras(self, values: Values) -> tuple[Camera, ...]:
+        """Describe the three cameras, with pictures of 128 x 128 pixels."""
+        return tuple(
+            camera_from(
+                camera.name,
+                values[f"camera_{camera.name}.position"],
+                values[f"camera_{camera.name}.orientation"],
+                float(values[f"camera_{camera.name}.field_of_view"]),
+            )
+            for camera in CAMERAS
+        )
+
 
 def _turned(camera: str, usual: Floats) -> Variable:
     """Declare the orientation of a camera as a rotation vector, near the usual one [rad]."""
@@ -99,17 +111,4 @@ def _turned(camera: str, usual: Floats) -> Variable:
         mechanism=to_rotation_vector,
         inverse=from_rotation_vector,
         doc="Orientation as a rotation vector; setting it sets the quaternion.",
-    )
-
-
-def cameras(values: Values) -> tuple[Camera, ...]:
-    """Describe the three cameras, with pictures of 128 x 128 pixels."""
-    return tuple(
-        camera_from(
-            camera.name,
-            values[f"camera_{camera.name}.position"],
-            values[f"camera_{camera.name}.orientation"],
-            float(values[f"camera_{camera.name}.field_of_view"]),
-        )
-        for camera in CAMERAS
     )

@@ -23,9 +23,9 @@ from scm_world.env.start import asked, begin, beginning_structure
 from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, ModelError, UnknownOption
+from scm_world.geometry.clipping import scaled_clip_kernel
 from scm_world.geometry.direct import direct
 from scm_world.scene.camera import Camera
-from scm_world.scene.kinematics import scaled_clip_kernel
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
@@ -86,6 +86,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         action_mode: One of the task's ``action_modes`` (of the robot's tasks
             ``"joint_positions"``, ``"joint_torques"``, ``"end_effector_positions"``), or one of
             them after ``"delta_"``: see ``DeltaAction``; the first one if None.
+        resolution: One of the task's ``resolutions``: how finely its variables are cut, see
+            ``World``; observations and actions do not depend on it. The first one if None.
         delta_scale: Share of half of the range that the largest relative action stands for.
         delta_origin: Joint positions are relative to the last ``"command"``, or ``"measured"``.
         normalize_actions: Take actions in [-1, 1] instead of SI units.
@@ -143,6 +145,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         preset: str | None = None,
         frame_skip: int | None = None,
         action_mode: str | None = None,
+        resolution: str | None = None,
         delta_scale: float = 1.0,
         delta_origin: str = COMMAND,
         normalize_actions: bool = True,
@@ -184,6 +187,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             backend=backend,
             preset=preset,
             action_mode=mode.removeprefix(PREFIX),
+            resolution=resolution,
             frame_skip=frame_skip,
             max_episode_length=max_episode_length,
             conventions=conventions,

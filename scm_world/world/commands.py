@@ -6,7 +6,7 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
-from scm_world.scene.kinematics import clip_kernel
+from scm_world.geometry.clipping import clip_kernel
 
 
 def clipped(action: ArrayLike, low: Floats, high: Floats, unit: str) -> Floats:

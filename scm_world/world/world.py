@@ -11,7 +11,7 @@ import numpy as np
 from scm_world._types import ArrayLike, Value, Values
 from scm_world.backends import Backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.entities import CONTROL_INDEX, cameras
+from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
 from scm_world.models import Scene, State
@@ -161,9 +161,9 @@ class World(Stepped):
         return self.describe(self._now, self._state.copy())
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Describe the three cameras of the robot as they are now."""
+        """Describe the cameras whose places are variables: the three of the robot."""
         self._require_episode()
-        return cameras(self._now)
+        return self.composition.cameras(self._now)
 
     def reset(
         self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
