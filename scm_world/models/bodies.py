@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, final
 
-from scm_world._types import Floats
 from scm_world.models.scene import ParameterKey
 
 UNIT = 1e-14  # a squared length this near to 1 is taken as it is
@@ -103,7 +102,7 @@ class Geom:
         orientation: The same.
         size: Half edges of a box; radius of a sphere; radius and half length of a capsule (of
             its straight part) or cylinder [m]; nothing of a plane or mesh.
-        vertices: Corners of the convex hull of a mesh, shape (n, 3) [m].
+        vertices: Corners of the convex hull of a mesh [m].
         friction: Sliding coefficient.
         slippery: Whether it asks for contacts without friction.
         priority: The shape with the higher one decides about the friction of a contact.
@@ -115,7 +114,7 @@ class Geom:
     position: Vector
     orientation: Rotation
     size: tuple[float, ...] = ()
-    vertices: Floats | None = None
+    vertices: tuple[Vector, ...] = ()
     friction: float = 1.0
     slippery: bool = False
     priority: int = 0

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scm_world import World
 from scm_world.backends import Backend, make_backend, read_model
 from scm_world.backends.bullet import (
     BulletBackend,
@@ -95,7 +96,12 @@ CHAIN = """
         <joint name="left_2" axis="0 1 1" pos="0.02 0 0" stiffness="2" springref="30"/>
         <joint name="left_3" type="slide" axis="0 0 1" damping="3"/>
         <geom type="capsule" fromto="0 0 0 0.1 0.2 0.3" size="0.03"/>
-        <body name="knob" pos="0.1 0.2 0.3"><geom size="0.05"/></body>
+        <body name="knob" pos="0.1 0.2 0.3">
+          <joint name="knob_1" type="ball" pos="0 0.01 0"/>
+          <joint name="knob_2" type="slide" axis="0 0 1"/>
+          <geom type="box" size="0.05 0.04 0.03" pos="0.02 0.01 0" euler="10 20 30"/>
+          <body name="end" pos="0.1 0 0"><geom size="0.03"/></body>
+        </body>
       </body>
       <body name="right" pos="0.1 -0.2 0">
         <joint name="right" type="ball" pos="0 0.05 0" damping="0.05"/>
@@ -657,6 +663,19 @@ def test_names_and_modes_that_do_not_exist(backend: BulletBackend) -> None:
     backend.build(robot)
     with pytest.raises(UnknownOption, match="joint_positions, joint_torques"):
         backend.step(CONTROLS, np.zeros(9), 1)
+
+
+def test_a_world_leaves_out_what_bullet_lacks() -> None:
+    """Its variables are those that can be set; the others are named as refused."""
+    world = World(described("cartpole"), backend="bullet")
+    world.reset(seed=0)
+    names = {variable.name for variable in world.graph.variables}
+    assert "cart_to_pole.damping" in names
+    assert "cart_to_pole.armature" not in names
+    world.do({"pole.mass": 0.3})
+    assert world.backend.parameters([("pole", "mass")])["pole", "mass"] == 0.3
+    with pytest.raises(NotIntervenable, match="no parameter of bullet"):
+        world.do({"cart_to_pole.armature": 0.3})
 
 
 def test_deviations_are_said() -> None:

@@ -142,6 +142,17 @@ class Client(ABC):
         self._close()
         self.handle = None
 
+    def set_solver(self) -> None:
+        """Set how the engine solves for contacts."""
+        self.engine.setPhysicsEngineParameter(
+            numSolverIterations=SOLVER_ITERATIONS,
+            # An early end, decided for all bodies together, would let bodies act on each other
+            # without touching.
+            solverResidualThreshold=0.0,
+            deterministicOverlappingPairs=1,
+            physicsClientId=self.handle,
+        )
+
     def canonicalize(self, instant: Instant) -> None:
         """Bring about the one world that has these parameters and this state, whatever was before.
 

@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from scm_world._types import Floats
 from scm_world.backends.mujoco.fields import Field, element_names, table
 from scm_world.backends.mujoco.trees import Couplings, disabled
 from scm_world.models.bodies import (
@@ -196,23 +195,23 @@ def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
         _vector(mj.geom_pos[geom]),
         _rotation(mj.geom_quat[geom]),
         tuple(mj.geom_size[geom, :numbers].tolist()),
-        _hull(mj, int(mj.geom_dataid[geom])) if kind == "mesh" else None,
+        _hull(mj, int(mj.geom_dataid[geom])) if kind == "mesh" else (),
         float(mj.geom_friction[geom, 0]),
         bool(mj.geom_condim[geom] == 1),
         int(mj.geom_priority[geom]),
     )
 
 
-def _hull(mj: mujoco.MjModel, mesh: int) -> Floats:
-    """Copy the corners of the convex hull of a mesh, shape (n, 3) [m]."""
+def _hull(mj: mujoco.MjModel, mesh: int) -> tuple[Vector, ...]:
+    """Copy the corners of the convex hull of a mesh [m]."""
     first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
-    vertices: Floats = mj.mesh_vert[first : first + count].astype(np.float64)
+    vertices = mj.mesh_vert[first : first + count].astype(np.float64)
     graph = int(mj.mesh_graphadr[mesh])
     if graph >= 0:  # number of corners and faces, where their edges begin, which vertices they are
         corners = int(mj.mesh_graph[graph])
         numbers = mj.mesh_graph[graph + 2 + corners : graph + 2 + 2 * corners]
         vertices = vertices[numbers]
-    return vertices
+    return tuple(map(_vector, vertices))
 
 
 def _actuator(mj: mujoco.MjModel, actuator: int, name: str) -> Actuator:

@@ -29,7 +29,7 @@ Handle = tuple[int, int]
 MOVING, STATIC = 1, 2
 """Collision groups. What cannot move never touches what cannot move."""
 
-FASTEST = 1e9  # [rad/s] or [m/s]; the engine would cut at 100
+FASTEST = 1e4  # [rad/s] or [m/s]; the engine would cut at 100
 HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much
 GEAR_ERP = 0.2  # share of the error of a coupling that a step takes away
 STRONGEST = 1e9  # [N m] or [N] of a coupling
@@ -191,8 +191,8 @@ def _shape(engine: Any, client: int, geom: Geom) -> int:
             kind, size = engine.GEOM_SPHERE, {"radius": geom.size[0]}
         case "box":
             kind, size = engine.GEOM_BOX, {"halfExtents": list(geom.size)}
-        case "mesh" if geom.vertices is not None:
-            kind, size = engine.GEOM_MESH, {"vertices": geom.vertices.tolist()}
+        case "mesh":  # the engine keeps what it is given for ever: always the same object
+            kind, size = engine.GEOM_MESH, {"vertices": geom.vertices}
         case _:
             kind = engine.GEOM_CAPSULE if geom.kind == "capsule" else engine.GEOM_CYLINDER
             size = {"radius": geom.size[0], "height": 2.0 * geom.size[1]}

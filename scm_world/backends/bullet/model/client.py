@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, final
@@ -10,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Contact
-from scm_world.backends.bullet.client import SOLVER_ITERATIONS, Client
+from scm_world.backends.bullet.client import Client
 from scm_world.backends.bullet.model.build import Built, build, solid
 from scm_world.backends.bullet.model.forces import Forces
 from scm_world.backends.bullet.model.frames import Ball, Frame
@@ -127,14 +128,7 @@ class ModelClient(Client):
 
     def furnish(self) -> None:
         """Set how the engine works; nothing stands in every scene."""
-        self.engine.setPhysicsEngineParameter(
-            numSolverIterations=SOLVER_ITERATIONS,
-            # An early end, decided for all bodies together, would let bodies act on each other
-            # without touching.
-            solverResidualThreshold=0.0,
-            deterministicOverlappingPairs=1,
-            physicsClientId=self.handle,
-        )
+        self.set_solver()
 
     def construct(self, structure: Model, parameters: Values) -> None:
         """Make everything anew, unless only other parameters differ from what is there."""
@@ -150,7 +144,7 @@ class ModelClient(Client):
         )
         self._built = build(self.engine, self.handle, bodies)
         self._find(bodies, self._built, structure.layout.size)
-        self._shares: list[float] = []
+        self._shares = [math.nan] * len(bodies.geoms)
         for number in self._built.bodies:
             self._weigh(number)
         for number in range(len(bodies.joints)):
@@ -170,8 +164,9 @@ class ModelClient(Client):
                 body = bodies.bodies[joint.body]
                 self._frames.append(Frame(multibody, joint.start, body.center, body.axes))
             elif joint.kind == "ball":
-                _, axes = solid(bodies, joint.body)
-                self._ball_joints[number] = Ball(multibody, link, joint.start, axes.tolist())
+                last = max(bodies.joints_of(joint.body)) == number  # the others carry no mass
+                axes = bodies.bodies[joint.body].axes if last else (0.0, 0.0, 0.0, 1.0)
+                self._ball_joints[number] = Ball(multibody, link, joint.start, axes)
             else:
                 found = scalars.setdefault(multibody, Scalars(multibody, [], []))
                 found.links.append(link)
@@ -277,14 +272,13 @@ class ModelClient(Client):
         """Let forces and frictions follow from the parameters."""
         bodies, built = self._bodies, self._built
         numbers = shares(bodies, usual_friction(self._model.bodies))
-        for handle, share, before in zip(
-            built.geoms, numbers, self._shares or [-1.0] * len(numbers), strict=True
-        ):
-            if share != before:
+        for number, (handle, share) in enumerate(zip(built.geoms, numbers, strict=True)):
+            if share != self._shares[number]:
+                self._shares[number] = math.nan  # unknown, should the engine fail
                 self.engine.changeDynamics(
                     *handle, lateralFriction=share, physicsClientId=self.handle
                 )
-        self._shares = numbers
+                self._shares[number] = share
         self._forces = forces = Forces(bodies)
         self._driven_balls = [
             (ball, forces.dofs[number])

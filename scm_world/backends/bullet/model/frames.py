@@ -47,9 +47,14 @@ class Frame:
     def from_engine(
         self, pose: tuple[Numbers, Numbers], twist: tuple[Numbers, Numbers]
     ) -> list[float]:
-        """Turn what the engine has into the state of the body."""
+        """Turn what the engine has into the state of the body, with a quaternion whose w >= 0.
+
+        The engine keeps a matrix: which of two quaternions it makes of it has no meaning.
+        """
         (position, orientation), (linear, spin) = pose, twist
         turn = composed(orientation, self._back)
+        if turn[3] < 0.0:
+            turn = [-part for part in turn]
         arm = rotated(turn, self._center)
         back = (-turn[0], -turn[1], -turn[2], turn[3])
         return [

@@ -113,9 +113,8 @@ def _form(engine: Any, client: int, shape: Shape) -> int:
     """Make a collision shape."""
     form: int
     if isinstance(shape, Hull):
-        corners = [list(corner) for corner in shape.vertices]
-        form = engine.createCollisionShape(
-            engine.GEOM_MESH, vertices=corners, physicsClientId=client
+        form = engine.createCollisionShape(  # it never lets go of a list
+            engine.GEOM_MESH, vertices=shape.vertices, physicsClientId=client
         )
     else:
         form = engine.createCollisionShape(

@@ -9,7 +9,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Contact
-from scm_world.backends.bullet.client import SOLVER_ITERATIONS, Client
+from scm_world.backends.bullet.client import Client
 from scm_world.backends.bullet.trifinger import arena, dynamics, touch
 from scm_world.backends.bullet.trifinger.description import JOINTS
 from scm_world.backends.bullet.trifinger.dynamics import Bodies
@@ -95,14 +95,7 @@ class TriFingerClient(Client):
         floor = arena.add_floor(engine, handle)
         stage = arena.add_stage(engine, handle)
         self.bodies = Bodies(arena.add_robot(engine, handle), floor, stage)
-        engine.setPhysicsEngineParameter(
-            numSolverIterations=SOLVER_ITERATIONS,
-            # An early end, decided for all bodies together, would let bodies act on each other
-            # without touching.
-            solverResidualThreshold=0.0,
-            deterministicOverlappingPairs=1,
-            physicsClientId=handle,
-        )
+        self.set_solver()
 
     def construct(self, structure: Structure, parameters: Values) -> None:
         """Make sure that the obstacles and blocks are there, with their shapes."""
