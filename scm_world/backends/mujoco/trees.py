@@ -56,6 +56,7 @@ class Couplings:
         number = {root: i for i, root in enumerate(self.roots)}
         self._tree = np.array([number.get(int(root), -1) for root in mj.body_rootid])
         self._coupled = _groups(len(self.roots), self._couplings())
+        self._known: dict[Trees, Effect] = {}
 
     @property
     def every(self) -> Trees:
@@ -70,8 +71,11 @@ class Couplings:
 
     def always(self, trees: Iterable[int]) -> Effect:
         """Give the effect of something that acts on some trees in every step."""
-        found = frozenset().union(*(self._coupled[tree] for tree in trees))
-        return found, self._reached(found) - found
+        key = frozenset(trees)
+        if key not in self._known:
+            found = frozenset().union(*{self._coupled[tree] for tree in key})
+            self._known[key] = found, self._reached(found) - found
+        return self._known[key]
 
     def touching(self, trees: Iterable[int]) -> Effect:
         """Give the effect of something that acts on some trees by contact alone."""
@@ -242,7 +246,7 @@ class Couplings:
         return _groups(len(self.roots), links)
 
     def _reached(self, trees: Iterable[int]) -> Trees:
-        return frozenset().union(*(self._islands[tree] for tree in trees))
+        return frozenset().union(*{self._islands[tree] for tree in trees})
 
     # --- couplings -----------------------------------------------------------------------------
 
@@ -385,7 +389,10 @@ def _groups(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
     """Merge what is linked, directly or through others; give the group of each."""
     group = [{i} for i in range(n)]
     for link in links:
-        members = set().union(*(group[i] for i in link))
-        for member in members:
-            group[member] = members
-    return [frozenset(members) for members in group]
+        joined = {id(group[i]): group[i] for i in link}
+        if len(joined) > 1:
+            members = set().union(*joined.values())
+            for member in members:
+                group[member] = members
+    shared = {id(members): frozenset(members) for members in group}
+    return [shared[id(members)] for members in group]
