@@ -158,7 +158,8 @@ class Follow(Part):
         """
         if not situation.due:
             return {}
-        given = self.function.bind()(situation)
+        function: Any = self.function.bind()
+        given = function(situation)
         if given is None:
             return {}
         if not isinstance(given, Mapping):

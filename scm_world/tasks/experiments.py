@@ -39,7 +39,9 @@ class Dice:
 
     def of(self, stream: str, n: int) -> Floats:
         """Draw numbers in [0, 1) that belong to a name, shape (n,)."""
-        return self._noise.uniforms(stream, n=n, episode=self._probe, step=self._attempt)[0]
+        drawn = self._noise.uniforms(stream, n=n, episode=self._probe, step=self._attempt)
+        found: Floats = drawn[0]
+        return found
 
 
 @final
