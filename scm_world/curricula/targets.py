@@ -71,19 +71,26 @@ def matching(declaration: Declaration, patterns: Iterable[str]) -> tuple[str, ..
 
 def settable(declaration: Declaration) -> tuple[str, ...]:
     """List what ``do`` accepts in a structure, without the actions."""
-    model, actions = declaration.model, declaration.actions
+    model, actions = declaration.model, declaration.commanded
     return tuple(n for n in model if model.declared(model.target(n)).settable and n not in actions)
 
 
 def _spaced(declaration: Declaration) -> Iterable[Variable]:
-    """List roots and states that have a space, under one name each."""
+    """List roots and states that have a space, under one name each; bundles, not their parts."""
     model = declaration.model
+    parts = {part for parts in declaration.bundles.values() for part in parts}
     for name in settable(declaration):
+        if name in parts:
+            continue
         variable: Any = model.declared(name)
         quantity = model.declared(model.target(name))
         is_root = isinstance(quantity, Exogenous) or quantity.role == "state"
         has_space = variable.a is not None or variable.b is not None
-        if is_root and has_space and (name == quantity.name or quantity.a is None):
+        if (
+            is_root
+            and has_space
+            and (name == quantity.name or variable.parts or quantity.a is None)
+        ):
             yield variable
 
 

@@ -142,9 +142,11 @@ class Turn:
         acts = self.curriculum.part.acts(situation)
         if first is not None:
             acts = {name: act for name, act in acts.items() if name in first}
-        taken = {model.target(name) if name in model else name for name in besides}
+
+        def targets(name: str) -> tuple[str, ...]:
+            return model.targets(name) if name in model else (name,)
+
+        taken = {target for name in besides for target in targets(name)}
         return {
-            name: act
-            for name, act in acts.items()
-            if not taken or (model.target(name) if name in model else name) not in taken
+            name: act for name, act in acts.items() if not taken or taken.isdisjoint(targets(name))
         }

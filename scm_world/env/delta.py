@@ -125,7 +125,8 @@ class Delta:
         if world.version != self._version:
             self._version = world.version
             instant = world.snapshot().instant
-            set_now = instant and (instant.at_start or "joint_positions" in instant.requests)
+            joints = world.model.targets("joint_positions")
+            set_now = instant and (instant.at_start or any(j in instant.requests for j in joints))
             self._fresh = world.index if set_now else -1
         return self._fresh == world.index
 

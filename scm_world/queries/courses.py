@@ -90,13 +90,14 @@ class Course:
         last: dict[str, tuple[int, dict[str, None]]] = {}
         for number, (start, plan) in enumerate(self.layers):
             for name in plan if start <= step else ():
-                target = world.model.target(name) if name in world.model else name
-                if last.get(target, (-1, {}))[0] != number:
-                    last[target] = (number, {})
-                last[target][1][name] = None
-        for number, names in last.values():
+                for target in world.model.targets(name) if name in world.model else (name,):
+                    if last.get(target, (-1, {}))[0] != number:
+                        last[target] = (number, {})
+                    last[target][1][name] = None
+        owners = dict.fromkeys((number, name) for number, names in last.values() for name in names)
+        for number, name in owners:
             start, plan = self.layers[number]
-            yield from ((number, name, start, plan[name]) for name in names)
+            yield number, name, start, plan[name]
 
 
 def _still_held(parts: tuple[Any, ...], step: int) -> Intervention:

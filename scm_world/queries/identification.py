@@ -64,13 +64,15 @@ def nature_graph(
         raise ModelError(
             [f"what nature does to {name!r} has to happen at the beginning" for name in late]
         )
-    states = [n for n in map(model.target, acts) if model.declared(n).role == "state"]
-    held = model.do({n: act for n, act in acts.items() if model.target(n) not in states})
+    moved = [name for name in acts if model.declared(model.target(name)).role == "state"]
+    states = [target for name in moved for target in model.targets(name)]
+    held = model.do({name: act for name, act in acts.items() if name not in moved})
     graph = episode_outcome(held, outcomes, starts=states)
-    for name, act in acts.items():
-        if model.target(name) in states:
-            causes = (n if n in graph else f"{n}@0" for n in sorted(_followed(model, name, act)))
-            graph.add_edges_from((cause, f"{model.target(name)}@0") for cause in causes)
+    for name in moved:
+        followed = sorted(_followed(model, name, acts[name]))
+        causes = [n if n in graph else f"{n}@0" for n in followed]
+        for target in model.targets(name):
+            graph.add_edges_from((cause, f"{target}@0") for cause in causes)
     return graph
 
 

@@ -96,7 +96,7 @@ def settable(world: World, patterns: Iterable[str]) -> tuple[str, ...]:
         UnknownVariable: A pattern names nothing that can be set.
     """
     model = world.model
-    actions = world.declaration.actions
+    actions = world.declaration.commanded
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
     for pattern in given:
@@ -134,7 +134,7 @@ def is_state(model: SCM, name: str) -> bool:
 def reached(model: SCM, names: Iterable[str]) -> tuple[str, ...]:
     """Name the variables that interventions set: with coordinates, the quantity, too."""
     given = tuple(names)
-    return tuple(sorted({*given, *map(model.target, given)}))
+    return tuple(sorted({*given, *(target for name in given for target in model.targets(name))}))
 
 
 def columns_of_outcome(variable: Variable, outcome: Outcome) -> tuple[Column, ...]:
@@ -249,7 +249,7 @@ class Instants:
         parts = [
             # At an instant the world still has the action of the step before.
             np.asarray(episode[name], float)[1:]
-            if name in self.world.declaration.actions
+            if name in self.world.declaration.commanded
             else sensors.instants(episode, name)[:-1]
             for name in self.watched
         ]

@@ -190,8 +190,13 @@ class TaskSubject:
 
     def _step_truth(self, task: str) -> Truth:
         names = tuple(dict.fromkeys((*self._causes, *(o.name for o in self._outcomes), "action")))
-        known = set(names)
-        edges = tuple(e.key for e in self._world.model.edges if {e.cause, e.effect} <= known)
+        known, bundles = set(names), self._world.declaration.bundles
+        whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
+        found = (e.key for e in self._world.model.edges)
+        named = ((whole.get(c, c), whole.get(e, e), lag) for c, e, lag in found)
+        edges = tuple(
+            dict.fromkeys((c, e, lag) for c, e, lag in named if {c, e} <= known and (lag or c != e))
+        )
         return Truth(name=f"{task}/step", names=names, edges=edges, about=self._about())
 
     def _about(self) -> dict[str, Any]:
