@@ -166,7 +166,7 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
                 f"{where}: the actuator {label!r} acts with a delay, and what it remembers is no "
                 "state; remove its delay and nsample"
             )
-    if mj.nplastic:
+    if getattr(mj, "nplastic", 0):  # since MuJoCo 4
         problems.append(
             f"{where} has plastic springs or flexes, whose rest shape is a hidden state; remove "
             "springyield and yield"
