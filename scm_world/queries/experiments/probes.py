@@ -86,7 +86,7 @@ def _prepared(world: World, scenario: Scenario, noise: Noise, number: int, settl
         except (InterventionError, EngineFailure):
             continue
     world.reset(seed=number)
-    return _made(world, AT_START, Dice(noise, number), settled)
+    return _made(world, AT_REST, Dice(noise, number), settled)
 
 
 def _made(world: World, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
@@ -279,7 +279,15 @@ def _at_random(world: World, extra: None, dice: Dice) -> Floats:
     return _within(world, dice.of("probe action", world.declaration.n_actions))
 
 
+def _at_rest(world: World, extra: None, dice: Dice) -> Floats:
+    """Let the system be."""
+    return world.task.idle(world)
+
+
 AT_START = Scenario("start", start, _at_random, steps=0)
+AT_REST = Scenario("start", start, _at_rest, steps=0)
+"""What is left where nothing else is feasible."""
+
 _ANYWHERE = Scenario("anywhere", anywhere, _at_random, fresh=True)
 _OTHERWISE = Scenario("anywhere, others", _with_others(anywhere), _at_random, fresh=True)
 _ONWARD = Scenario("onward", onward, _at_random, steps=0)
