@@ -22,9 +22,6 @@ from scm_world.models.state import State, StateLayout
 Numbers = float | tuple[float, ...]
 """One number, or one for each component."""
 
-Change = Literal["live", "constants", "recompile"]
-"""What a write costs: nothing more, derived constants, or another compilation."""
-
 
 @dataclass(frozen=True)
 class Row:
@@ -62,13 +59,11 @@ class Parameter(Row):
         key: The element and the property, as engines know it.
         kind: ``"real"``, ``"rotation"`` (unit quaternion) or ``"inertia"`` (principal moments,
             which obey the triangle inequality).
-        change: What a write costs.
         visual: Whether it acts on pictures only.
     """
 
     key: ParameterKey = ("", "")
     kind: Literal["real", "rotation", "inertia"] = "real"
-    change: Change = "live"
     visual: bool = False
 
 

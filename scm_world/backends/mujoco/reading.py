@@ -250,7 +250,6 @@ def _parameter(mj: mujoco.MjModel, data: mujoco.MjData | None, field: Field) -> 
         contact=contact,
         key=field.key,
         kind=field.nature,
-        change="constants" if slot.constant else "live",
         visual=field.visual,
     )
 
