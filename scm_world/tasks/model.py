@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Self, final
 
 import numpy as np
+from numba import njit
 
+from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
 from scm_world.entities import Clock, Composition
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.geometry import chains
 from scm_world.models import Model, ParameterKey, Readout, Row
 from scm_world.tasks.base import Task, Timing
 from scm_world.tasks.observed import Observed
@@ -30,6 +33,7 @@ from scm_world.variables import (
     Rotations,
     Variable,
 )
+from scm_world.variables.mechanisms import Stacked
 
 TIMESTEP = "timestep"
 FINEST = 20.0
@@ -360,13 +364,23 @@ def _space(given: Any) -> Any:
     return given
 
 
+@Stacked
+@njit(cache=True)
+def pose(numbers: Floats, links: Floats) -> Floats:
+    """Compute where the end of a chain of joints is; see ``scm_world.geometry.chains.Chain``."""
+    return chains.end_of_chain(numbers, links)
+
+
 def _readout(row: Readout) -> Measured:
+    mechanism = Function(row.function)
+    if isinstance(row.function, chains.Chain):
+        mechanism = Function(pose, constants={"links": row.function.links})
     return Measured(
         name=row.name,
         unit=row.unit,
         shape=row.shape,
         parents=row.parents,
-        mechanism=Function(row.function),
+        mechanism=mechanism,
         doc=row.doc,
     )
 

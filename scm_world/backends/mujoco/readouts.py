@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, final
@@ -23,6 +23,7 @@ from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.sources import Source, realized
 from scm_world.backends.mujoco.trees import disabled
 from scm_world.errors import ModelError, nearest
+from scm_world.geometry.chains import BALL, FREE, HINGE, OFFSET, SLIDE, Chain
 from scm_world.models.model import Parameter, Readout, StateRow
 from scm_world.models.scene import ParameterKey
 
@@ -203,8 +204,40 @@ class _Finder:
     def _pose(self, name: str, kind: str, index: int, attribute: str) -> Readout:
         unit, shape, doc = _POSES[attribute]
         states, keys = self._parents([(kind, index)], attribute.endswith("velocity"))
+        function: Callable[..., Any]
         function = Pose(self._source, self._places(states), keys, index, kind, attribute)
+        if not keys and attribute in ("position", "orientation"):
+            function = self._chain(kind, index, states, turn=attribute == "orientation")
         return self._row(name, unit, shape, states, keys, function, doc.format(kind=kind))
+
+    def _chain(self, kind: str, index: int, states: Sequence[str], *, turn: bool) -> Chain:
+        """Write a pose down as a chain of joints, which is computed faster than by MuJoCo."""
+        mj, first, numbers = self._mj, 0, dict[int, int]()
+        for row, _, where, joint in self._states:
+            if row.name in states:
+                numbers.setdefault(joint, first)
+                first += len(where)
+        steps: list[tuple[float, ...]] = []
+        body = index
+        if kind != "body":
+            owner, places, turns = {
+                "site": (mj.site_bodyid, mj.site_pos, mj.site_quat),
+                "geom": (mj.geom_bodyid, mj.geom_pos, mj.geom_quat),
+            }[kind]
+            steps, body = [(OFFSET, 0.0, *places[index], *turns[index])], int(owner[index])
+        while body:
+            joints = range(
+                mj.body_jntadr[body], mj.body_jntadr[body] + max(0, mj.body_jntnum[body])
+            )
+            kinds = [int(mj.jnt_type[joint]) for joint in joints]
+            steps = [
+                *(_joint_step(mj, joint, numbers[joint]) for joint in joints),
+                *steps,
+            ]
+            if kinds != [int(mujoco.mjtJoint.mjJNT_FREE)]:
+                steps.insert(0, (OFFSET, 0.0, *mj.body_pos[body], *mj.body_quat[body]))
+            body = int(mj.body_parentid[body])
+        return Chain.of(steps, turn=turn)
 
     def _row(
         self,
@@ -213,7 +246,7 @@ class _Finder:
         shape: tuple[int, ...],
         states: Sequence[str],
         keys: Sequence[ParameterKey],
-        function: _Computed,
+        function: Callable[..., Any],
         doc: str,
     ) -> Readout:
         named = {row.key: row.name for row in self._parameters}
@@ -370,6 +403,20 @@ _UNITS = {
     _SENS.mjSENS_E_POTENTIAL: "J",
     _SENS.mjSENS_E_KINETIC: "J",
 }
+
+
+def _joint_step(mj: mujoco.MjModel, joint: int, first: int) -> tuple[float, ...]:
+    """Write a joint down as a step of a chain."""
+    axis, anchor = mj.jnt_axis[joint], mj.jnt_pos[joint]
+    reference = float(mj.qpos0[mj.jnt_qposadr[joint]])
+    match mujoco.mjtJoint(int(mj.jnt_type[joint])):
+        case mujoco.mjtJoint.mjJNT_HINGE:
+            return (HINGE, first, *axis, *anchor, reference)
+        case mujoco.mjtJoint.mjJNT_SLIDE:
+            return (SLIDE, first, *axis, 0.0, 0.0, 0.0, reference)
+        case mujoco.mjtJoint.mjJNT_BALL:
+            return (BALL, first, *anchor)
+    return (FREE, first)
 
 
 def _belongs(key: ParameterKey, kind: str, element: str) -> bool:
