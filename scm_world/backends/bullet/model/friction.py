@@ -11,11 +11,11 @@ from scm_world.models.bodies import Bodies
 def shares(bodies: Bodies, usual: float) -> list[float]:
     """Give each shape a number, so that a contact has the product of two as its friction.
 
-    A model says the larger of two coefficients. With the first fixed shape as measure, the
-    product is that wherever a moving shape touches fixed ones that are all alike, and wherever
-    two moving shapes touch of which one has at most the measure or the usual coefficient, and
-    the other at least that. The number of a moving shape depends on its own coefficient and on
-    the measure alone, so that shapes which never touch leave one another alone to the last bit.
+    A model says the larger of two coefficients. The product is that wherever a moving shape
+    touches fixed ones that are all alike, and wherever one of two moving shapes has the usual
+    coefficient and the other at least that, if the floor has no more than it. The number of a
+    moving shape depends on its own coefficient and on that of the first fixed shape alone, so
+    that shapes which never touch leave one another alone to the last bit.
 
     Args:
         bodies: All of them, with the coefficients in force.
