@@ -145,7 +145,7 @@ def test_many_together_are_as_many_alone(world: World) -> None:
     alone = Random()
     sets = [
         world.sample({"pole.mass": 0.2}, 16, steps=60, workers=workers, policy=policy)
-        for workers, policy in ((2, "random"), (None, lambda one: alone(one)))
+        for workers, policy in ((2, "random"), (None, alone.__call__))
     ]
     for name in sets[0]:
         assert np.array_equal(sets[0][name], sets[1][name])
