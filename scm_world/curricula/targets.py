@@ -78,9 +78,8 @@ def settable(declaration: Declaration) -> tuple[str, ...]:
 def _spaced(declaration: Declaration) -> Iterable[Variable]:
     """List roots and states that have a space, under one name each; bundles, not their parts."""
     model = declaration.model
-    parts = {part for parts in declaration.bundles.values() for part in parts}
     for name in settable(declaration):
-        if name in parts:
+        if name in declaration.parts:
             continue
         variable: Any = model.declared(name)
         quantity = model.declared(model.target(name))

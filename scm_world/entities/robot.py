@@ -276,9 +276,9 @@ class Robot(Entity):
         for finger in FINGERS:
             yield from self._links(finger)
         yield from self._hidden()
+        yield from self._tips()
         if len(self._joints) > 1:
             yield from self._bundles()
-        yield from self._tips()
 
     def _actions(self) -> Iterable[Variable]:
         unit, bounds = ACTIONS[self.action_mode]

@@ -168,7 +168,7 @@ def published(world: World, declaration: Declaration) -> dict[str, Observed]:
 def _vector(world: World, declaration: Declaration, how: Observing) -> Vector:
     names = list(how.names if how.mode == "custom" else published(world, declaration))
     if how.mode == "full":
-        names += list(declaration.model)
+        names += [name for name in declaration.model if name not in declaration.parts]
     names = list(dict.fromkeys((*names, *how.include)))
     parts = _parts(world, declaration, names)
     corners = _keypoints(declaration) if how.keypoints else None

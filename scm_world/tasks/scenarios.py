@@ -98,6 +98,15 @@ def finger_at_wall(world: Any, dice: Dice) -> Setting:
     return states, around(center, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
 
 
+def fingers_together(world: Any, dice: Dice) -> Setting:
+    """Put the fingertips side by side in the middle and let them press on one another."""
+    angles, center = facing(dice), np.array([*dice.between(-0.02, 0.02, 2), 0.0])
+    radius, height = 1.3 * TIP, dice.between(0.05, 0.1)
+    states = {"joint_positions": joints_for(world, around(center, radius, angles, height))}
+    states.update(out_of_the_way(world, dice))
+    return states, around(center, 0.0, angles, height + dice.between(-0.02, 0.02))
+
+
 # --- all blocks ---------------------------------------------------------------------------------
 
 
@@ -173,7 +182,9 @@ def obstacle_ahead(world: Any, dice: Dice) -> Setting:
     tips = present_tips(world).reshape(3, 3)
     places = np.array(world[PLACES])
     inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
-    places[:3] = tips + inward * (TIP + dice.between(0.0056, 0.006))
+    each = bool(world.declaration.bundles)  # then it matters in front of which finger one comes
+    ahead = tips + inward * (TIP + dice.between(0.0056, 0.008 if each else 0.006))
+    places[:3] = np.roll(ahead, int(dice.between(0.0, 3.0)), axis=0) if each else ahead
     return {PLACES: places}, (tips + 0.05 * inward).ravel()
 
 
@@ -234,6 +245,8 @@ def scenarios(world: Any) -> tuple[Scenario, ...]:
         found = ((on_coming_obstacle, 0), *found)
     if PLACES in world.model:
         found = (*found, (obstacle_ahead, 0))
+    if world.declaration.bundles and not made.blocks:  # else they act through blocks, too
+        found = (*found, (fingers_together, None))
     return tuple(Scenario(prepare.__name__, prepare, driven, steps) for prepare, steps in found)
 
 

@@ -100,6 +100,7 @@ class Declaration:
         whole: States that are whole numbers.
         actions: Where each action stands in the vector of all actions.
         bundles: The parts of each bundle.
+        parts: Those of all bundles.
         commanded: Where each action stands, with the bundles of actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
@@ -120,6 +121,7 @@ class Declaration:
             first = self.n_actions
             self.actions[action.name] = slice(first, first + int(np.prod(action.shape)))
         self.bundles = {v.name: v.parts for v in self.model.variables if v.parts}
+        self.parts = frozenset(part for parts in self.bundles.values() for part in parts)
         self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
         states = self.composition.slices()
         self.slices = {**states, **_in_a_row(self.bundles, states)}

@@ -15,6 +15,10 @@ import pytest
 from worlds import NEEDS_BULLET, REST, actions
 
 from scm_world import discover
+from scm_world.curricula.targets import GROUPS, matching, settable
+from scm_world.discovery.exam.subjects import TaskView, subject
+from scm_world.entities import RESOLUTIONS
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ConflictingTargets,
     InterventionError,
@@ -27,7 +31,7 @@ from scm_world.tasks import TASKS
 from scm_world.variables import Box, Draw, Mechanism, Natural, Parent, Scale, Shift
 from scm_world.world.batch import Batch
 
-FINER = ("finger", "joint")
+FINER = RESOLUTIONS[1:]
 MODES = ("joint_positions", "joint_torques", "end_effector_positions")
 NAMES = ("joint_positions", "joint_velocities", "joint_torques", "end_effector_positions", "action")
 NEAR_REST = Draw(Box(tuple(REST - 0.1), tuple(REST + 0.1)))
@@ -121,6 +125,9 @@ def test_the_default_has_the_variables_that_it_always_had() -> None:
     world = World("pushing", backend="fake")
     assert world.resolution == "vector"
     assert not world.declaration.bundles
+    for resolution in FINER:
+        finer = World("pushing", backend="fake", resolution=resolution)
+        assert [n for n in finer.model if n not in finer.declaration.parts] == list(world.model)
     assert len(world.identity) == 6
     assert copy.copy(world).resolution == "vector"
     with pytest.raises(UnknownOption, match="finger"):
@@ -341,3 +348,61 @@ def test_every_edge_between_fingers_is_found(backend: str) -> None:
     report = discover(World("pushing", resolution="finger", backend=backend), probes=16)
     assert (report.score.shd, report.floor) == (0, 0.0)
     assert len(report.declared) == 565
+
+
+# --- what is built on worlds ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("resolution", FINER)
+@pytest.mark.parametrize("mode", ["delta_joint_positions", "end_effector_positions"])
+def test_environments_observe_and_reward_the_same(resolution: str, mode: str) -> None:
+    """Spaces, observations, rewards and infos of an episode, relative actions included."""
+    options: dict[str, Any] = {
+        "action_mode": mode,
+        "include": ("joint_torques",),
+        "observation_mode": "full",
+        "start": {"joint_positions": NEAR_REST},
+    }
+    envs = [ScmWorldEnv("picking", resolution=name, **options) for name in ("vector", resolution)]
+    assert envs[0].observation_space == envs[1].observation_space
+    (first, _), (second, _) = (env.reset(seed=2) for env in envs)
+    generator = np.random.default_rng(0)
+    for step in range(6):
+        np.testing.assert_array_equal(first, second)
+        action = generator.uniform(-1.0, 1.0, 9).astype(np.float32)
+        if step == 3:
+            for env in envs:
+                env.do({"joint_positions": REST})
+        (first, *one), (second, *other) = (env.step(action) for env in envs)
+        np.testing.assert_equal(one, other)
+
+
+@pytest.mark.parametrize("resolution", FINER)
+def test_curricula_mean_the_same_variables(resolution: str) -> None:
+    """Every group of variables has the same names, and what is drawn for them is the same."""
+    coarse, fine = (World("pushing", resolution=r, backend="fake") for r in ("vector", resolution))
+    for group in GROUPS:
+        found = [matching(world.declaration, [f"@{group}"]) for world in (coarse, fine)]
+        assert found[0] == found[1], group
+    names = [set(settable(world.declaration)) for world in (coarse, fine)]
+    assert names[0] < names[1]
+    assert "action" not in names[1]
+
+
+def test_a_later_plan_for_a_whole_takes_the_place_of_one_for_a_part() -> None:
+    """The other way round it says so: what one plan draws as a whole cannot be given in part."""
+    world = World("pushing", resolution="finger", backend="fake")
+    part = {"finger_120.joint_velocities": [0.1] * 3}
+    episode = world.rollout(seed=0, steps=2, do=part)
+    other = episode.counterfactual({"joint_velocities": [0.2] * 9}, at=0)
+    assert other["joint_velocities"][0].tolist() == [0.2] * 9
+    with pytest.raises(ConflictingTargets):
+        other.counterfactual(part, at=0)
+
+
+def test_what_is_learnt_by_step_has_one_truth() -> None:
+    """A data set has columns of the whole robot; its graph is the same at every resolution."""
+    views = [TaskView("step", options={"resolution": r, "backend": "fake"}) for r in RESOLUTIONS]
+    truths = [set(subject("pushing", view=view).truth.edges) for view in views]
+    assert ("action", "joint_positions", 1) in truths[0]
+    assert truths[0] == truths[1] == truths[2]
