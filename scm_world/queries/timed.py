@@ -22,8 +22,11 @@ def as_act(value: Any) -> Any:
     Raises:
         UnknownOption: It is neither numbers nor an intervention.
     """
-    if isinstance(value, (*ACTS, dict)):  # a dictionary comes from a file
+    if isinstance(value, ACTS) or (isinstance(value, dict) and "kind" in value):  # from a file
         return value
+    if isinstance(value, dict):
+        allowed = "a value or an intervention: {'pole.mass': At(3, 1.0)}, not At(3, {…})"
+        raise UnknownOption("act", value, (allowed,))
     if isinstance(value, str) and value in SPACES:
         return Draw(value)
     given = value if not isinstance(value, np.ndarray) else value.tolist()

@@ -31,10 +31,10 @@ PRESSING = "pressing"
 """The rule of local graphs: contacts with force."""
 
 MOST, LEAST = 200, 16
-"""How many probe states there are at most, and how many even if every edge was seen before.
+"""How many probe states there are at most, and how many even if every edge was seen before."""
 
-Of a generated graph there are as many as at least, since some of its edges may never be seen.
-"""
+QUIET = 4
+"""After how many probe states without a new edge it ends, of a generated graph."""
 
 HELD_OUT = 8
 """How many further ones there are for what a generated graph leaves open."""
@@ -46,7 +46,7 @@ OTHER = 1_000_003
 def verify(
     system: World | Task | str,
     *,
-    probes: int | None = None,
+    probes: int = MOST,
     least: int = LEAST,
     seed: int = 0,
     progress: Progress | None = None,
@@ -60,13 +60,12 @@ def verify(
     finished.
 
     A graph that was generated from a model says what can act on what; some of its edges may never
-    show. What was never seen, or seen without an edge, is looked for again in probe states of
-    another seed.
+    show. So it ends when nothing new is seen any more, and what was never seen, or seen without
+    an edge, is looked for again in probe states of another seed.
 
     Args:
         system: A world, a task, the name of one, or a model file.
-        probes: How many states to experiment in at most; 200, or ``least`` of a generated graph,
-            if None.
+        probes: How many states to experiment in at most.
         least: How many even if every declared edge has been seen before.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
@@ -81,7 +80,7 @@ def verify(
         >>> found.floor, found.undeclared, found.passed  # without physics nothing moves
         (0.0, (), False)
     """
-    checked_count("number of probes", 1 if probes is None else probes)
+    checked_count("number of probes", probes)
     checked_count("least number of probes", least)
     if isinstance(system, World):
         if options:
@@ -98,7 +97,7 @@ def verify_engines(
     task: Task | str,
     *,
     backends: tuple[str, str] = ("mujoco", "bullet"),
-    probes: int | None = None,
+    probes: int = MOST,
     least: int = LEAST,
     seed: int = 0,
     progress: Callable[[str], Progress | None] | None = None,
@@ -132,7 +131,7 @@ def verify_engines(
     def told(name: str) -> Progress | None:
         return None if progress is None else progress(name)
 
-    compared = least if probes is None else min(least, probes)
+    compared = min(least, probes)
     limits: dict[str, Any] = {"probes": probes, "least": least, "seed": seed}
     reports: list[Verification] = []
     for name in backends:
@@ -161,34 +160,39 @@ class _Watch:
     Args:
         declared: The edges.
         least: When it is early to end.
+        quiet: After how many probe states without a new edge it is enough; never if None.
     """
 
-    def __init__(self, declared: Iterable[EdgeKey], least: int) -> None:
+    def __init__(self, declared: Iterable[EdgeKey], least: int, quiet: int | None) -> None:
         self.missing, self.after = set(declared), dict[EdgeKey, int]()
-        self._least = least
+        self._least, self._quiet, self._last = least, quiet, 0
+        self.ended = False
 
     def __call__(self, effects: Effects, done: int) -> bool:
         """Look for edges that are seen now; tell whether it is enough."""
         new = self.missing & effects.found(effects.threshold)
         self.missing -= new
         self.after.update(dict.fromkeys(new, done))
-        return not self.missing and done >= self._least
+        self._last = done if new else self._last
+        is_quiet = self._quiet is not None and done - self._last >= self._quiet
+        self.ended = done >= self._least and (not self.missing or is_quiet)
+        return self.ended
 
 
 def _verified(
-    world: World, most: int | None, least: int, seed: int, progress: Progress | None
+    world: World, probes: int, least: int, seed: int, progress: Progress | None
 ) -> Verification:
     started = time.perf_counter()
     generated = world.task.generated_graph
-    probes = (least if generated else MOST) if most is None else most
     declared = tuple(edge.key for edge in world.model.edges)
     measured = {v.name for v in world.model.variables if isinstance(v, Measured)}
-    watch, paired = _Watch(declared, least), Paired(world, seed)
+    watch = _Watch(declared, least, QUIET if generated else None)
+    paired = Paired(world, seed)
     series = Series(paired, probes, progress)
     series.run(probe_states(world, probes, seed), watch)
     effects, done = series.effects, series.done
     found = effects.edges(set(declared))
-    interrupted = done < probes and (bool(watch.missing) or done < least)
+    interrupted = done < probes and not watch.ended
     open_ = found.symmetric_difference(declared)
     held_out: Series | None = None
     if generated and open_ and not interrupted:
