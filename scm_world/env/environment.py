@@ -247,7 +247,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             scaled = np.isfinite(low + high) & (low < high)
             bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         self._delta = delta_for(mode, self.world, self._middle, self._half, **steps)
-        self._given = np.empty(low.size)
+        self._given, self._command = np.empty(low.size), np.empty(low.size)
         self._range = (self._middle, self._half, low, high)
         self._scale_and_clip = direct(scaled_clip_kernel, self._given, *self._range, self._given)
         self.action_space = self._delta.space() if self._delta else box(*bounds)
@@ -342,7 +342,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        self.world.advance(self._command(action))
+        self.world.advance(self._commanded(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
         terminated = self._counted.terminated and bool(now[TERMINATED])
@@ -351,8 +351,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             self._show()
         return self._observer.observe(now), reward, terminated, truncated, self._info(now)
 
-    def _command(self, action: NDArray[np.float32]) -> Floats:
-        """Turn an action into what the world takes, shape (n,)."""
+    def _commanded(self, action: NDArray[np.float32]) -> Floats:
+        """Turn an action into what the world takes, shape (n,); it holds until the next call."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
             given = doubles(action, self._given.size)
@@ -361,7 +361,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if self._delta is not None:
             given = self._delta.absolute(np.array(given, dtype=np.float64))
         self._given[...] = given  # every 32-bit number is a 64-bit one
-        command = np.empty(self._given.size)
+        command = self._command
         if not self._scale_and_clip(self._given, *self._range, command):
             raise ActionError(f"an action is {finite(command.size)}, got {action!r}", action)
         return command
@@ -404,7 +404,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             info["fractional_success"] = float(now[FRACTION])
         if self._goals is not None:
             info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world, now)
-        info["reward_terms"] = {name: float(now[name]) for name in self._terms}
+        info["reward_terms"] = terms = {}
+        for name in self._terms:
+            terms[name] = float(now[name])
         contacts, state = self._rich
         if contacts:
             info["contacts"] = _touches(self.world.backend)

@@ -9,8 +9,10 @@ from operator import is_, itemgetter
 from typing import Any, final
 
 import numpy as np
+from numba.core.errors import NumbaError
 
 from scm_world._types import Value
+from scm_world.errors import ModelError
 from scm_world.geometry.direct import direct
 from scm_world.geometry.gather import gather_into, places
 from scm_world.graph import SCM
@@ -87,7 +89,7 @@ class _Rule:
         name: Of the variable.
         keys: Of the parents.
         shape: Of the value.
-        writes: Whether its function can write into an array.
+        writes: Whether its values are written into one array, so that what follows finds it there.
     """
 
     def __init__(self, model: SCM, name: str) -> None:
@@ -96,7 +98,6 @@ class _Rule:
         self.name, self.shape = name, variable.shape
         self.keys = tuple(map(key, parents))
         self._function, self._constants = positional(variable.mechanism.bind(), len(parents))
-        self.writes = hasattr(self._function, "into")
         self._moves = [
             k not in model or isinstance(model.declared(k), Measured | Action) for k in self.keys
         ]
@@ -104,6 +105,9 @@ class _Rule:
         self._unboxed = self._function if isinstance(self._function, Unboxed) else None
         if self._unboxed is not None:
             self._function = self._unboxed.kernel
+        compiled = isinstance(self._function, Stacked) or self._unboxed is not None
+        self._is_kept = compiled and variable.dtype == "real" and variable.shape != ()
+        self.writes = hasattr(self._function, "into") or self._is_kept
 
     def step(self) -> _Step:
         """Bind it to what is looked up in every step."""
@@ -118,17 +122,34 @@ class _Rule:
     def call(self, given: list[Any], written: Value | None) -> Callable[[], Any]:
         """Bind it to arguments that stay the same objects."""
         function, constants = self._function, self._constants
-        if isinstance(function, Stacked):
-            return _Stack(function, given, self._moves, constants)
-        if self.writes:
+        if hasattr(function, "into"):
             return _Written(function.into, (*given, *constants, written))
+        if isinstance(function, Stacked):
+            made: Callable[[], Any] = _Stack(function, given, self._moves, constants)
+        else:
+            made = self._compiled(given)
+        return _Kept(made, written, self.name) if self._is_kept else made
+
+    def _compiled(self, given: list[Any]) -> Callable[[], Any]:
+        """Bind a function without ``into`` to its arguments.
+
+        Raises:
+            ModelError: It is the user's, and numba cannot compile it for them.
+        """
+        function, constants = self._function, self._constants
         like = given
         if (
             self._unboxed is not None
-        ):  # it computes with numbers, where ours take arrays of no dimension too
+        ):  # it computes with numbers; ours take arrays without dimension
             pairs = zip(self._are_numbers, given, strict=True)
             like = [0.0 if is_number else value for is_number, value in pairs]
-        return partial(direct(function, *like, *constants), *given, *constants)
+        try:
+            compiled = direct(function, *like, *constants)
+        except NumbaError as error:
+            reason = str(error).strip().splitlines()[-1]
+            problem = f"numba cannot compile the function of {self.name!r}: {reason}"
+            raise ModelError([problem]) from error
+        return partial(compiled, *given, *constants)
 
 
 @final
@@ -147,6 +168,33 @@ class _Written:
         """Write, and give the array."""
         self._call()
         found: Value = self._into
+        return found
+
+
+@final
+class _Kept:
+    """A function whose values are copied into an array.
+
+    Args:
+        function: Gives them.
+        into: The array.
+        name: Of the variable.
+
+    Raises:
+        ModelError: They have another shape.
+    """
+
+    def __init__(self, function: Callable[[], Any], into: Any, name: str) -> None:
+        self._call, self._into = function, into
+        found = np.shape(function())
+        if found != into.shape:
+            problem = f"the function of {name!r} gives the shape {found}, not {into.shape}"
+            raise ModelError([problem])
+
+    def __call__(self) -> Value:
+        """Compute, and give the array."""
+        found: Value = self._into
+        found[...] = self._call()
         return found
 
 

@@ -1,0 +1,1 @@
+"""Any model: speed and proofs, on models from other packages."""

@@ -1,0 +1,116 @@
+"""How fast environments of models are, beside Gymnasium's own.
+
+``python -m benchmarks.models.speed [--quick] [--json FILE]``. Both sides take the same actions in
+the same process, in turns. Times are of this process: a step of one environment, and a step of one
+of 64 worlds on two threads, in seconds of CPU and on the clock.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from benchmarks.models.gymnasium_tasks import PAIRS, Pair
+
+WORLDS, THREADS = 64, 2
+MICRO = 1e6
+GOALS = {"single": 1.0, "per core": 1.3, "on the clock": 2.2}
+RAW = {"normalize_observations": False, "normalize_actions": False}
+
+
+def single(env: Any, actions: Any, clock: Callable[[], float]) -> float:
+    """Give the time of a step [µs]; nothing is reset on the way."""
+    env.reset(seed=0)
+    started = clock()
+    for action in actions:
+        env.step(action)
+    return (clock() - started) / len(actions) * MICRO
+
+
+def many(envs: Any, actions: Any, clock: Callable[[], float]) -> float:
+    """Give the time for a step of one of many worlds [µs]; an episode that ends begins anew."""
+    envs.reset(seed=0)
+    envs.step(actions[0])  # from here on all are in their seats
+    started = clock()
+    for action in actions:
+        envs.step(action)
+    return (clock() - started) / (len(actions) * envs.num_envs) * MICRO
+
+
+def bare(env: Any, actions: Any, clock: Callable[[], float]) -> float:
+    """Give the time of the physics alone [µs]: ``mj_step`` on Gymnasium's own model."""
+    inner = env.unwrapped
+    env.reset(seed=0)
+    model, data, skip = inner.model, inner.data, inner.frame_skip
+    started = clock()
+    for action in actions:
+        data.ctrl[:] = action
+        mujoco.mj_step(model, data, skip)
+    return (clock() - started) / len(actions) * MICRO
+
+
+def compare(pair: Pair, steps: int, rounds: int) -> dict[str, float]:
+    """Measure one task, the sides in turns.
+
+    Returns:
+        Medians over rounds: times [µs], and how many times faster we are.
+    """
+    theirs = gymnasium.make(pair.id, **pair.options)
+    ours = gymnasium.make("scm_world/Model-v0", model=pair.make(), **RAW)
+    envs = gymnasium.make_vec(
+        "scm_world/Model-v0", WORLDS, model=pair.make(), threads=THREADS, copy=False, **RAW
+    )
+    space, rng = theirs.action_space, np.random.default_rng(0)
+    one: Any = rng.uniform(space.low, space.high, (steps, *space.shape)).astype(np.float32)
+    few = max(2, 4 * steps // WORLDS)
+    all_: Any = rng.uniform(space.low, space.high, (few, WORLDS, *space.shape)).astype(np.float32)
+    for env in (theirs, ours):
+        single(env, one[:50], time.perf_counter)
+    many(envs, all_[:2], time.perf_counter)
+    rows = [
+        {
+            "theirs": single(theirs, one, time.process_time),
+            "ours": single(ours, one, time.process_time),
+            "physics": bare(theirs, one, time.process_time),
+            "batch, CPU": many(envs, all_, time.process_time),
+            "batch, clock": many(envs, all_, time.perf_counter),
+        }
+        for _ in range(rounds)
+    ]
+    for env in (theirs, ours, envs):
+        env.close()
+    found = {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
+    ratios = {"single": "ours", "per core": "batch, CPU", "on the clock": "batch, clock"}
+    return found | {
+        name: float(np.median([row["theirs"] / row[side] for row in rows]))
+        for name, side in ratios.items()
+    }
+
+
+def main() -> None:
+    """Compare all tasks, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a few steps only")
+    parser.add_argument("--json", type=Path, help="where to write the numbers")
+    parser.add_argument("tasks", nargs="*", default=[*PAIRS], help=f"of {', '.join(PAIRS)}")
+    given = parser.parse_args()
+    steps, rounds = (200, 2) if given.quick else (2000, 9)
+    found = {name: compare(PAIRS[name], steps, rounds) for name in given.tasks}
+    for name, row in found.items():
+        times = ", ".join(f"{key} {row[key]:.1f} µs" for key in row if key not in GOALS)
+        ratios = ", ".join(f"{key} {row[key]:.2f} (goal {goal})" for key, goal in GOALS.items())
+        print(f"{name}: {times}\n  times faster: {ratios}")
+    if given.json is not None:
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
