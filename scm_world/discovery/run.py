@@ -101,7 +101,11 @@ def _experiments(
 def _terms(world: World, seed: int) -> dict[str, Any]:
     given = {name: str(value) for name, value in sorted(world.task.given.items())}
     backend = world.backend
+    finer = (
+        {} if world.resolution == world.task.resolutions[0] else {"resolution": world.resolution}
+    )
     return {
+        **finer,
         "task": world.task.name,
         "arguments": given,
         "action_mode": world.action_mode,

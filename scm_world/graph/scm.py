@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from typing import Any, final
 
 import numpy as np
@@ -251,14 +252,14 @@ class SCM:
                     if target in targets:
                         raise ConflictingTargets((targets[target], name), target)
                     targets[target] = name
-                wanted |= divided(self.declared(name), act)
+                wanted[name] = act
             except InterventionError as problem:
                 problems.append(problem)
         raise_all(problems)
         return self.with_interventions(wanted)
 
     def with_interventions(self, acts: Mapping[str, Intervention]) -> SCM:
-        """Apply interventions that have been checked already.
+        """Apply interventions that have been checked already; on a bundle, to its parts.
 
         Raises:
             ModelError: Draws from spaces that follow other variables, or mechanisms, close a cycle.
@@ -268,7 +269,8 @@ class SCM:
         model._evaluator = self._evaluator
         model._interventions = {**self._interventions}
         model._acts = {**self._acts}
-        for name, intervention in acts.items():
+        parts = (divided(self.declared(name), act).items() for name, act in acts.items())
+        for name, intervention in chain.from_iterable(parts):
             target = self.target(name)
             replaced = model._acts.pop(target, None)
             if replaced is not None:

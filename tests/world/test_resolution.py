@@ -401,8 +401,18 @@ def test_a_later_plan_for_a_whole_takes_the_place_of_one_for_a_part() -> None:
 
 
 def test_what_is_learnt_by_step_has_one_truth() -> None:
-    """A data set has columns of the whole robot; its graph is the same at every resolution."""
-    views = [TaskView("step", options={"resolution": r, "backend": "fake"}) for r in RESOLUTIONS]
-    truths = [set(subject("pushing", view=view).truth.edges) for view in views]
-    assert ("action", "joint_positions", 1) in truths[0]
+    """A data set has the joints of the whole robot, and the actions of the resolution."""
+    truths = []
+    for resolution in RESOLUTIONS:
+        options = {"resolution": resolution, "backend": "fake"}
+        made = subject("pushing", view=TaskView("step", options=options))
+        assert set(made.data("see", 5, 0).variables) == set(made.truth.names)
+        edges = set(made.truth.edges)
+        commands = {cause for cause, _, _ in edges if cause.endswith("action")}
+        assert {("joint_positions", 1), ("tool_block.linear_velocity", 1)} <= {
+            (effect, lag) for cause, effect, lag in edges if cause in commands
+        }
+        assert len(commands) == {"vector": 1, "finger": 3, "joint": 9}[resolution]
+        truths.append({edge for edge in edges if edge[0] not in commands})
+        made.close()
     assert truths[0] == truths[1] == truths[2]

@@ -189,8 +189,10 @@ class TaskSubject:
         return Truth(name=task, names=names, edges=edges, left_out=pairs, about=self._about())
 
     def _step_truth(self, task: str) -> Truth:
-        names = tuple(dict.fromkeys((*self._causes, *(o.name for o in self._outcomes), "action")))
-        known, bundles = set(names), self._world.declaration.bundles
+        actions, bundles = self._world.declaration.actions, self._world.declaration.bundles
+        outcomes = (outcome.name for outcome in self._outcomes)
+        names = tuple(dict.fromkeys((*self._causes, *outcomes, *actions)))
+        known = set(names)
         whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
         found = (e.key for e in self._world.model.edges)
         named = ((whole.get(c, c), whole.get(e, e), lag) for c, e, lag in found)
