@@ -24,7 +24,6 @@ TRUST = Annotated[
         help="Package whose functions may be called because results name them; once for each.",
     ),
 ]
-METRIC = "last_fractional_success"
 
 
 def evaluate(
@@ -55,8 +54,12 @@ def evaluate(
     env: ENV = None,
     option: Arguments = None,
     metric: Annotated[
-        str, typer.Option(help="Score that is shown and drawn; all are written.")
-    ] = METRIC,
+        str | None,
+        typer.Option(
+            help="Score that is shown and drawn; all are written.",
+            show_default="last_fractional_success, or return where a task has none",
+        ),
+    ] = None,
     workers: ManyWorkers = 0,
     engine: Engine = None,
     address: Address = None,
@@ -121,7 +124,9 @@ def explain(
     ] = None,
     agent: Annotated[str | None, typer.Option(help="Who acted, if there are several.")] = None,
     backend: Annotated[str | None, typer.Option(help="Engine, if there are several.")] = None,
-    metric: Annotated[str, typer.Option(help="Score that is explained.")] = METRIC,
+    metric: Annotated[
+        str, typer.Option(help="Score that is explained.")
+    ] = "last_fractional_success",
     versus: Annotated[
         str | None, typer.Option(help="A: from the training space; default: left as it is.")
     ] = None,

@@ -65,7 +65,7 @@ class Options:
     backends: str
     env: tuple[str, ...]
     arguments: tuple[str, ...]
-    metric: str
+    metric: str | None
     work: Work
     form: str
     videos: bool
@@ -146,12 +146,11 @@ def run(options: Options, *, out: Location | None) -> int:
         said = f"interrupted: {safe} files are safe in {folder}; the same command goes on"
         terminal.print(said, soft_wrap=True)
         return INTERRUPTED
+    metric = options.metric or next(name for name in METRICS if name in found.metrics)
     files = found.save(folder, kind=options.form)
     with shown_episodes() as progress:
-        more = write_outputs(
-            found, folder, metric=options.metric, videos=options.videos, progress=progress
-        )
-    for made in _tables(found, options.metric):
+        more = write_outputs(found, folder, metric=metric, videos=options.videos, progress=progress)
+    for made in _tables(found, metric):
         terminal.print(keep_whole(made, terminal, 0))
     written(terminal, *files, *more)
     return 0
@@ -159,7 +158,7 @@ def run(options: Options, *, out: Location | None) -> int:
 
 def _check(options: Options) -> None:
     """Refuse what could not be shown or written in the end."""
-    if options.metric not in METRICS:
+    if options.metric not in (None, *METRICS):
         raise UnknownOption("metric", options.metric, METRICS)
     if options.form not in CODECS:
         raise UnknownOption("format", options.form, CODECS)

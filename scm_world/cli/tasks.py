@@ -11,7 +11,7 @@ from typing import Any, get_args, get_type_hints
 import typer
 
 from scm_world.cli.assignments import parse_assignments
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption
 from scm_world.tasks import TASKS, Task, make_task
 from scm_world.tasks.model import FILES
 
@@ -45,7 +45,7 @@ def build(name: str, arguments: Sequence[str] = ()) -> Task:
     try:
         return make_task(name, **given)
     except (TypeError, ValueError) as error:
-        if isinstance(error, UnknownOption):
+        if isinstance(error, ScmWorldError) and not (arguments and isinstance(error, ModelError)):
             raise
         raise typer.BadParameter(f"{', '.join(arguments)}: {error}", param_hint=_HINT) from None
 

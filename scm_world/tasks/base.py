@@ -63,6 +63,7 @@ class Task(ABC):
         goal_causes: The variables that a new goal is drawn for.
         plan: What there is, as ``arrange`` has it; None where that is always the same.
         absent: Entities that an intervention took away.
+        checks_functions: Whether what functions of users give is checked when a world begins.
         generated_graph: Whether edges follow from structure, so that some may never show.
         conventions: Ours or the predecessor's.
         given: What it was made with.
@@ -83,6 +84,7 @@ class Task(ABC):
     decided_by: ClassVar[tuple[str, ...]] = ()
     goal_causes: ClassVar[tuple[str, ...]] = ()
     plan: Hashable = None
+    checks_functions: ClassVar[bool] = False
     absent: frozenset[str] = frozenset()
     generated_graph: bool = False
     conventions: Conventions = CONVENTIONS["scm_world"]

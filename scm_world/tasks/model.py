@@ -35,9 +35,6 @@ from scm_world.variables import (
 )
 from scm_world.variables.mechanisms import Stacked
 
-TIMESTEP = "timestep"
-FINEST = 20.0
-"""How many times finer than in the file the physics step can be set."""
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
 
@@ -77,10 +74,6 @@ class ModelComposition(Composition):
     def slices(self) -> Mapping[str, slice]:
         """Say where each state stands in the state vector."""
         return self._model.layout.slices
-
-    def timestep(self, values: Mapping[str, Any]) -> float:
-        """Give the physics step [s], which is a parameter where it is exposed."""
-        return float(values.get(TIMESTEP, self._model.timestep))
 
 
 class ModelTask(Task):
@@ -131,6 +124,7 @@ class ModelTask(Task):
     action_modes = ("controls",)
     presets = ("model",)
     generated_graph = True
+    checks_functions = True
 
     model: Any = None
     expose: Iterable[str] | str | None = None
@@ -154,6 +148,7 @@ class ModelTask(Task):
                 raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
             if value is not None:
                 setattr(self, option, value)
+        self._check_options()
         source = self.model if model is None else model
         if source is None:
             raise UnknownOption("model", None, ("a path, XML text, an MjSpec or an MjModel",))
@@ -167,6 +162,22 @@ class ModelTask(Task):
         self._check_names()
         self.weights = {REWARD: 1.0} if self.reward is not None else {}
 
+    def _check_options(self) -> None:
+        """Check what was given as lists and dictionaries; a text alone is a list of one."""
+        patterns = [self.expose] if isinstance(self.expose, str) else self.expose
+        if patterns is not None and not all(isinstance(one, str) for one in _listed(patterns)):
+            raise UnknownOption("expose", self.expose, ("patterns such as '*.mass'",))
+        for option in ("outcomes", "observe", "ties"):
+            value = getattr(self, option)
+            value = [value] if isinstance(value, str) else value
+            kinds = {"ties": Variable, "observe": str}.get(option, (str, Measured))
+            if value is not None and not all(isinstance(one, kinds) for one in _listed(value)):
+                raise UnknownOption(option, value, ("names", "or declared variables"))
+            setattr(self, option, value if value is None else tuple(value))
+        for option in ("spaces", "start"):
+            if not isinstance(getattr(self, option), Mapping):
+                raise UnknownOption(option, getattr(self, option), ("a dictionary by name",))
+
     def _read(self, source: Any) -> Model:
         if isinstance(source, Model):
             return source
@@ -175,10 +186,16 @@ class ModelTask(Task):
 
     def _steps(self) -> int:
         """Give the length of a control step in physics steps."""
+        for option in ("seconds", "control_dt"):
+            value = getattr(self, option)
+            if value is not None and _numbers(option, value, ()) <= 0.0:
+                raise UnknownOption(option, value, ("a time above zero [s]",))
         if self.frame_skip is not None:
+            if self.control_dt is not None:
+                raise UnknownOption("frame_skip", self.frame_skip, ("none, beside control_dt",))
             return self.frame_skip
         wanted = CONTROL_DT if self.control_dt is None else self.control_dt
-        steps = wanted / self.time_unit if wanted > 0.0 else 0.0
+        steps = wanted / self.time_unit
         if self.control_dt is None:
             return max(1, math.ceil(steps - 1e-9))
         if steps < 1.0 - 1e-9 or abs(steps - round(steps)) > 1e-6:
@@ -194,6 +211,10 @@ class ModelTask(Task):
                 allowed = known if option == "spaces" else self.system.layout.slices
                 if name not in allowed:
                     raise UnknownOption(option, name, allowed)
+        for row in rows:
+            tie = next((one for one in self.ties if one.name == row.name), None)
+            if tie is not None and tie.shape != row.shape:
+                raise UnknownOption(f"shape of the tie {row.name}", tie.shape, (str(row.shape),))
         for name, given in self.spaces.items():
             for what in given:
                 if what not in _OVERRIDES:
@@ -222,7 +243,7 @@ class ModelTask(Task):
         """Declare what the tables have, and what counts."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
         parameters: list[Variable] = [
-            ties.pop(row.name) if row.name in ties else self._parameter(row, timing.control_period)
+            ties.pop(row.name) if row.name in ties else self._parameter(row)
             for row in system.parameters
         ]
         actions = [self._action(row) for row in system.inputs]
@@ -245,30 +266,35 @@ class ModelTask(Task):
 
     def _fields(self, row: Row, kind: str = "real") -> dict[str, Any]:
         """Give what all kinds of declarations have in common, with what was asked for."""
-        given = dict(self.spaces.get(row.name, {}))
+        given, where = dict(self.spaces.get(row.name, {})), f"spaces[{row.name!r}]"
         low, high = (np.broadcast_to(end, row.shape) for end in (row.low, row.high))
         bounded = bool(np.isfinite(low).any() or np.isfinite(high).any())
-        bounds = Rotations() if kind == "rotation" else Box(row.low, row.high) if bounded else None
+        bounds = (
+            Rotations(keeps_sign=True)
+            if kind == "rotation"
+            else Box(row.low, row.high)
+            if bounded
+            else None
+        )
         fields: dict[str, Any] = {
             "name": row.name,
             "unit": row.unit,
             "shape": row.shape,
             "doc": given.get("doc", row.doc),
-            "bounds": _space(given.get("bounds", bounds)),
-            "a": _space(given.get("a")),
-            "b": _space(given.get("b")),
+            "bounds": _space(f"{where}['bounds']", given.get("bounds", bounds), row.shape, bounds),
         }
+        for name in ("a", "b"):
+            option = f"{where}[{name!r}]"
+            fields[name] = _space(option, given.get(name), row.shape, fields["bounds"])
         return fields
 
-    def _parameter(self, row: Any, control_period: float) -> Exogenous:
+    def _parameter(self, row: Any) -> Exogenous:
         given = self.spaces.get(row.name, {})
-        fields = self._fields(row, row.kind)
-        if row.name == TIMESTEP and "bounds" not in given:  # at least one in a control step
-            fields["bounds"] = Box(self.system.timestep / FINEST, control_period)
+        where = f"spaces[{row.name!r}]"
         return Exogenous(
-            **fields,
-            default=_spread(given.get("default", row.default), row.shape),
-            distribution=_space(given.get("distribution")),
+            **self._fields(row, row.kind),
+            default=_numbers(f"{where}['default']", given.get("default", row.default), row.shape),
+            distribution=_space(f"{where}['distribution']", given.get("distribution"), row.shape),
         )
 
     def _action(self, row: Row) -> Action:
@@ -282,7 +308,7 @@ class ModelTask(Task):
         default = self.spaces.get(row.name, {}).get("default", row.default)
         state = Measured(
             **self._fields(row, row.kind),
-            default=_spread(default, row.shape),
+            default=_numbers(f"spaces[{row.name!r}]['default']", default, row.shape),
             parents=causes,
             settable_state=True,
         )
@@ -333,8 +359,12 @@ def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
     """
     if begin is None:
         return (state,)
+    option = f"start[{state.name!r}]"
+    if state.shape == () and isinstance(begin, tuple | list):
+        begin = _space(option, begin, ())
     if isinstance(begin, int | float | list | tuple | np.ndarray):
-        return (state.model_copy(update={"default": _spread(begin, state.shape)}),)
+        return (state.model_copy(update={"default": _numbers(option, begin, state.shape)}),)
+    begin = _space(option, begin, state.shape, state.bounds)
     name = f"{state.name}.{START}"
     drawn = Exogenous(
         name=name,
@@ -351,17 +381,72 @@ def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
     return drawn, state.model_copy(update={"parents": parents, "start": function})
 
 
-def _spread(value: Any, shape: tuple[int, ...]) -> Any:
-    """Give a number, or the numbers of all components."""
-    numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
+def _listed(value: Any) -> list[Any]:
+    """List what was given, or the thing itself where it cannot be listed."""
+    return list(value) if isinstance(value, Iterable) else [value, None]
+
+
+def _numbers(option: str, value: Any, shape: tuple[int, ...]) -> Any:
+    """Give a number, or the numbers of all components.
+
+    Raises:
+        UnknownOption: It is neither, or not finite.
+    """
+    try:
+        numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
+    except (TypeError, ValueError):
+        numbers = np.full(shape, np.nan)
+    if not np.isfinite(numbers).all():
+        wanted = f"{int(np.prod(shape))} finite numbers" if shape else "a finite number"
+        raise UnknownOption(option, value, (wanted,))
     return tuple(numbers.ravel().tolist()) if shape else float(numbers)
 
 
-def _space(given: Any) -> Any:
-    """Read a space: a pair of ends stands for a box."""
-    if isinstance(given, tuple | list) and len(given) == 2:
-        return Box(*(tuple(end) if isinstance(end, list) else end for end in given))
+def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) -> Any:
+    """Read a space: a pair of ends stands for a box.
+
+    Args:
+        option: What it was given for.
+        given: The space; None for none.
+        shape: Of the variable.
+        within: The bounds, in which it must lie.
+
+    Raises:
+        UnknownOption: It is no space of this shape, its ends are the wrong way round, or it leaves
+            the bounds.
+    """
+    if given is None or given is within:
+        return given
+    size = int(np.prod(shape))
+    wanted = "a space, or its lower and its upper end" + (f", {size} numbers each" if shape else "")
+    if isinstance(given, tuple | list):
+        if len(given) != 2:
+            raise UnknownOption(option, given, (wanted,))
+        given = Box(*(_ends(option, end, shape, wanted) for end in given))
+    if isinstance(within, Rotations) and not isinstance(given, Rotations):
+        raise UnknownOption(option, given, ("sw.Rotations()",))
+    if not isinstance(given, Box) or given.parents():
+        return given
+    try:
+        low, high = given.bounds(shape, {})
+    except ValueError:
+        raise UnknownOption(option, given, (wanted,)) from None
+    if not (low <= high).all():
+        raise UnknownOption(option, given, ("the lower end first",))
+    if isinstance(within, Box) and not within.parents():
+        corners = within.bounds(shape, {})
+        if (low < corners[0]).any() or (high > corners[1]).any():
+            raise UnknownOption(option, given, (f"a space within {within.describe(shape, {})}",))
     return given
+
+
+def _ends(option: str, end: Any, shape: tuple[int, ...], wanted: str) -> Any:
+    """Read one end of a box; it may be infinite."""
+    try:
+        numbers = np.broadcast_to(np.asarray(end, dtype=np.float64), shape)
+    except (TypeError, ValueError):
+        raise UnknownOption(option, end, (wanted,)) from None
+    return tuple(numbers.ravel().tolist()) if shape else float(numbers)
 
 
 @Stacked

@@ -15,7 +15,7 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.models import ParameterKey
 from scm_world.tasks.base import Task, Timing
-from scm_world.tasks.model import REWARD, TERMINATED, _spread, beginning, declared
+from scm_world.tasks.model import REWARD, TERMINATED, _numbers, beginning, declared
 from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import (
@@ -291,7 +291,7 @@ class StepTask(Task):
             *(_lagged(state) or (Parent(name, 1) for name in given)),
             *(p for p in state.parents if p.when == "set"),
         )
-        default = _spread(0.0 if state.default is None else state.default, state.shape)
+        default = _numbers(state.name, 0.0 if state.default is None else state.default, state.shape)
         fields = {"parents": causes, "settable_state": True, "default": default}
         return beginning(state.model_copy(update=fields), self.start.get(state.name))
 

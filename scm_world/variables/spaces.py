@@ -339,12 +339,16 @@ class Either(_Space):
 class Rotations(_Space):
     """All unit quaternions (x, y, z, w); q and -q are one rotation, written with w >= 0.
 
+    Attributes:
+        keeps_sign: Whether q and -q are told apart, for engines that keep what they were given.
+
     Example:
         >>> Rotations().nearest(np.array([0.0, 0.0, 0.0, -2.0]))
         array([0., 0., 0., 1.])
     """
 
     kind: Literal["rotations"] = "rotations"
+    keeps_sign: bool = False
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Tell whether the norm is 1, to six digits."""
@@ -356,7 +360,8 @@ class Rotations(_Space):
         whole = np.where(norm < 1e-12, (0.0, 0.0, 0.0, 1.0), value)
         length = np.where(norm < 1e-12, 1.0, norm)
         exact = np.where(np.abs(length - 1.0) < 1e-15, 1.0, length)
-        unit: Value = whole / exact * np.where(whole[..., 3:] < 0, -1.0, 1.0)
+        turned = (whole[..., 3:] < 0) & (not self.keeps_sign)
+        unit: Value = whole / exact * np.where(turned, -1.0, 1.0)
         return unit + 0.0
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 from scm_world._types import Value, Values
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.graph import Moment
+from scm_world.graph import SCM, Moment
 from scm_world.models import Model, State
 from scm_world.scene.feasibility import TOLERANCE
 from scm_world.tasks import ModelTask, Task, make_task, tasks
@@ -127,3 +127,30 @@ def whole_number(option: str, value: Any, *, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise UnknownOption(option, value, (f"any whole number from {least} on",))
     return int(value)
+
+
+def check_functions(model: SCM, values: Values) -> None:
+    """Check what the functions of readouts give at the beginning.
+
+    Raises:
+        ModelError: One gives no finite numbers of the declared shape, or is out of bounds.
+    """
+    problems = []
+    for variable in model.variables:
+        if not isinstance(variable, Measured) or variable.mechanism is None:
+            continue
+        value = values[variable.name]
+        try:
+            numbers = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            numbers = np.asarray(np.nan)
+        wanted = (
+            f"finite numbers of shape {variable.shape}" if variable.shape else "a finite number"
+        )
+        if numbers.shape != variable.shape or not np.isfinite(numbers).all():
+            problems.append(f"the function of {variable.name!r} gives {value!r}, not {wanted}")
+        elif variable.bounds is not None and not variable.bounds.contains(numbers, values):
+            allowed = variable.bounds.describe(variable.shape, values)
+            problems.append(f"the function of {variable.name!r} gives {value!r}, not in {allowed}")
+    if problems:
+        raise ModelError(problems)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
+from scm_world.errors import EngineFailure
 from scm_world.graph import SCM, Moment
 from scm_world.models import ControlMode, State
 from scm_world.world.commands import clipped
@@ -46,16 +47,35 @@ class Stepped(Declared):
     _held_actions: tuple[str, ...]
     _translates: bool
     _inputs: tuple[str, ...]
+    _lost: str = ""
 
     def advance(self, command: Floats) -> None:
         """Advance one control step with finite numbers in their range; see ``step``."""
         self._require_episode()
+        self._refuse_lost()
         command = self.decided(command)
         self._readouts.remember()
         self._act(command)
-        self.backend.step(self.composition.mode, self.told(command), self._substeps)
+        try:
+            self.backend.step(self.composition.mode, self.told(command), self._substeps)
+        except EngineFailure as error:
+            left = self.declaration.empty_state()
+            self.backend.read(left)
+            if not np.isfinite(left.vector).all():
+                self._lost = f"the state was lost in control step {self._index}: {error}"
+            raise
         self.backend.read(self._state)
         self._goes_on(self._index + 1)
+
+    def _refuse_lost(self) -> None:
+        """Refuse to go on from a state that the engine has lost.
+
+        Raises:
+            EngineFailure: It has; a reset or a snapshot goes on.
+        """
+        if self._lost:
+            advice = "reset the world, or restore a snapshot"
+            raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
 
     @property
     def has_begun(self) -> bool:

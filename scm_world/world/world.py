@@ -28,7 +28,14 @@ from scm_world.world.following import policy_inputs
 from scm_world.world.proposal import Instant, Proposal
 from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
-from scm_world.world.start import beginning, check_held, the_backend, the_task, whole_number
+from scm_world.world.start import (
+    beginning,
+    check_functions,
+    check_held,
+    the_backend,
+    the_task,
+    whole_number,
+)
 from scm_world.world.stepping import Stepped
 
 
@@ -94,7 +101,7 @@ class World(Stepped):
             conventions_name=conventions,
         )
         self.family = as_family(task if isinstance(task, Family) else kind, self.options)
-        self._started = False
+        self._started = self._checked = False
         self.noise, self.episode = Noise(0), 0
         self.version = 0  # counts changes of anything but what physics moves
         self._static: Values = {}
@@ -194,6 +201,7 @@ class World(Stepped):
         return self.do(do) if do else None
 
     def _begin(self) -> None:
+        self._lost = ""
         origin = self.family.natural(None)
         if self._started:
             self.backend.restore(self._origin.engine)
@@ -203,6 +211,10 @@ class World(Stepped):
         self.adopt(origin, origin.model, self._origin.static, 0)
         self._draw_nature()
         self._readouts.forget()
+        if self.task.checks_functions and not self._checked:
+            self._readouts.evaluate()
+            check_functions(self.model, self._now)
+            self._checked = True
         self._instant = self._present(at_start=True)
 
     def _build(self, origin: Declaration) -> None:
@@ -263,6 +275,7 @@ class World(Stepped):
             NotReset: There is no episode yet.
         """
         self._require_episode()
+        self._refuse_lost()
         instant = self._instant or self._present()
         space = self.variables_space if space is None else space
         proposal, change = feasible(self, instant, request, space)
@@ -362,12 +375,15 @@ class World(Stepped):
         Raises:
             SnapshotMismatch: It is one of another task or engine.
         """
+        if not isinstance(snapshot, WorldSnapshot):
+            raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
         if snapshot.world != self.identity:
             raise SnapshotMismatch("the snapshot is one of another task, or of other options")
         if not self._started:
             self._begin()
         engine: EngineSnapshot = snapshot.engine
         self.backend.restore(engine)
+        self._lost = ""
         self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
         declaration = self.family.declaration(snapshot.plan)
         held = declaration.model.with_interventions(snapshot.interventions)

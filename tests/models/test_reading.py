@@ -292,7 +292,6 @@ def test_mocap_bodies_have_a_pose_that_can_be_set() -> None:
         <equality><weld body1="hand" body2="held"/></equality></mujoco>"""
     )
     row = next(row for row in model.parameters if row.name == "hand.position")
-    assert (row.default, row.change, row.always) == ((0.0, 0.0, 1.0), "live", {0})
     mj = copy.copy(compiled(model))
     data = mujoco.MjData(mj)
     slots(mj, model, data)[row.key].write(np.array([0.0, 0.3, 1.0]))
