@@ -155,10 +155,15 @@ def read_source(
         )
     name = stem if spec.modelname in ("", _UNNAMED) else spec.modelname
     if not fixed_base and urdf:
-        for body in spec.worldbody.bodies:  # MuJoCo fixes the root link to the world
-            if not body.joints:
-                body.add_freejoint()
-    files = _located(spec, folder, where)
+        _free(spec)
+    whole = spec.copy()
+    try:
+        files = _located(spec, folder, where)
+    except ModelError:
+        attached = _compiled_whole(whole)  # parts of other files keep their own folders
+        if urdf or attached is None:
+            raise
+        return read_source(attached, fixed_base=fixed_base, options=options)[0], name, where
     if urdf:
         _repair(spec, where)
         _add_motors(spec)
@@ -238,6 +243,15 @@ def understood(where: str) -> Iterator[None]:
         raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
 
 
+def _compiled_whole(spec: mujoco.MjSpec) -> mujoco.MjModel | None:
+    """Compile as MuJoCo itself finds the files; None where it does not."""
+    try:
+        with understood("it"):
+            return spec.compile()
+    except ModelError:
+        return None
+
+
 # --- files -------------------------------------------------------------------------------------
 
 
@@ -303,6 +317,13 @@ def _repair(spec: mujoco.MjSpec, where: str) -> None:
         if "inertia" not in str(error):
             raise
         spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
+
+
+def _free(spec: mujoco.MjSpec) -> None:
+    """Free the root link of a URDF, which MuJoCo fixes to the world."""
+    for body in spec.worldbody.bodies:
+        if not body.joints:
+            body.add_freejoint()
 
 
 def _add_motors(spec: mujoco.MjSpec) -> None:
