@@ -156,19 +156,11 @@ def _resistance(scope: Scope, joint: int, kind: int, row: Callable[..., Field]) 
         ("stiffness", ("N m/rad", "N/m", "1"), at("jnt_stiffness", joint),
          mj.jnt_stiffness[joint], unsprung, "Stiffness of a spring that pulls to springref."),
     ):  # fmt: skip
-        array = mj.jnt_stiffness if attribute == "stiffness" else getattr(mj, f"dof_{attribute}")
-        axes = array[dof : dof + (1 if attribute == "stiffness" else count)]
+        axes = getattr(mj, f"dof_{attribute}", mj.jnt_stiffness[:1])[dof : dof + count]
         alike = bool((axes == axes[:1]).all())  # else one number could not say what the file says
         yield row(
             attribute, units[column], doc, slot, low=0.0, usual=usual or bool(present),
             refusal=refusal if alike else "is not the same about all axes of the joint",
-        )  # fmt: skip
-        rows = array[dof : dof + count]
-        if not (rows == rows[:1]).all():  # one number could not say what the file says
-            refusal = "is not the same about all axes of the joint"
-        yield row(
-            attribute, units[column], doc, slot, low=0.0, usual=usual or bool(present),
-            refusal=refusal,
         )  # fmt: skip
 
 
