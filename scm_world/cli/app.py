@@ -21,6 +21,7 @@ from scm_world.cli.options import (
     Out,
     Policy,
     Preset,
+    Resolution,
     Seed,
     Steps,
     Task,
@@ -107,6 +108,7 @@ def discover(
     out: Out = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if the SHD is not 0.")] = False,
     option: Arguments = None,
+    resolution: Resolution = None,
     learner: Annotated[
         str | None,
         typer.Option(help="Examine these, with commas between them; see 'scm-world list'."),
@@ -155,7 +157,7 @@ def discover(
         from scm_world.cli.discovery import Options, run
 
         Work(engine, workers, address).refuse_others("discover without --learner")
-        options = Options(task, backend, preset, probes, seed, tuple(option or ()))
+        options = Options(task, backend, preset, probes, seed, tuple(option or ()), resolution)
         raise typer.Exit(run(options, out=out, strict=strict))
     from scm_world.cli import exam
 
@@ -190,6 +192,7 @@ def verify(
     preset: Preset = None,
     out: Out = None,
     option: Arguments = None,
+    resolution: Resolution = None,
 ) -> None:
     """Check the declared causal graph of a task against its physics.
 
@@ -198,7 +201,8 @@ def verify(
     """
     from scm_world.cli.verification import Options, run
 
-    options = Options(task, backend, both, preset, probes, seed, tuple(option or ()))
+    arguments = tuple(option or ())
+    options = Options(task, backend, both, preset, probes, seed, arguments, resolution)
     raise typer.Exit(run(options, out=out))
 
 
@@ -215,11 +219,12 @@ def graph(
         ),
     ] = None,
     option: Arguments = None,
+    resolution: Resolution = None,
 ) -> None:
     """Show the declared causal graph of a task."""
     from scm_world.cli.graphs import run
 
-    run(task, format_.value, out, action_mode, option or ())
+    run(task, format_.value, out, action_mode, option or (), resolution)
 
 
 @app.command()

@@ -47,6 +47,7 @@ class Options:
         probes: How many probe states.
         seed: Of the experiments.
         arguments: Of the task, each as ``name=value``.
+        resolution: Of the graph of the robot; that of the task if None.
     """
 
     task: str
@@ -55,15 +56,19 @@ class Options:
     probes: int
     seed: int
     arguments: tuple[str, ...] = ()
+    resolution: str | None = None
 
 
 def run(options: Options, *, out: Location | None, strict: bool) -> int:
     """Discover, print, write; return the exit code."""
     about = f"{options.backend}-seed{options.seed}{suffix(options.arguments)}"
+    about += f"-{options.resolution}" if options.resolution else ""
     folder = out or RESULTS / f"discover-{tag(options.task)}-{about}"
     check_writable(folder, folder=True)
     task = build(options.task, options.arguments)
-    world = World(task, backend=options.backend, preset=options.preset)
+    world = World(
+        task, backend=options.backend, preset=options.preset, resolution=options.resolution
+    )
     try:
         with shown_progress(options.probes) as progress:
             report = discover(

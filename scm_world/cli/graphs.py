@@ -32,13 +32,15 @@ def run(
     out: Path | None,
     action_mode: str | None,
     arguments: Sequence[str] = (),
+    resolution: str | None = None,
 ) -> None:
     """Write the declared graph of a task."""
     if format_ == "png" and out is None:
         out = Path(f"{tag(task)}{suffix(arguments)}-graph.png")
     if out is not None:
         check_writable(out, folder=False)
-    world = World(build(task, arguments), backend="fake", action_mode=action_mode)
+    made = build(task, arguments)
+    world = World(made, backend="fake", action_mode=action_mode, resolution=resolution)
     if out is None:
         _to_terminal(world, format_)
         return

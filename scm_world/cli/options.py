@@ -37,6 +37,12 @@ Preset = Annotated[
     str | None,
     typer.Option(help="Numerical settings of the robot: fast or precise.", show_default="fast"),
 ]
+Resolution = Annotated[
+    str | None,
+    typer.Option(
+        help="Nodes of the robot's graph: vector, finger or joint.", show_default="vector"
+    ),
+]
 Seed = Annotated[int, typer.Option(min=0, help="Of every random choice.")]
 Arguments = Annotated[
     list[str] | None,

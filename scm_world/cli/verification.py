@@ -49,6 +49,7 @@ class Options:
         probes: How many probe states at most.
         seed: Of the experiments.
         arguments: Of the task, each as ``name=value``.
+        resolution: Of the graph of the robot; that of the task if None.
     """
 
     task: str
@@ -58,6 +59,7 @@ class Options:
     probes: int
     seed: int
     arguments: tuple[str, ...] = ()
+    resolution: str | None = None
 
     @property
     def where(self) -> str:
@@ -68,6 +70,7 @@ class Options:
 def run(options: Options, *, out: Location | None) -> int:
     """Verify, print, write; return the exit code."""
     about = f"{options.where}-seed{options.seed}{suffix(options.arguments)}"
+    about += f"-{options.resolution}" if options.resolution else ""
     folder = out or RESULTS / f"verify-{tag(options.task)}-{about}"
     check_writable(folder, folder=True)
     every = options.task == ALL
@@ -101,6 +104,7 @@ def _verified(task: str, arguments: tuple[str, ...], options: Options) -> Found:
                 made,
                 backend=options.backend,
                 preset=options.preset,
+                resolution=options.resolution,
                 progress=bar(f"{tag(task)} on {options.backend}"),
                 **common,
             )
@@ -109,6 +113,7 @@ def _verified(task: str, arguments: tuple[str, ...], options: Options) -> Found:
             made,
             backends=BOTH,
             preset=options.preset,
+            resolution=options.resolution,
             progress=lambda name: bar(f"{tag(task)}: {name}"),
             **common,
         )

@@ -33,6 +33,7 @@ from scm_world.variables import (
     Rotations,
     Variable,
 )
+from scm_world.variables.bundles import bundle
 from scm_world.variables.mechanisms import Stacked
 
 CONTROL_DT = 0.02
@@ -247,6 +248,7 @@ class ModelTask(Task):
             for row in system.parameters
         ]
         actions = [self._action(row) for row in system.inputs]
+        together = [bundle("action", actions, doc="All controls.")] if len(actions) > 1 else []
         causes = _Causes(system)
         states: list[Variable] = []
         for row in system.states:
@@ -261,7 +263,7 @@ class ModelTask(Task):
         ]
         rest = list(ties.values())
         return ModelComposition(system), [
-            *rest, *parameters, *actions, *states, clock, *readouts, *own, *counted,
+            *rest, *parameters, *actions, *together, *states, clock, *readouts, *own, *counted,
         ]  # fmt: skip
 
     def _fields(self, row: Row, kind: str = "real") -> dict[str, Any]:
