@@ -61,6 +61,9 @@ class Batch:
         self._names = tuple(names)
         self._tables: dict[Declaration, Table] = {}
         self._homes: list[Table | None] = [None] * len(self._worlds)
+        self._shared: Table | None = None  # in which all worlds are, if they are in one
+        self._tempo: list[Any] = [None] * len(self._worlds)
+        self._in_time: Any = None  # the pace of all worlds, if they have one
         self._away = np.zeros(len(self._worlds), dtype=np.bool_)  # it went on in its row only
         self._loaded = np.zeros(len(self._worlds), dtype=np.bool_)  # its row is as it is
         self._all = np.arange(len(self._worlds))
@@ -98,10 +101,8 @@ class Batch:
 
     def tables(self, rows: Integers) -> list[tuple[Table, Integers]]:
         """Give the tables of some worlds, each with the rows of those that are in it."""
-        first = self._homes[int(rows[0])] if len(rows) else None
-        homes = self._homes
-        if first is not None and all(homes[row] is first for row in rows.tolist()):
-            return [(first, rows)]
+        if self._shared is not None and len(rows):
+            return [(self._shared, rows)]
         found: dict[int, tuple[Table, list[int]]] = {}
         for row in rows.tolist():
             table = self.table(row)
@@ -124,7 +125,7 @@ class Batch:
         """
         rows = self._all if which is None else np.flatnonzero(which)
         self.fill(rows)
-        held = self._held.intersection(rows.tolist())
+        held = self._held.intersection(rows.tolist()) if self._held else ()
         if held:
             commands = commands.copy()
             for row in held:
@@ -161,18 +162,25 @@ class Batch:
 
     def _paces(self, rows: Integers) -> list[tuple[Any, Integers]]:
         """Tell worlds with different presets apart."""
+        if self._in_time is not None:
+            return [(self._in_time, rows)]
         found: dict[Any, list[int]] = {}
         for row in rows.tolist():
-            found.setdefault(self._worlds[row].pace, []).append(row)
-        if len(found) == 1:
-            return [(next(iter(found)), rows)]
+            found.setdefault(self._tempo[row], []).append(row)
         return [(pace, np.array(members)) for pace, members in found.items()]
 
     def _load(self, row: int) -> None:
         """Take a world as it is now into its row."""
         world = self._worlds[row]
-        table = self._homes[row] = self._table(world)
+        table = self._table(world)
+        if self._homes[row] is not table:
+            self._homes[row] = table
+            alike = all(home is table for home in self._homes)
+            self._shared = table if alike else None
         table.load(row, world)
+        if self._tempo[row] != world.pace:
+            self._tempo[row] = world.pace
+            self._in_time = world.pace if len(set(self._tempo)) == 1 else None
         self._loaded[row] = True
         both = ((self._held, world.holds_action), (self._translating, world.translates))
         for rows, belongs in both:

@@ -20,6 +20,7 @@ class Articulated(Realization):
     """A ``Model``. Its state vector is a permutation of MuJoCo's numbers."""
 
     modes = (ControlMode.CONTROLS,)
+    lean = True
 
     def __init__(self, structure: Model) -> None:
         model = reading.compiled(structure)

@@ -46,6 +46,7 @@ class Payload:
         numbers: ``mjSTATE_INTEGRATION``.
         memory: What the realization remembers besides.
         touches: The contacts of the last physics step.
+        again: What takes that step again if they are not known: see ``Realization``.
     """
 
     structure: Structure
@@ -53,6 +54,7 @@ class Payload:
     numbers: Floats
     memory: Any
     touches: Touches | None
+    again: tuple[tuple[Floats, int] | None, Floats | None] = (None, None)
 
 
 def realize(structure: Any, parameters: Parameters) -> Realization:
@@ -72,7 +74,7 @@ class MujocoBackend(Backend):
 
     _now: Realization
     _touches: Touches | None
-    _seat: Seat | None = None
+    seat: Seat | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
@@ -95,7 +97,7 @@ class MujocoBackend(Backend):
         now = self._realized(scene.structure, scene.parameters)
         now.reset()
         now.place(scene.state.vector)
-        self._now, self._seat, self._touches = now, None, None
+        self._now, self.seat, self._touches = now, None, None
 
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
@@ -106,7 +108,8 @@ class MujocoBackend(Backend):
         """
         self._return()
         now, structure = self._now, difference.structure
-        if now.began is not None and (difference.parameters or structure is not None):
+        again = now.began is not None or now.replay is not None
+        if again and (difference.parameters or structure is not None):
             self._last_touches()  # later, this would be another step
         if structure is None:
             now.edit(difference.parameters)
@@ -139,7 +142,7 @@ class MujocoBackend(Backend):
 
     def read(self, into: State) -> None:
         """Write the present state into an existing vector."""
-        if self._seat is not None:
+        if self.seat is not None:
             self._return()
         self._now.read(into.vector)
 
@@ -150,7 +153,7 @@ class MujocoBackend(Backend):
             EngineFailure: A number is not finite afterwards, or memory did not suffice.
             UnknownOption: The structure has no such mode.
         """
-        if self._seat is not None:
+        if self.seat is not None:
             self._return()
         now = self._now
         if mode is not now.mode:
@@ -181,8 +184,10 @@ class MujocoBackend(Backend):
         """Save everything."""
         self._return()
         now = self._now
+        touches = self._touches if now.replay is not None else self._last_touches()
+        again = (now.replay, now.began) if touches is None else (None, None)
         payload = Payload(
-            now.structure, dict(now.kept), now.numbers(), now.memory(), self._last_touches()
+            now.structure, dict(now.kept), now.numbers(), now.memory(), touches, again
         )
         return EngineSnapshot(f"{self.name} {self.version}", payload)
 
@@ -198,7 +203,8 @@ class MujocoBackend(Backend):
         payload: Payload = snapshot.payload
         now = self._realized(payload.structure, payload.parameters)
         now.recall(payload.numbers, payload.memory)
-        self._now, self._seat, self._touches = now, None, payload.touches
+        now.replay, now.began = payload.again
+        self._now, self.seat, self._touches = now, None, payload.touches
 
     @classmethod
     def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
@@ -217,10 +223,10 @@ class MujocoBackend(Backend):
         if mode is not now.mode:
             now.switch(mode)
         edited = now.edited
-        if self._seat is not seat:
+        if self.seat is not seat:
             self._return()
             seat.take(now)
-            self._seat, edited = seat, True
+            self.seat, edited = seat, True
         now.forget()
         self._touches = None
         now.edited = False
@@ -228,9 +234,9 @@ class MujocoBackend(Backend):
 
     def _return(self) -> None:
         """Take the state back from where it is stepped."""
-        if self._seat is not None:
-            self._seat.give_back(self._now)
-            self._seat = None
+        if self.seat is not None:
+            self.seat.give_back(self._now)
+            self.seat = None
 
     def close(self) -> None:
         """Free the model and its data."""

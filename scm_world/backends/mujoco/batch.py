@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Sequence
 from typing import Any, Protocol, final
@@ -25,6 +26,8 @@ _STRANDED: list[_Room] = []
 
 class Guest(Protocol):
     """A scene that can be stepped elsewhere; see ``MujocoBackend``."""
+
+    seat: Seat | None
 
     @property
     def realization(self) -> Realization:
@@ -51,11 +54,17 @@ class Seat:
     def take(self, scene: Realization) -> None:
         """Take over the state of a scene."""
         mujoco.mj_getState(scene.model, scene.data, self.room.batch.state[self.index], STATE)
+        self.room.taken[self.index] = 0
 
     def give_back(self, scene: Realization) -> None:
-        """Copy everything that the last step left."""
-        self.room.batch.get_data(self.index, scene.data)
-        scene.began = self.room.began[self.index]
+        """Copy everything that the last step left, or what it takes to compute it again."""
+        room, index = self.room, self.index
+        if scene.lean and room.taken[index]:
+            mujoco.mj_setState(scene.model, scene.data, room.batch.state[index], STATE)
+            scene.replay = room.before[index].copy(), int(room.taken[index])
+        elif not scene.lean:
+            room.batch.get_data(index, scene.data)
+        scene.began = room.began[index]
 
 
 @final
@@ -70,22 +79,33 @@ class _Room:
 
     def __init__(self, scene: Realization, n: int, threads: int) -> None:
         self.structure = scene.structure
-        # An MjData for each scene: contacts of the last step can be asked for.
-        self.batch: Any = Batch(scene.model, n, threads, persistent=True)
+        # An MjData for each scene, so that contacts of the last step can be asked for; or one for
+        # each thread, which stays in the cache, and that step is taken again if anybody asks.
+        self.batch: Any = Batch(scene.model, n, threads, persistent=not scene.lean)
+        self.before: Floats = np.zeros(self.batch.state.shape if scene.lean else (n, 0))
+        self.taken = np.zeros(n, dtype=np.int64)  # physics steps of the last step
         self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
         self.seats = [Seat(self, index) for index in range(n)]
-        self.models: list[mujoco.MjModel] = [scene.model] * n
+        # Scenes that are as the first one was share a copy of its model: it stays in the cache.
+        self._usual = scene.fingerprint(), copy.copy(scene.model)
+        self.models: list[mujoco.MjModel] = [self._usual[1]] * n
         self.read = scene.rows(self.batch)
         self.began: list[Floats | None] = [None] * n  # see ``Realization``
         self._staged = scene.staged
         self._width = len(scene.command)
         self._commands = self.batch.bind("ctrl")
 
+    def model_of(self, scene: Realization) -> mujoco.MjModel:
+        """Give the model with which a scene is stepped: its own, or one that is exactly alike."""
+        return self._usual[1] if scene.fingerprint() == self._usual[0] else scene.model
+
     def step(self, which: Integers, commands: Floats, substeps: int) -> None:
         """Hold commands, shape (n, at least n_commands), in some of the simulations."""
         width, everyone = self._width, len(which) == len(self.seats)
         rows = slice(None) if everyone else which
         self._commands[rows, :width] = commands[rows, :width]
+        if self.before.size:
+            self.before[rows], self.taken[rows] = self.batch.state[rows], substeps
         for index in which.tolist() if self._staged else ():
             self.began[index] = self.batch.state[index].copy() if substeps == 1 else None
         self.batch.step(ids=None if everyone else which, nstep=substeps)
@@ -109,6 +129,7 @@ class MujocoBatch(EngineBatch):
         self._rooms: dict[Any, _Room] = {}
         self._seats: list[Seat | None] = [None] * len(self._guests)
         self._process = os.getpid()
+        self._last: tuple[_Room, ControlMode] | None = None  # if all were stepped in one room
 
     def step(
         self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
@@ -121,6 +142,13 @@ class MujocoBatch(EngineBatch):
         """
         if self._process != os.getpid():
             self._leave_threads()
+        if self._last is not None and len(which) == len(self._guests):
+            room, last = self._last
+            if mode is last and [guest.seat for guest in self._guests] == self._seats:
+                problem = _step(room, which.astype(np.int32), commands, substeps, into)
+                if problem:
+                    raise EngineFailure(problem, "mujoco")
+                return
         rooms: dict[int, tuple[_Room, list[int]]] = {}
         changed: set[int] = set()
         for index in which.tolist():
@@ -128,9 +156,11 @@ class MujocoBatch(EngineBatch):
             key = id(seat.room)
             rooms.setdefault(key, (seat.room, []))[1].append(index)
             if self._guests[index].depart(seat, mode):
-                seat.room.models[index] = self._guests[index].realization.model
+                seat.room.models[index] = seat.room.model_of(self._guests[index].realization)
                 changed.add(key)
         problems = []
+        everyone = len(rooms) == 1 and len(which) == len(self._guests)
+        self._last = (next(iter(rooms.values()))[0], mode) if everyone else None
         for key, (room, members) in rooms.items():
             if key in changed:
                 room.batch.set_models(room.models)
@@ -165,6 +195,7 @@ class MujocoBatch(EngineBatch):
         _STRANDED.extend(seat.room for seat in self._seats if seat is not None)
         self._rooms.clear()
         self._seats = [None] * len(self._guests)
+        self._last = None
 
     def _leave_unused(self) -> None:
         used = {id(seat.room) for seat in self._seats if seat is not None}

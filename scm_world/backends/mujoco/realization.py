@@ -55,9 +55,13 @@ class Realization(ABC):
         edited: Whether the model has changed since someone last cleared this.
         staged: Whether a physics step has stages, each with contacts of its own.
         began: ``mjSTATE_INTEGRATION`` before the last step, if it had stages and was taken alone.
+        lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to remember.
+        replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
+            taken elsewhere, so that their contacts are not in the data.
     """
 
     modes: ClassVar[tuple[ControlMode, ...]]
+    lean: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -79,6 +83,7 @@ class Realization(ABC):
         self.edited = True
         self.staged = has_stages(model)
         self.began: Floats | None = None
+        self.replay: tuple[Floats, int] | None = None
         self.command = data.ctrl[: structure.n_commands]
         self._positions, self._velocities, self._activations = data.qpos, data.qvel, data.act
         self._counts = data.warning.number
@@ -113,12 +118,12 @@ class Realization(ABC):
         places, turns = data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
         data.mocap_pos[:], data.mocap_quat[:] = places, turns
-        self.began = None
+        self.began = self.replay = None
         self._counts[:] = 1
 
     def forget(self) -> None:
         """Forget what was before a step that is made now."""
-        self.began = None
+        self.began = self.replay = None
 
     def problem(self) -> str:
         """Say what is wrong with what a step left, or nothing."""
@@ -137,10 +142,26 @@ class Realization(ABC):
 
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step, with those of earlier stages where known."""
-        found = touches(self.model, self.data, self._owners)
+        if self.replay is None:
+            found = touches(self.model, self.data, self._owners)
+        else:
+            found = self._replayed(*self.replay)
         if self.began is not None:
             for earlier in earlier_stages(self.model, self.began, self._owners):
                 found = found.extended(earlier)
+        return found
+
+    def _replayed(self, numbers: Floats, steps: int) -> Touches:
+        """Take steps again on other data, and copy the contacts of the last one."""
+        data = self._scratch
+        mujoco.mj_setState(self.model, data, numbers, STATE)
+        try:
+            mujoco.mj_step(self.model, data, steps)
+        except (mujoco.FatalError, mujoco.UnexpectedError):
+            mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
+        found = touches(self.model, data, self._owners)
+        mujoco.mj_resetData(self.model, data)
+        data.warning.number[:] = 1
         return found
 
     def numbers(self) -> Floats:
@@ -157,7 +178,7 @@ class Realization(ABC):
         """Go on from what was remembered."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
-        self.began = None
+        self.began = self.replay = None
 
     def follow(self, before: Realization) -> None:
         """Go on after the last step of another realization; then the state is written."""
@@ -181,6 +202,11 @@ class Realization(ABC):
             raise UnknownOption("body", body, self._bodies)
         moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
         return moments
+
+    def fingerprint(self) -> tuple[Any, ...]:
+        """Sum up what the model is made of besides its structure: models of one sum are alike."""
+        numbers = b"".join(value.tobytes() for value in self.kept.values())
+        return self.mode, tuple(self.kept), numbers
 
     def check(self, keys: Iterable[ParameterKey]) -> None:
         """Raise ``UnknownOption`` for the first parameter that there is not."""
