@@ -244,10 +244,10 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         bounds = (low, high)
         if normalize:
             self._middle, self._half = action_scale(self.world)
-            scaled = np.isfinite(low + high) & (low < high)
+            scaled = np.isfinite(low) & np.isfinite(high) & (low < high)
             bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         self._delta = delta_for(mode, self.world, self._middle, self._half, **steps)
-        self._given, self._command = np.empty(low.size), np.empty(low.size)
+        self._given = np.empty(low.size)
         self._range = (self._middle, self._half, low, high)
         self._scale_and_clip = direct(scaled_clip_kernel, self._given, *self._range, self._given)
         self.action_space = self._delta.space() if self._delta else box(*bounds)
@@ -352,7 +352,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return self._observer.observe(now), reward, terminated, truncated, self._info(now)
 
     def _commanded(self, action: NDArray[np.float32]) -> Floats:
-        """Turn an action into what the world takes, shape (n,); it holds until the next call."""
+        """Turn an action into what the world takes, shape (n,)."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
             given = doubles(action, self._given.size)
@@ -361,7 +361,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if self._delta is not None:
             given = self._delta.absolute(np.array(given, dtype=np.float64))
         self._given[...] = given  # every 32-bit number is a 64-bit one
-        command = self._command
+        command = np.empty(given.shape)  # the world remembers it
         if not self._scale_and_clip(self._given, *self._range, command):
             raise ActionError(f"an action is {finite(command.size)}, got {action!r}", action)
         return command

@@ -41,7 +41,7 @@ def action_scale(world: World) -> tuple[Floats, Floats]:
     What has no two bounds keeps its unit.
     """
     low, high = world.action_low, world.action_high
-    bounded = np.isfinite(low + high) & (low < high)
+    bounded = np.isfinite(low) & np.isfinite(high) & (low < high)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     return (low + high) / 2.0, (high - low) / 2.0
 
