@@ -77,10 +77,10 @@ def actions(steps: int, worlds: int | None = None) -> NDArray[np.float32]:
 def bare(env: ScmWorldEnv) -> Callable[[NDArray[np.float64]], None]:
     """Give the engine's own step of the scene of an environment: a command, and nothing else."""
     world = env.world
-    mode, substeps, engine = world._mode, world._substeps, world.backend
+    mode, substeps, engine = world.composition.mode, world._substeps, world.backend
     return lambda command: engine.step(mode, command, substeps)
 
 
 def commands(env: ScmWorldEnv, given: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     """Turn actions into what the engine takes, each shape (9,)."""
-    return [np.array(env._command(action)) for action in given]
+    return [np.array(env._commanded(action)) for action in given]

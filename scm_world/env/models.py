@@ -40,6 +40,7 @@ def model_env(model: Any = None, **options: Any) -> ScmWorldEnv:
 
     Example:
         >>> import gymnasium
+        >>> import numpy as np
         >>> pendulum = '''<mujoco><worldbody><body name="pole"><joint name="hinge" damping="0.1"/>
         ...   <geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/></body></worldbody>
         ...   <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>'''

@@ -78,8 +78,8 @@ class World(Simulated):
             ...     "</mujoco>"
             ... )
             >>> world.reset(seed=0)
-            >>> print(world.do({"pole.mass": 2.0}))
-            pole.mass = 2, engine reports 2
+            >>> print(world.do({"pole.mass": 2.5}))
+            pole.mass = 2.5, engine reports 2.5
         """
         return cls(
             ModelTask(source, **options),

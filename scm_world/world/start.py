@@ -10,7 +10,7 @@ import numpy as np
 from scm_world._types import Value, Values
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.graph import SCM, Moment
+from scm_world.graph import Moment
 from scm_world.models import Model, State
 from scm_world.scene.feasibility import TOLERANCE
 from scm_world.tasks import ModelTask, Task, make_task, tasks
@@ -129,15 +129,16 @@ def whole_number(option: str, value: Any, *, least: int) -> int:
     return int(value)
 
 
-def check_functions(model: SCM, values: Values) -> None:
+def check_functions(declaration: Declaration, values: Values) -> None:
     """Check what the functions of readouts give at the beginning.
 
     Raises:
         ModelError: One gives no finite numbers of the declared shape, or is out of bounds.
     """
     problems = []
-    for variable in model.variables:
-        if not isinstance(variable, Measured) or variable.mechanism is None:
+    for variable in declaration.model.variables:
+        given = isinstance(variable, Measured) and variable.mechanism is not None
+        if not given or variable.name in declaration.bundles:
             continue
         value = values[variable.name]
         try:

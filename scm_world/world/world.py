@@ -213,7 +213,7 @@ class World(Stepped):
         self._readouts.forget()
         if self.task.checks_functions and not self._checked:
             self._readouts.evaluate()
-            check_functions(self.model, self._now)
+            check_functions(self.declaration, self._now)
             self._checked = True
         self._instant = self._present(at_start=True)
 
