@@ -16,6 +16,7 @@ from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.policies import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
+from scm_world.evaluation.recording.environments import refuse_untrusted
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import Seat, listed
 from scm_world.evaluation.setups import Place, Setup
@@ -112,9 +113,7 @@ def _place(
             raise UnknownOption("task", task, (f"{made} with {about['arguments']}",))
         return place
     text = about["task"]
-    if ":" in text and not (known or text.partition(".")[0].partition(":")[0] in trusted):
-        advice = (f"task={text!r}", "trusted=(…) with its module, to run what is in there")
-        raise UnknownOption("task of an evaluation", text, advice)
+    refuse_untrusted(text, None if known else trusted)
     if text not in tasks() and not text.endswith(FILES) and ":" not in text:
         allowed = (*tasks(), "one of your own, if it is given: task=")
         raise UnknownOption("task", about.get("class", about["task"]), allowed)

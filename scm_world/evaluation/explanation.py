@@ -79,7 +79,7 @@ class Otherwise:
         would_be: Its value otherwise.
         score: Of the episode.
         would_score: It would have scored this.
-        would_succeed: Whether it would have succeeded in the end.
+        would_succeed: Whether it would have succeeded in the end, if the task says so.
     """
 
     variable: str
@@ -87,7 +87,7 @@ class Otherwise:
     would_be: tuple[float, ...]
     score: float
     would_score: float
-    would_succeed: bool
+    would_succeed: bool | None
 
     @property
     def gain(self) -> float:
@@ -96,6 +96,7 @@ class Otherwise:
 
     def __str__(self) -> str:
         success = "would have succeeded" if self.would_succeed else "would not have succeeded"
+        success = "would have scored" if self.would_succeed is None else success
         was, would_be = (_numbers(value) for value in (self.was, self.would_be))
         return (
             f"with {self.variable} = {would_be} instead of {was} it {success}: "
@@ -216,8 +217,9 @@ def _others(
         except EvaluationError as error:
             left_out[name] = error.reason
         else:
-            success = bool(then.scores.get("success", False))
-            scores = row.scores[metric], then.scores[metric], success
+            success = then.scores.get("success")
+            reached = None if success is None else bool(success)
+            scores = row.scores[metric], then.scores[metric], reached
             would_be = tuple(then.drawn.get(name, look.value))
             one = Otherwise(name, tuple(row.drawn[name]), would_be, *scores)
             reason = _no_answer(one, row, then, part.found, arena.env.world)

@@ -223,6 +223,8 @@ def played(
     tell = _teller(progress, sum(shard.stop - shard.first for shard in shards))
     tell(found)
     with opened(executor) as player:
+        if not isinstance(player, Serial):
+            setup.place.refuse_unsent(player)
         for seat in setup.seats:
             player.check(f"policy {seat.agent!r} with several workers", seat.policy)
         threads = cores() if isinstance(player, Serial) else 1  # workers share the cores

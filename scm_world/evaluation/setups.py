@@ -24,6 +24,7 @@ from scm_world.models import Model
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
 from scm_world.tasks import TASKS, Task, make_task, tasks
+from scm_world.work.executors import Executor
 from scm_world.world.start import whole_number
 
 SHARD = 25
@@ -45,6 +46,21 @@ class Place:
 
     task: Task | str
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    def refuse_unsent(self, executor: Executor) -> None:
+        """Refuse a task that other processes cannot be given.
+
+        Raises:
+            UnknownOption: With what to do.
+        """
+        try:
+            executor.check("task with several workers", self.task)
+        except UnknownOption as error:
+            allowed = (
+                "a name, a file or 'module:function' for a function that makes it",
+                f"workers=None ({error})",
+            )
+            raise UnknownOption("task with several workers", self.name, allowed) from error
 
     def env(self, engine: str, form: Mapping[str, Any] | None = None) -> ScmWorldEnv:
         """Make the environment on an engine.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,24 @@ def named(task: Any) -> str:
     return task.name if isinstance(task, Task) else str(task)
 
 
-def remade(made_with: Mapping[str, Any], task: Task | None = None) -> ScmWorldEnv:
+def refuse_untrusted(text: str, trusted: Sequence[str] | None) -> None:
+    """Refuse to run a function that a file names, as ``"module:function"`` for a task.
+
+    Args:
+        text: The task.
+        trusted: Packages whose functions may be called, without ``.py``; any if None.
+
+    Raises:
+        UnknownOption: With what to do.
+    """
+    home, colon, _ = text.rpartition(":")
+    package = Path(home).stem if home.endswith(".py") else home.partition(".")[0]
+    if colon and trusted is not None and package not in trusted:
+        allowed = (f"task={text!r}, or trusted={(package,)}, to run what is in there",)
+        raise UnknownOption("task that a file names", text, allowed)
+
+
+def remade(made_with: Mapping[str, Any], task: Task | str | None = None) -> ScmWorldEnv:
     """Make an environment again, for repeating what was done.
 
     Args:
@@ -56,8 +74,10 @@ def remade(made_with: Mapping[str, Any], task: Task | None = None) -> ScmWorldEn
         raise SnapshotMismatch(
             f"the recording is one of another version: environments have no option {min(unknown)!r}"
         )
-    if task is not None:
+    if isinstance(task, Task):
         arguments |= {"task": task, "task_options": None}
+    elif task is not None:
+        arguments["task"] = task
     return ScmWorldEnv(**arguments)
 
 

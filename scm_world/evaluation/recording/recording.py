@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scm_world.env.observer import Observation
 from scm_world.errors import ModelError, SnapshotMismatch, UnreadableFile
-from scm_world.evaluation.recording.environments import named, remade
+from scm_world.evaluation.recording.environments import named, refuse_untrusted, remade
 from scm_world.evaluation.recording.episodes import Recorded, parts
 from scm_world.evaluation.recording.headers import ADVICE, written
 from scm_world.evaluation.recording.minari_datasets import from_dataset, to_dataset
@@ -36,12 +36,15 @@ class Recording:
         episodes: What happened.
         versions: What it was made with.
         policy: What acted, if it is known.
+        trusted: Packages whose functions may be called to make the environment again; any if the
+            recording was made in this process.
     """
 
     environment: Mapping[str, Any]
     episodes: tuple[Recorded, ...]
     versions: Mapping[str, str] = field(default_factory=dict)
     policy: Mapping[str, Any] | None = None
+    trusted: Sequence[str] | None = field(default=None, compare=False, repr=False)
 
     def __len__(self) -> int:
         """Give the number of episodes."""
@@ -65,7 +68,7 @@ class Recording:
         """Give what was seen and what was done then, for behavior cloning.
 
         Returns:
-            Observations, shape (n, k), and actions, shape (n, 9), of all control steps. The parts
+            Observations, shape (n, k), and actions, shape (n, m), of all control steps. The parts
             of an observation that has names follow one another in the order of the names.
 
         Raises:
@@ -78,20 +81,23 @@ class Recording:
         actions = np.concatenate([e.actions for e in self.episodes])
         return np.array(rows, dtype=np.float32), actions.astype(np.float32)
 
-    def replay(self, which: int | None = None, *, task: Task | None = None) -> int:
+    def replay(self, which: int | None = None, *, task: Task | str | None = None) -> int:
         """Live through episodes again, and compare observations, rewards and true states.
 
         Args:
             which: Number of the episode; all if None.
-            task: In the place of the task of the recording, if that is not registered.
+            task: In the place of the task of the recording, if that is not registered, or the
+                text that names it, to run what is in there.
 
         Returns:
             How many control steps happened again, bit for bit.
 
         Raises:
             SnapshotMismatch: Something differs; it says from which control step on.
-            UnknownOption: The task is not registered.
+            UnknownOption: The task is not registered, or a function of no trusted package.
         """
+        if task is None:
+            refuse_untrusted(named(self.environment["task"]), self.trusted)
         numbers = range(len(self)) if which is None else (range(len(self))[which],)
         env = remade(self.environment, task)
         try:
@@ -142,7 +148,8 @@ class Recording:
         except OSError as error:
             raise UnreadableFile(str(path), said(error), ADVICE) from None
         header, episodes = decoded(data, str(path), trusted)
-        return cls(header.environment, tuple(episodes), header.versions, header.policy)
+        about = header.environment, tuple(episodes), header.versions, header.policy
+        return cls(*about, tuple(trusted))
 
     def to_minari(self, dataset_id: str, **about: Any) -> Any:
         """Write a dataset of Minari; ``recover_environment`` of it gives the environment.
@@ -178,7 +185,8 @@ class Recording:
             ModelError: A mechanism is a function of no trusted package.
         """
         header, episodes = from_dataset(dataset, trusted)
-        return cls(header.environment, tuple(episodes), header.versions, header.policy)
+        about = header.environment, tuple(episodes), header.versions, header.policy
+        return cls(*about, tuple(trusted))
 
     def _header(self) -> str:
         return written(self.environment, self.versions, self.policy, self.episodes)

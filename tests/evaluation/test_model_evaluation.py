@@ -1,0 +1,183 @@
+"""Protocols and evaluations of models: tasks that are files, functions, or objects."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from scm_world import ModelTask
+from scm_world.cli import app
+from scm_world.env import ScmWorldEnv
+from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
+from scm_world.evaluation import (
+    Evaluation,
+    Recording,
+    WorldPolicy,
+    check,
+    evaluate,
+    protocols_of,
+    record,
+    why,
+)
+from scm_world.evaluation.lockstep import Lockstep
+from scm_world.evaluation.reporting import write_outputs
+from scm_world.tasks.factories import load_factory
+
+FILE = Path(__file__).parents[1] / "env" / "model_tasks.py"
+Balance, Falling, Scored, Decay = (
+    load_factory(f"{FILE}:{name}") for name in ("Balance", "Falling", "Scored", "Decay")
+)
+
+
+def proportional(observation: np.ndarray) -> np.ndarray:
+    """Push against the fall, a little."""
+    return np.clip(2.0 * observation[2:3] + 0.3 * observation[3:4], -1.0, 1.0)
+
+
+def test_protocols_follow_from_the_spaces() -> None:
+    """Nothing, everything from A, one from A, and likewise B."""
+    found = {p.name: (p.varies, p.space) for p in protocols_of(f"{FILE}:Balance")}
+    assert found == {
+        "P0": ((), "A"),
+        "A": (("pole.mass", "motor.gear"), "A"),
+        "A:pole.mass": (("pole.mass",), "A"),
+        "A:motor.gear": (("motor.gear",), "A"),
+        "B": (("pole.mass",), "B"),
+        "B:pole.mass": (("pole.mass",), "B"),
+    }
+    assert [p.name for p in protocols_of(Decay())] == ["P0", "B", "B:rate"]
+    with pytest.raises(UnknownOption, match="did you mean 'pushing'"):
+        protocols_of("pushin")
+
+
+def test_a_file_is_evaluated_kept_and_checked(tmp_path: Path) -> None:
+    """By its text: scores, resuming, results on disk, replays; another model is told apart."""
+    file = tmp_path / "tasks.py"
+    shutil.copy(FILE, file)
+    task, agents = f"{file}:Balance", {"mine": proportional, "random": "random"}
+    found = evaluate(agents, "P0,A,B", task=task, n=6, out=tmp_path / "out")
+    assert (found.metrics, found.metric()) == (("success", "return"), "success")
+    assert found.score("A", agent="mine").value == 1.0
+    assert found.score("A", "return", agent="mine").value > 28.0
+    low, high = found.only(agent="mine", protocol="B").drawn()["pole.mass"].ravel()[[0, 1]]
+    assert 0.2 <= low <= 0.4
+    assert low != high
+    assert evaluate(agents, "P0,A,B", task=task, n=6, out=tmp_path / "out") == found
+    found.save(tmp_path / "out")
+    loaded = Evaluation.load(tmp_path / "out")
+    assert loaded == found
+    assert loaded.about["task"] == task
+    with pytest.raises(UnknownOption, match="trusted"):
+        check(loaded, policy=agents)
+    assert check(loaded, policy=agents, task=task, episodes=4, seed=0)
+    assert check(found, episodes=4, seed=0)
+    files = write_outputs(found, tmp_path / "out")
+    assert {file.name for file in files} >= {"bars.png", "report.html"}
+    text = file.read_text().replace('mass=".1"', 'mass=".12"')
+    file.write_text(text)
+    with pytest.raises((UnknownOption, SnapshotMismatch), match=r"model|tasks"):
+        check(loaded, policy=agents, task=task, episodes=1)
+    other = evaluate(agents, "P0", task=task, n=6, out=tmp_path / "out")
+    assert other != found.only(protocol="P0")
+
+
+def test_what_a_variable_did_is_explained() -> None:
+    """An episode in B is played again with another mass."""
+    task = f"{FILE}:Falling"
+    found = evaluate("still", "B:pole.mass", task=task, n=2)
+    assert found.metrics == ("return",)
+    answer = why(found, "B:pole.mass", 0)
+    assert [one.variable for one in answer.others] == ["pole.mass"]
+    assert answer.others[0].would_succeed is None
+    assert "succeed" not in str(answer)
+    assert found.causes("B:pole.mass") is not None
+
+
+def test_episodes_end_where_the_task_says_so() -> None:
+    """Each has as many steps as it had; the last one counts."""
+    driven = WorldPolicy(lambda world: world.action_high)
+    found = evaluate(driven, "P0", task=Falling(), n=3)
+    assert (found.columns["steps"] < 30).all()
+    found = evaluate("still", "P0", task=Scored(), n=2)
+    assert found.metrics[0] == found.metric() == "last_fractional_success"
+    assert (found.columns["steps"] == 30).all()
+
+
+def test_side_by_side_is_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the engine steps many worlds, rows are the same, bit for bit."""
+    played: list[int] = []
+    original = Lockstep.play
+
+    def play(self: Lockstep, *given: Any) -> Any:
+        rows = original(self, *given)
+        played.append(len(rows or ()))
+        return rows
+
+    monkeypatch.setattr(Lockstep, "play", play)
+    for kind in (Balance, Falling):
+        together = evaluate(proportional if kind is Balance else "random", "A", task=kind(), n=5)
+        with monkeypatch.context() as alone:
+            alone.setattr(Lockstep, "_takes", lambda *_: False)
+            other = evaluate(proportional if kind is Balance else "random", "A", task=kind(), n=5)
+        assert together == other
+    assert played[0] in (0, 5)  # one core plays one after another
+
+
+def test_workers_need_a_task_that_can_be_sent() -> None:
+    """A text can; an object with a lambda cannot, and the error says what to do."""
+    how: Any = {"n": 26, "workers": 2, "env": {"max_episode_length": 2}}
+    task = f"{FILE}:Balance"
+    assert evaluate("random", "P0", task=task, **how) == evaluate(
+        "random", "P0", task=task, n=26, env={"max_episode_length": 2}
+    )
+    mine = Balance(reward=(lambda angle: 2.0 * angle, "hinge.position"))
+    assert len(evaluate("random", "P0", task=mine, n=2)) == 2
+    with pytest.raises(UnknownOption, match="module:function"):
+        evaluate("random", "P0", task=mine, **how)
+
+
+def test_many_actions_are_checked() -> None:
+    """A policy for another number of actuators is named."""
+    with pytest.raises(ModelError, match="no reward"):
+        evaluate("random", "P0", task=ModelTask(Balance().system), n=1)
+    from scm_world.errors import EvaluationError
+
+    with pytest.raises(EvaluationError, match=r"shape \(1,\)"):
+        evaluate([np.zeros((3, 2))], "P0", task=Balance(), n=1)
+
+
+def test_episodes_are_recorded_and_replayed(tmp_path: Path) -> None:
+    """A recording names the task by a text, from which it is made again."""
+    env = ScmWorldEnv(f"{FILE}:Falling")
+    found = record("random", env, 2, seed=1, out=tmp_path / "runs.parquet")
+    assert found[0].infos == {}
+    loaded = Recording.load(tmp_path / "runs.parquet")
+    assert [*loaded] == [*found]
+    with pytest.raises(UnknownOption, match="trusted"):
+        loaded.replay()
+    assert loaded.replay(task=f"{FILE}:Falling") == found.replay() == sum(map(len, found))
+    loaded = Recording.load(tmp_path / "runs.parquet", trusted=("model_tasks",))
+    assert loaded.replay(1) == len(found[1])
+    assert loaded[0].terminations[-1] or loaded[0].truncations[-1]
+
+
+def test_the_command_line_evaluates_files(tmp_path: Path) -> None:
+    """A file:function where a task is named; a model without a reward is refused."""
+    runner, folder = CliRunner(), tmp_path / "out"
+    given = ["evaluate", "random", f"{FILE}:Balance", "--protocols", "P0,B", "-n", "2"]
+    done = runner.invoke(app, [*given, "--out", str(folder), "--format", "csv"])
+    assert done.exit_code == 0, done.output
+    results = json.loads((folder / "results.json").read_text())
+    assert [row["protocol"] for row in results["scores"]] == ["P0", "B"]
+    assert results["about"]["task"] == f"{FILE}:Balance"
+    model = tmp_path / "cartpole.xml"
+    model.write_text(Balance.model)
+    done = runner.invoke(app, ["evaluate", "random", str(model), "-n", "1"])
+    assert done.exit_code != 0
+    assert "reward" in done.output
