@@ -16,8 +16,8 @@ from scm_world.env import MODEL_ID
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the scripts are no part of the package
 
-from benchmarks.models.gymnasium_tasks import PAIRS  # noqa: E402 # from there
-from benchmarks.models.speed import RAW, compare  # noqa: E402
+from benchmarks.models.gymnasium_tasks import PAIRS  # from there
+from benchmarks.models.speed import RAW, compare
 
 
 @pytest.mark.parametrize("name", PAIRS)
