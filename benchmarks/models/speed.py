@@ -24,6 +24,7 @@ WORLDS, THREADS = 64, 2
 MICRO = 1e6
 GOALS = {"single": 1.0, "per core": 1.3, "on the clock": 2.2}
 RAW = {"normalize_observations": False, "normalize_actions": False}
+ENDLESS = {**RAW, "max_episode_length": 10**9}
 
 
 def single(env: Any, actions: Any, clock: Callable[[], float]) -> float:
@@ -33,6 +34,14 @@ def single(env: Any, actions: Any, clock: Callable[[], float]) -> float:
     for action in actions:
         env.step(action)
     return (clock() - started) / len(actions) * MICRO
+
+
+def reset(env: Any, count: int) -> float:
+    """Give the time of a reset [µs]."""
+    started = time.process_time()
+    for _ in range(count):
+        env.reset()
+    return (time.process_time() - started) / count * MICRO
 
 
 def many(envs: Any, actions: Any, clock: Callable[[], float]) -> float:
@@ -64,9 +73,9 @@ def compare(pair: Pair, steps: int, rounds: int) -> dict[str, float]:
         Medians over rounds: times [µs], and how many times faster we are.
     """
     theirs = gymnasium.make(pair.id, **pair.options)
-    ours = gymnasium.make("scm_world/Model-v0", model=pair.make(), **RAW)
+    ours = gymnasium.make("scm_world/Model-v0", model=pair.make(), **ENDLESS)
     envs = gymnasium.make_vec(
-        "scm_world/Model-v0", WORLDS, model=pair.make(), threads=THREADS, copy=False, **RAW
+        "scm_world/Model-v0", WORLDS, model=pair.make(), threads=THREADS, copy=False, **ENDLESS
     )
     space, rng = theirs.action_space, np.random.default_rng(0)
     one: Any = rng.uniform(space.low, space.high, (steps, *space.shape)).astype(np.float32)
@@ -82,6 +91,8 @@ def compare(pair: Pair, steps: int, rounds: int) -> dict[str, float]:
             "physics": bare(theirs, one, time.process_time),
             "batch, CPU": many(envs, all_, time.process_time),
             "batch, clock": many(envs, all_, time.perf_counter),
+            "reset, theirs": reset(theirs, 50),
+            "reset, ours": reset(ours, 50),
         }
         for _ in range(rounds)
     ]

@@ -79,6 +79,7 @@ class Realization(ABC):
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
         self._bodies, self._owners = bodies, owners
         self.kept: dict[ParameterKey, Floats] = {}
+        self._numbers: bytes | None = None  # of what is kept, if nothing was written since
         self.mode = self.modes[0]
         self.edited = True
         self.staged = has_stages(model)
@@ -205,8 +206,9 @@ class Realization(ABC):
 
     def fingerprint(self) -> tuple[Any, ...]:
         """Sum up what the model is made of besides its structure: models of one sum are alike."""
-        numbers = b"".join(value.tobytes() for value in self.kept.values())
-        return self.mode, tuple(self.kept), numbers
+        if self._numbers is None:
+            self._numbers = b"".join(value.tobytes() for value in self.kept.values())
+        return self.mode, tuple(self.kept), self._numbers
 
     def check(self, keys: Iterable[ParameterKey]) -> None:
         """Raise ``UnknownOption`` for the first parameter that there is not."""
@@ -242,7 +244,7 @@ class Realization(ABC):
                 kept[key] = given
             if not before:
                 return
-            self.edited = True
+            self.edited, self._numbers = True, None
             reason = self.followed(before)
             if reason:
                 names = ", ".join(".".join(key) for key in before)
@@ -269,6 +271,7 @@ class Realization(ABC):
 
     def _take_back(self, before: Mapping[ParameterKey, Floats | None]) -> None:
         """Write old values again; where there is none, the model is new and is given up."""
+        self._numbers = None
         for key, value in before.items():
             if value is not None:
                 self.kept[key] = value
