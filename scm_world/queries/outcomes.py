@@ -95,7 +95,8 @@ def usual_outcomes(world: World) -> tuple[str, ...]:
     """
     if FRACTION in world.model:
         return (FRACTION,)
-    found: tuple[str, ...] = world.declaration.computed
+    declaration = world.declaration
+    found = tuple(name for name in declaration.computed if name not in declaration.bundles)
     if not found:
         allowed = ("names of variables, such as " + repr(next(iter(world.declaration.slices))),)
         raise UnknownOption("outcomes", None, allowed)

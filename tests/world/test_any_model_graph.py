@@ -203,5 +203,5 @@ def test_an_action_without_bounds_is_varied() -> None:
     assert paired.targets == ()
     assert paired.actions == ("left_motor.control",)
     moved = {effect for cause, effect, _ in paired.effects.found(0.0)}
-    assert moved == {"left.position", "left.velocity"}
+    assert moved == {"action", "left.position", "left.velocity"}  # action is both controls
     assert all(np.isfinite(size) for size in paired.effects.largest.values())
