@@ -147,9 +147,10 @@ def test_many_do_what_single_ones_do(kind: Any, mode: str, crew: str) -> None:
     single.close()
 
 
-def test_many_worlds_of_a_function() -> None:
+@pytest.mark.parametrize("crew", ["native", "loop"])
+def test_many_worlds_of_a_function(crew: str) -> None:
     """Also where the physics is a function, and actions have two components."""
-    many = gymnasium.make_vec(MODEL_ID, 2, model=Decay(), backend="step")
+    many = gymnasium.make_vec(MODEL_ID, 2, model=Decay(), backend="step", crew=crew)
     one = make(Decay(), backend="step")
     seen, _ = many.reset(seed=0)
     np.testing.assert_array_equal(seen[0], one.reset(seed=0)[0])

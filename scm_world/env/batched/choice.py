@@ -11,6 +11,9 @@ from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.work.threads import cores
 
+TOGETHER = ("mujoco", "step")
+"""Engines that step many worlds in one call."""
+
 CREWS = ("native", "processes", "loop")
 
 
@@ -58,7 +61,7 @@ def fastest(backend: str, num_envs: int, *, workers: int | None) -> str:
 
     A process of a pool starts none of its own.
     """
-    if backend == "mujoco" and workers is None:
+    if backend in TOGETHER and workers is None:
         return "native"
     several = num_envs > 1 and cores() > 1 and not multiprocessing.current_process().daemon
     return "processes" if workers is not None or (backend == "bullet" and several) else "loop"
