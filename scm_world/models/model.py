@@ -1,7 +1,7 @@
 """The description of any articulated system: typed tables of what can be set, read and commanded.
 
-Engine-free. A reader (``backends.mujoco.reading``, ``backends.bullet.reading``) makes it from a
-file; an engine realises it. The tables say on which kinematic trees each quantity acts, always or
+Engine-free. ``backends.mujoco.reading`` makes it from a file, for every engine; an engine realises
+it. The tables say on which kinematic trees each quantity acts, always or
 while there is contact: the causal graph follows from them and from nothing else.
 """
 

@@ -1,4 +1,4 @@
-"""What an engine is told, and what a picture shows."""
+"""Scenes: the input of an engine and of a picture."""
 
 from __future__ import annotations
 
