@@ -13,13 +13,13 @@ from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.arena import FRACTIONS, Row
 from scm_world.evaluation.statistics import (
+    LEVEL,
     Causes,
     Interval,
     aggregate,
     find_causes,
     mean_interval,
 )
-from scm_world.evaluation.statistics.intervals import LEVEL
 from scm_world.evaluation.tables import (
     DRAWN,
     KEYS,

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.arena import METRICS, Row
-from scm_world.evaluation.statistics import Interval, difference_interval
-from scm_world.evaluation.statistics.proportions import is_binary
+from scm_world.evaluation.statistics import Interval, difference_interval, is_binary
 
 TEXTS = ("agent", "engine", "protocol", "hash")
 WHOLE = ("run", "seed", "episode", "steps")

@@ -3,19 +3,25 @@
 Every draw comes from a seed, so the same numbers give the same intervals.
 """
 
-from scm_world.evaluation.statistics.aggregate import METRICS, aggregate
+from scm_world.evaluation.statistics.aggregates import (
+    METRICS,
+    Profile,
+    aggregate,
+    performance_profile,
+    probability_of_improvement,
+)
 from scm_world.evaluation.statistics.causes import Cause, Causes, Column, find_causes
-from scm_world.evaluation.statistics.improvement import probability_of_improvement
 from scm_world.evaluation.statistics.intervals import (
+    LEVEL,
     Interval,
     difference_interval,
+    is_binary,
     mean_interval,
-    pairing_gain,
     unpaired_interval,
 )
-from scm_world.evaluation.statistics.profiles import Profile, performance_profile
 
 __all__ = [
+    "LEVEL",
     "METRICS",
     "Cause",
     "Causes",
@@ -25,8 +31,8 @@ __all__ = [
     "aggregate",
     "difference_interval",
     "find_causes",
+    "is_binary",
     "mean_interval",
-    "pairing_gain",
     "performance_profile",
     "probability_of_improvement",
     "unpaired_interval",

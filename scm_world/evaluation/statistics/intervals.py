@@ -1,43 +1,39 @@
 """Means and differences of scores, with intervals.
 
-The intervals are percentiles of a bootstrap that resamples within each stratum (Efron and
-Tibshirani, *An Introduction to the Bootstrap*, 1993). Where every score is 0 or 1 they are those of
-``proportions``, because a bootstrap of two hundred successes in a row has no width.
+Intervals are percentiles of a bootstrap within each stratum (Efron and Tibshirani, *An Introduction
+to the Bootstrap*, 1993). Success rates get intervals of the binomial distribution instead, because
+a bootstrap of two hundred successes in a row has no width.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from statistics import NormalDist
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.statistics.inputs import checked_level, numbers, strata_of
-from scm_world.evaluation.statistics.proportions import (
-    is_binary,
-    paired_bounds,
-    proportion_bounds,
-)
-from scm_world.evaluation.statistics.resampling import percentiles, resampled_mean
 
 LEVEL = 0.95
 RESAMPLES = 2000
+BLOCK = 1_000_000  # numbers that are resampled at once, some ten megabytes
 
 
 @final
 @dataclass(frozen=True)
 class Interval:
-    """A number, and where it may as well be.
+    """An estimate with its confidence interval.
 
     Attributes:
         value: The estimate.
         low: Lower end; NaN if the data say nothing about it, as one number alone does.
         high: Upper end, or NaN.
         level: Confidence, such as 0.95.
-        n: From how many numbers.
+        n: How many numbers it is estimated from.
 
     Example:
         >>> print(Interval(0.931, 0.904, 0.952, level=0.95, n=200))
@@ -55,12 +51,17 @@ class Interval:
         """Length of the interval."""
         return self.high - self.low
 
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """The value, and the ends of its interval if they are known."""
+        return (self.value,) if math.isnan(self.width) else (self.value, self.low, self.high)
+
     def excludes(self, number: float) -> bool:
         """Whether a number lies outside; never if the ends are unknown."""
         return self.low > number or self.high < number
 
     def as_dict(self) -> dict[str, Any]:
-        """Write it as plain data, in which an unknown end is None."""
+        """Return it as plain data, in which an unknown end is None."""
         found = asdict(self)
         return found | {end: None for end in ("low", "high") if math.isnan(found[end])}
 
@@ -84,34 +85,43 @@ def mean_interval(
 
     Args:
         values: One number per episode, shape ``(n,)``.
-        strata: To which stratum each belongs, for example its protocol, shape ``(n,)``. How many
-            episodes a stratum has was chosen, not found, so it is the same in every resample.
+        strata: To which stratum each belongs, for example its protocol, shape ``(n,)``. Every
+            resample has as many episodes of each stratum.
         level: Confidence.
-        resamples: Of the bootstrap.
+        resamples: Of the bootstrap, whose draws come from ``seed`` alone.
         seed: Of the bootstrap.
         proportion: Whether the values are failures and successes, 0 and 1, which get a Wilson
             interval. By default they are if each of them is 0 or 1.
 
     Returns:
         The mean. Its ends are unknown if no stratum has two numbers, unless these are proportions.
-        A stratum of a single number adds nothing to the width.
+        A stratum of a single number adds nothing to the width. Strata whose rates differ narrow a
+        Wilson interval: see ``_effective_size``.
 
     Raises:
         UnknownOption: No values; values, strata, level or resamples that are none; or a
             proportion of values that are not 0 or 1.
+
+    Source:
+        Wilson, *Probable inference*, Journal of the American Statistical Association 22, 1927;
+        with strata as in Korn and Graubard, *Confidence intervals for proportions*, Survey
+        Methodology 24, 1998.
 
     Example:
         >>> print(mean_interval([1.0] * 200))
         1.00 [0.98, 1.00]
     """
     scores = numbers("values", values)
-    members = strata_of(scores, strata)
-    level = checked_level(level)
+    members = _parted(scores, strata)
+    z2 = normal_quantile(level) ** 2
     if proportion and not is_binary(scores):
         raise UnknownOption("a value of a proportion", "another number", ("0 or 1",))
-    if is_binary(scores) if proportion is None else proportion:
-        return _around(scores, proportion_bounds(scores, members, level), level)
-    return _bootstrapped(scores, members, level, resamples, seed)
+    if not (is_binary(scores) if proportion is None else proportion):
+        return _bootstrapped_mean(scores, members, level, resamples, seed)
+    n, rate = _effective_size(members, z2), float(scores.mean())
+    center = (rate + z2 / (2.0 * n)) / (1.0 + z2 / n)
+    reach = math.sqrt(z2 * (rate * (1.0 - rate) + z2 / (4.0 * n)) / n) / (1.0 + z2 / n)
+    return _around(scores, max(0.0, center - reach), min(1.0, center + reach), level)
 
 
 def difference_interval(
@@ -124,59 +134,60 @@ def difference_interval(
     seed: int = 0,
     proportion: bool | None = None,
 ) -> Interval:
-    """Estimate how much higher ``a`` is than ``b``, where both met the same draws.
+    """Estimate how much higher ``a`` is than ``b`` in the same episodes (paired).
 
     Args:
         a: Scores of one policy, shape ``(n,)``.
         b: Scores of another in the same episodes, shape ``(n,)``.
         strata: To which stratum each episode belongs, shape ``(n,)``.
-        level: Confidence.
-        resamples: Of the bootstrap.
-        seed: Of the bootstrap.
-        proportion: Whether they are failures and successes; as for ``mean_interval``.
+        level: As for ``mean_interval``.
+        resamples: As for ``mean_interval``.
+        seed: As for ``mean_interval``.
+        proportion: As for ``mean_interval``.
 
     Returns:
-        The mean of ``a - b``. Where every score is 0 or 1 the interval is that of Bonett and
-        Price, see ``proportions``; else a bootstrap of the differences.
+        The mean of ``a - b``, with a bootstrap of the differences. Where every score is 0 or 1 the
+        interval is that of Bonett and Price: one episode in which only the first succeeds and one
+        in which only the second does are added, shared among the strata.
 
     Raises:
         UnknownOption: As for ``mean_interval``, or ``a`` and ``b`` differ in length.
 
+    Source:
+        Bonett and Price, *Adjusted Wald confidence interval for a difference of binomial
+        proportions based on paired data*, Journal of Educational and Behavioral Statistics 37,
+        2012.
+
     Example:
         >>> a = np.random.default_rng(0).random(100)
-        >>> print(difference_interval(a + 0.1, a))
-        0.1000 [0.1000, 0.1000]
+        >>> print(difference_interval(a + 0.1, a), difference_interval([0.0] * 98, [0.0] * 98))
+        0.1000 [0.1000, 0.1000] 0.00 [-0.03, 0.03]
     """
     first, second = numbers("a", a), numbers("b", b)
     if first.shape != second.shape:
         raise UnknownOption("b", f"{second.size} scores", (f"one for each of the {first.size} a",))
     difference = first - second
-    members = strata_of(difference, strata)
-    level = checked_level(level)
+    members, z = _parted(difference, strata), normal_quantile(level)
     binary = is_binary(first) and is_binary(second)
-    if binary if proportion is None else proportion:
-        return _around(difference, paired_bounds(difference, members, level), level)
-    return _bootstrapped(difference, members, level, resamples, seed)
+    if not (binary if proportion is None else proportion):
+        return _bootstrapped_mean(difference, members, level, resamples, seed)
+    added = 1.0 / len(members)
+    n = np.array([len(part) + 2.0 * added for part in members])
+    wins = np.array([np.count_nonzero(part > 0.0) + added for part in members]) / n
+    losses = np.array([np.count_nonzero(part < 0.0) + added for part in members]) / n
+    weights = np.array([len(part) for part in members]) / len(difference)
+    center = float(weights @ (wins - losses))
+    reach = z * math.sqrt(weights**2 @ ((wins + losses - (wins - losses) ** 2) / n))
+    return _around(difference, max(-1.0, center - reach), min(1.0, center + reach), level)
 
 
-def unpaired_interval(
-    a: ArrayLike,
-    b: ArrayLike,
-    *,
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-    proportion: bool | None = None,
-) -> Interval:
-    """Estimate how much higher ``a`` is than ``b``, if the episodes have nothing in common.
+def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
+    """Estimate how much higher ``a`` is than ``b`` in independent episodes.
 
     Args:
         a: Scores, shape ``(m,)``.
         b: Other scores, shape ``(n,)``.
-        level: Confidence.
-        resamples: Of the bootstrap of each mean.
-        seed: Of the bootstrap.
-        proportion: Whether they are failures and successes; as for ``mean_interval``.
+        how: ``level``, ``resamples``, ``seed`` and ``proportion`` of ``mean_interval``.
 
     Returns:
         The difference of the means. Its ends are recovered from those of the two means.
@@ -193,69 +204,128 @@ def unpaired_interval(
         >>> print(unpaired_interval([1.0] * 56 + [0.0] * 14, [1.0] * 48 + [0.0] * 32))
         0.20 [0.05, 0.33]
     """
-    how: Any = {"level": level, "resamples": resamples, "seed": seed, "proportion": proportion}
-    one, other = (mean_interval(x, **how) for x in (a, b))
+    one, other = mean_interval(a, **how), mean_interval(b, **how)
     value = one.value - other.value
     below = math.hypot(one.value - one.low, other.high - other.value)
     above = math.hypot(one.high - one.value, other.value - other.low)
-    return Interval(value, value - below, value + above, level, one.n + other.n)
+    return Interval(value, value - below, value + above, one.level, one.n + other.n)
 
 
-def pairing_gain(a: ArrayLike, b: ArrayLike) -> float:
-    """Compute how many times fewer episodes a paired difference needs.
+def is_binary(values: Floats) -> bool:
+    """Whether every value is 0 or 1."""
+    return bool(np.all((values == 0.0) | (values == 1.0)))
+
+
+def bootstrap(
+    strata: Sequence[Floats],
+    statistic: Callable[..., Any],
+    *,
+    level: float,
+    resamples: int,
+    seed: int,
+) -> tuple[Any, Any]:
+    """Compute the percentile interval of a stratified bootstrap.
 
     Args:
-        a: Scores of one policy, shape ``(n,)``, n at least 2.
-        b: Scores of another in the same episodes, shape ``(n,)``.
+        strata: Numbers that are resampled within each of them, two or more, each of shape ``(n,)``.
+        statistic: Takes resamples of all strata, each of shape ``(resamples, n)``, and ``axis=-1``;
+            returns shape ``(..., resamples)``.
+        level: Confidence.
+        resamples: How many.
+        seed: Of the draws.
 
     Returns:
-        Variance of an unpaired difference over that of a paired one. 1 if neither policy's score
-        ever varies, infinite if only the difference never does.
+        Lower and upper ends, each of shape ``(...)``.
+    """
+    from scipy.stats import bootstrap as of_scipy
+
+    found = of_scipy(
+        strata, statistic, n_resamples=draws("resamples", resamples), vectorized=True,
+        batch=max(1, BLOCK // sum(map(len, strata))), confidence_level=level,
+        method="percentile", rng=np.random.default_rng(seed),
+    )  # fmt: skip
+    return found.confidence_interval.low, found.confidence_interval.high
+
+
+def numbers(name: str, values: ArrayLike, *, ndim: tuple[int, ...] = (1,)) -> Floats:
+    """Take an array of finite numbers with one of these numbers of axes.
 
     Raises:
-        UnknownOption: ``a`` and ``b`` differ in length, or have less than two scores.
+        UnknownOption: It has other axes, is empty, or something in it is no finite number.
 
     Example:
-        >>> pairing_gain([0.0, 1.0, 0.0, 1.0], [0.0, 1.0, 1.0, 0.0])
-        1.0
+        >>> numbers("values", [])
+        Traceback (most recent call last):
+            ...
+        scm_world.errors.UnknownOption: values cannot be 'an array of shape (0,)'; it can be: ...
     """
-    first, second = numbers("a", a), numbers("b", b)
-    if first.shape != second.shape or first.size < 2:
-        raise UnknownOption(
-            "a and b",
-            f"{first.size} and {second.size} scores",
-            ("two scores or more, the same number",),
-        )
-    apart, together = first.var() + second.var(), (first - second).var()
-    # Differences that are equal on paper differ by rounding.
-    if together <= 1e-20 * max(apart, np.square(first).mean()):
-        return 1.0 if apart <= together else math.inf
-    return float(apart / together)
+    wanted = f"one finite number or more, in an array of {' or '.join(map(str, ndim))} axes"
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise UnknownOption(name, "something else than numbers", (wanted,)) from None
+    if array.ndim not in ndim or array.size == 0:
+        raise UnknownOption(name, f"an array of shape {array.shape}", (wanted,))
+    if not np.isfinite(array).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise UnknownOption(name, f"{array[place]} at {place}", (wanted,))
+    return array
 
 
-def _around(values: Floats, ends: tuple[float, float], level: float) -> Interval:
-    mean = float(values.mean())
-    return Interval(mean, min(ends[0], mean), max(ends[1], mean), level, values.size)
+def draws(name: str, count: int, least: int = 2) -> int:
+    """Return a number of resamples or permutations, or raise ``UnknownOption``."""
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < least:
+        raise UnknownOption(name, count, (f"a whole number, {least} or more",))
+    return int(count)
 
 
-def _bootstrapped(
+def normal_quantile(level: float) -> float:
+    """Return by how many deviations a normal interval reaches to either side."""
+    if not 0.0 < level < 1.0:
+        raise UnknownOption("level", level, ("a number between 0 and 1, such as 0.95",))
+    return NormalDist().inv_cdf(0.5 + 0.5 * level)
+
+
+def _parted(values: Floats, strata: ArrayLike | None) -> list[Floats]:
+    """Part values by their strata; without strata, they are one."""
+    if strata is None:
+        return [values]
+    labels: Any = np.asarray(strata)
+    if labels.shape != values.shape:
+        allowed = (f"one for each of the {values.size} values",)
+        raise UnknownOption("strata", f"an array of shape {labels.shape}", allowed)
+    places: Any = np.unique(labels, return_inverse=True)[1]
+    return [values[places == k] for k in range(int(places.max()) + 1)]
+
+
+def _effective_size(strata: Sequence[Floats], z2: float) -> float:
+    """Compute how many episodes of one kind are worth as much as these.
+
+    The variances are those of rates drawn toward one half, as the Wilson interval draws its
+    center, so that a stratum in which all succeed is not taken for certain.
+    """
+    n = np.array([len(part) for part in strata], dtype=np.float64)
+    rates = (np.array([part.sum() for part in strata]) + 0.5 * z2) / (n + z2)
+    weights = n / n.sum()
+    pooled = weights @ rates
+    return float(pooled * (1.0 - pooled) / (weights**2 @ (rates * (1.0 - rates) / n)))
+
+
+def _bootstrapped_mean(
     values: Floats, strata: list[Floats], level: float, resamples: int, seed: int
 ) -> Interval:
-    if max(len(members) for members in strata) < 2:
+    several = [part for part in strata if len(part) > 1]
+    if not several:
         return Interval(float(values.mean()), math.nan, math.nan, level, values.size)
-    return _around(
-        values,
-        percentiles(resampled_mean(values, strata, resamples=resamples, seed=seed), level),
-        level,
-    )
+    single = sum(float(part[0]) for part in strata if len(part) == 1)
+
+    def mean(*parts: Floats, axis: int) -> Any:
+        return (single + sum(part.sum(axis=axis) for part in parts)) / values.size
+
+    low, high = bootstrap(several, mean, level=level, resamples=resamples, seed=seed)
+    return _around(values, float(low), float(high), level)
 
 
-__all__ = [
-    "LEVEL",
-    "RESAMPLES",
-    "Interval",
-    "difference_interval",
-    "mean_interval",
-    "pairing_gain",
-    "unpaired_interval",
-]
+def _around(values: Floats, low: float, high: float, level: float) -> Interval:
+    mean = float(values.mean())
+    return Interval(mean, min(low, mean), max(high, mean), level, values.size)
