@@ -27,7 +27,6 @@ from scm_world.cli.options import (
     Task,
 )
 from scm_world.cli.planning import plan
-from scm_world.cli.reproduction import reproduce
 from scm_world.cli.sampling import collect, sweep
 from scm_world.cli.train import train
 from scm_world.cli.working import Address, Engine, Work, Workers
@@ -176,7 +175,7 @@ def discover(
     raise typer.Exit(exam.run(sitting, out=out))
 
 
-for _command in (evaluate, explain, collect, sweep, plan, reproduce, train, clone):
+for _command in (evaluate, explain, collect, sweep, plan, train, clone):
     app.command()(_command)
 
 

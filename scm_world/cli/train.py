@@ -16,7 +16,7 @@ def train(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="tuned: what works best here; paper: the published settings.",
+            help="tuned: what works best here.",
             show_default="tuned",
         ),
     ] = None,

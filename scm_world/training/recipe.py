@@ -24,7 +24,6 @@ from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
 from scm_world.tasks import TASKS, Task, make_task, tasks
-from scm_world.training.paper import paper
 from scm_world.training.settings import (
     ALGORITHMS,
     Count,
@@ -46,7 +45,7 @@ from scm_world.training.tuned import tuned
 from scm_world.variables.spaces import Frozen
 
 FORMAT = "scm_world/recipe/1"
-PRESETS = {"tuned": tuned, "paper": paper}
+PRESETS = {"tuned": tuned}
 """Recipes that are there for the asking: each gives the fields for a task and an algorithm."""
 
 PUBLISHED: dict[int, Curriculum] = {
@@ -292,7 +291,7 @@ def recipe(
             ``"module:function"`` for a function or class that gives a task. Then the presets say
             nothing of the environment, and trials are in P0, A and B as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
-        preset: ``"tuned"``: what we found to work best; ``"paper"``: the published settings.
+        preset: ``"tuned"``: what we found to work best.
         curriculum: See ``curriculum_of``; that of the preset if None.
         changes: Fields of the ``Recipe`` or settings of the algorithm. What is a dictionary
             (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names.
