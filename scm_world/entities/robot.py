@@ -82,55 +82,29 @@ ACTUATOR_NOISE = "actuator_noise"
 
 
 @njit(cache=True)
-def tips_into(joint_positions: Floats, robot_height: Value, out: Floats) -> None:
-    """Write the three fingertips, shape (9,) [m]."""
-    forward_kernel(joint_positions, scalar(robot_height), out)
-
-
-@njit(cache=True)
 def tips(joint_positions: Floats, robot_height: Value) -> Floats:
     """Compute the three fingertips from the joints, shape (9,) [m]."""
     found = np.empty(9)
-    tips_into(joint_positions, robot_height, found)
+    forward_kernel(joint_positions, scalar(robot_height), found)
     return found
-
-
-@njit(cache=True)
-def finger_tip_into(
-    joint_positions: Floats, robot_height: Value, finger: float, out: Floats
-) -> None:
-    """Write the tip of one finger, shape (3,) [m]."""
-    q0, q1, q2 = joint_positions[0], joint_positions[1], joint_positions[2]
-    tip_kernel(int(finger), q0, q1, q2, scalar(robot_height), out, 0)
 
 
 @njit(cache=True)
 def finger_tip(joint_positions: Floats, robot_height: Value, finger: float) -> Floats:
     """Compute the tip of one finger from its three joints, shape (3,) [m]."""
     found = np.empty(3)
-    finger_tip_into(joint_positions, robot_height, finger, found)
+    q0, q1, q2 = joint_positions[0], joint_positions[1], joint_positions[2]
+    tip_kernel(int(finger), q0, q1, q2, scalar(robot_height), found, 0)
     return found
-
-
-@njit(cache=True)
-def joints_tip_into(
-    q0: Value, q1: Value, q2: Value, robot_height: Value, finger: float, out: Floats
-) -> None:
-    """Write the tip of one finger, shape (3,) [m]."""
-    tip_kernel(int(finger), scalar(q0), scalar(q1), scalar(q2), scalar(robot_height), out, 0)
 
 
 @njit(cache=True)
 def joints_tip(q0: Value, q1: Value, q2: Value, robot_height: Value, finger: float) -> Floats:
     """Compute the tip of one finger from the angle of each joint, shape (3,) [m]."""
     found = np.empty(3)
-    joints_tip_into(q0, q1, q2, robot_height, finger, found)
+    height = scalar(robot_height)
+    tip_kernel(int(finger), scalar(q0), scalar(q1), scalar(q2), height, found, 0)
     return found
-
-
-_functions: Any = ((tips, tips_into), (finger_tip, finger_tip_into), (joints_tip, joints_tip_into))
-for _function, _into in _functions:
-    _function.into = _into  # a loop that keeps the array calls this instead
 
 
 RESOLUTIONS = ("vector", "finger", "joint")

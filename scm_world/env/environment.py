@@ -24,7 +24,6 @@ from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import scaled_clip_kernel
-from scm_world.geometry.direct import direct
 from scm_world.scene.camera import Camera
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
@@ -249,7 +248,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._delta = delta_for(mode, self.world, self._middle, self._half, **steps)
         self._given = np.empty(low.size)
         self._range = (self._middle, self._half, low, high)
-        self._scale_and_clip = direct(scaled_clip_kernel, self._given, *self._range, self._given)
         self.action_space = self._delta.space() if self._delta else box(*bounds)
 
     def relative(self) -> Delta:
@@ -362,7 +360,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             given = self._delta.absolute(np.array(given, dtype=np.float64))
         self._given[...] = given  # every 32-bit number is a 64-bit one
         command = np.empty(given.shape)  # the world remembers it
-        if not self._scale_and_clip(self._given, *self._range, command):
+        if not scaled_clip_kernel(self._given, *self._range, command):
             raise ActionError(f"an action is {finite(command.size)}, got {action!r}", action)
         return command
 
@@ -403,7 +401,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if self._counted.fraction:
             info["fractional_success"] = float(now[FRACTION])
         if self._goals is not None:
-            info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world, now)
+            info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world)
         info["reward_terms"] = terms = {}
         for name in self._terms:
             terms[name] = float(now[name])

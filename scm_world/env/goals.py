@@ -9,16 +9,15 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scm_world._types import Floats, Values
+from scm_world._types import Floats
 from scm_world.env.bounds import WIDE
 from scm_world.errors import UnknownOption
-from scm_world.geometry.direct import direct
-from scm_world.geometry.gather import gather_copied, places
 from scm_world.tasks import Task, TriFingerTask
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Linear
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
+from scm_world.world.mechanisms import places
 
 BOUND = 10.0
 """Goals of the robot are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
@@ -48,63 +47,23 @@ class Goals:
     def __init__(self, declaration: Declaration) -> None:
         sides = declaration.task.goal_names()
         self.names = (*sides[0], *sides[1])
-        self._both = Collected(declaration, self.names)
-        self._middle = Collected(declaration, sides[0]).size
-        sizes = (self._middle, self._both.size - self._middle)
+        where = declaration.mechanisms.where
+        self._sides = tuple(places(where[name] for name in side) for side in sides)
         self.bound = BOUND if isinstance(declaration.task, TriFingerTask) else WIDE
         self.spaces: dict[str, gymnasium.Space[Any]] = {
-            name: gymnasium.spaces.Box(-self.bound, self.bound, (size,), np.float64)
-            for name, size in zip(("achieved_goal", "desired_goal"), sizes, strict=True)
+            name: gymnasium.spaces.Box(-self.bound, self.bound, (side.size,), np.float64)
+            for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
 
-    def read(self, world: World, now: Values) -> tuple[Floats, Floats]:
+    def read(self, world: World) -> tuple[Floats, Floats]:
         """Give what is achieved and what is desired."""
-        both, middle = self._both.read(world, now), self._middle
-        return both[:middle], both[middle:]
+        row, (achieved, desired) = world.numbers[0], self._sides
+        return row.take(achieved), row.take(desired)
 
-    def observe(self, world: World, now: Values) -> dict[str, Floats]:
+    def observe(self, world: World) -> dict[str, Floats]:
         """Give both vectors, by name."""
-        pair = zip(self.spaces, self.read(world, now), strict=True)
+        pair = zip(self.spaces, self.read(world), strict=True)
         return {name: np.clip(goal, -self.bound, self.bound) for name, goal in pair}
-
-
-@final
-class Collected:
-    """The numbers of some variables, one after another.
-
-    Args:
-        declaration: Of the structure.
-        names: The variables.
-
-    Attributes:
-        size: How many numbers there are.
-    """
-
-    def __init__(self, declaration: Declaration, names: tuple[str, ...]) -> None:
-        sizes = [int(np.prod(declaration.model.declared(name).shape)) for name in names]
-        ends = np.cumsum(sizes).tolist()
-        where = [(n, slice(e - s, e)) for n, e, s in zip(names, ends, sizes, strict=True)]
-        self.size = ends[-1] if ends else 0
-        still, states = frozenset(declaration.static_names), declaration.slices
-        self._still = [(n, place) for n, place in where if n in still]
-        self._computed = [(n, at) for n, at in where if n not in states and n not in still]
-        self._numbers = np.empty(self.size)
-        sources = places(states[n] for n, _ in where if n in states)
-        self._moving = (sources, places(at for n, at in where if n in states), self._numbers)
-        self._copy = direct(gather_copied, np.empty(0), *self._moving, self._numbers)
-        self._version = -1
-
-    def read(self, world: World, now: Values) -> Floats:
-        """Copy the present numbers, shape (n,)."""
-        if self._version != world.version:
-            self._version = world.version
-            for name, place in self._still:
-                self._numbers[place] = np.ravel(now[name])
-        for name, place in self._computed:
-            self._numbers[place] = np.ravel(now[name])
-        found = np.empty(self.size)
-        self._copy(world.current()[1].vector, *self._moving, found)
-        return found
 
 
 @final

@@ -105,7 +105,7 @@ class Together:
     def observe(self, now: Values) -> dict[str, NDArray[Any]]:
         """Give all of them."""
         found = {name: part.observe(now) for name, part in self._parts.items()}
-        return found if self._goals is None else found | self._goals.observe(self._world, now)
+        return found if self._goals is None else found | self._goals.observe(self._world)
 
 
 def observer(

@@ -10,21 +10,22 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Value
+from scm_world._types import Floats, Integers, Value
 from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.env.bounds import WIDE
 from scm_world.env.keypoints import KEYPOINTS, Keypoints
-from scm_world.geometry.direct import direct
-from scm_world.geometry.gather import gather_scaled, places
+from scm_world.geometry.clipping import scale_rows
 from scm_world.tasks import TIME
 from scm_world.variables import Normal
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
+from scm_world.world.mechanisms import places
 
 Layouts = Mapping[str, Mapping[str, slice]]
 """Where each variable stands, for every vector by its name."""
 
-NOTHING = places(())
+FIRST = np.zeros(1, dtype=np.int64)
+"""The only row of a world by itself."""
 
 STREAM = "observation"
 """The stream of the noise of the sensors; draws of ``sensor_noise`` itself have another one."""
@@ -86,30 +87,15 @@ class Vector:
         bounded = (low > -WIDE) & (high < WIDE)
         sensed = np.concatenate([np.full(part.low.size, part.sensed) for part in parts])
         self._spread = np.where(bounded & sensed, (high - low) / 2.0, 0.0)
-        self._raw = np.empty(low.size)
-        self._arrange(declaration)
+        where = declaration.mechanisms.where
+        self._size = low.size
+        self._read = places(where[name] for name in self._slices if name != KEYPOINTS)
         self._published = world.conventions.published_observation
         hard = np.concatenate([np.full(part.low.size, part.saturates) for part in parts])
         self._scale(low, high, normalize & bounded & (high > low), hard)
         self._version = -1
         self._senses = SENSOR_NOISE in declaration.model
         self._noise = 0.0
-
-    def _arrange(self, declaration: Declaration) -> None:
-        """Sort the parts by how they are read."""
-        still, states = set(declaration.static_names), declaration.slices
-        fields = [(n, where) for n, where in self._slices.items() if n != KEYPOINTS]
-        read = [(where, states[n]) for n, where in fields if n in states]
-        self._read = (places(at for _, at in read), places(where for where, _ in read))
-        views = [
-            (n, self._raw[where].reshape(declaration.model.declared(n).shape))
-            for n, where in fields
-            if n not in states
-        ]
-        self._still = [view for view in views if view[0] in still]
-        computed = [view for view in views if view[0] not in still]
-        self._computed = [view for view in computed if view[1].ndim]
-        self._single = [(n, self._slices[n].start) for n, view in computed if not view.ndim]
 
     def _scale(
         self, low: Floats, high: Floats, scaled: NDArray[np.bool_], hard: NDArray[np.bool_]
@@ -121,40 +107,44 @@ class Vector:
         limits = (np.where(hard, low, -everything), np.where(hard, high, everything))
         limits = (-everything, everything) if self._published else limits
         self._scales = np.stack([*limits, gain, offset])
-        single = np.empty(0, dtype=np.float32)
-        like = (self._raw, *self._read, self._raw, self._scales, single)
-        self._write = direct(gather_scaled, *like)
         inside = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         inside = (np.where(hard, inside[0], -WIDE), np.where(hard, inside[1], WIDE))
         self.space = box(*(limits if self._published else inside))
         world = self._world
-        self._shift = 0.0
+        self._shift, self._shifts = 0.0, np.zeros(self._read.size)
         if self._published and TIME in self._slices and world.given_length is not None:
             # The predecessor subtracts seconds from a number of steps.
             self._shift = world.given_length * (1.0 - world.control_period)
+            self._shifts[self._slices[TIME]] = self._shift
+
+    def write(self, numbers: Floats, rows: Integers, out: NDArray[np.float32]) -> None:
+        """Write what is observed of some worlds, without the corners of blocks.
+
+        Args:
+            numbers: A row of values for each world; see ``Mechanisms``.
+            rows: Numbers of the worlds, shape (m,).
+            out: Their rows are written, shape (n_worlds, n).
+        """
+        scale_rows(numbers, rows, self._read, self._shifts, self._scales, out)
 
     def observe(self, now: Mapping[str, Value]) -> NDArray[np.float32]:
-        """Write the observation, shape (n,)."""
-        raw = self._raw
+        """Give the observation, shape (n,)."""
         if self._version != self._world.version:
             self._version = self._world.version
             self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
-            for name, place in self._still:
-                place[...] = now[name]
-        for name, place in self._computed:
-            place[...] = now[name]
-        for name, index in self._single:
-            raw[index] = now[name]
+        numbers = self._world.numbers
+        found: NDArray[np.float32] = np.empty((1, self._size), dtype=np.float32)
+        shown: NDArray[np.float32] = found[0]
+        if self._keypoints is None and not self._noise:
+            self.write(numbers, FIRST, found)
+            return shown
+        raw = numbers[0].take(self._read)
+        raw[self._shifts != 0.0] += self._shift
         if self._keypoints is not None:
-            raw[self._slices[KEYPOINTS]] = self._keypoints.observe(now)
-        if self._shift:
-            raw[self._slices[TIME]] += self._shift
-        vector = self._world.current()[1].vector
-        observation = np.empty(raw.size, dtype=np.float32)
-        self._write(vector, *self._read, raw, self._scales, observation)
-        if self._noise:
-            self._write(vector, NOTHING, NOTHING, self._sensed(raw), self._scales, observation)
-        return observation
+            raw = np.insert(raw, self._slices[KEYPOINTS].start, self._keypoints.observe(now))
+        raw = self._sensed(raw) if self._noise else raw
+        scale_rows(raw[None], FIRST, np.arange(raw.size), np.zeros(raw.size), self._scales, found)
+        return shown
 
     def _sensed(self, raw: Floats) -> Floats:
         """Add the noise of the sensors, the same whenever this instant is observed."""

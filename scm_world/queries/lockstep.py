@@ -18,8 +18,7 @@ from scm_world.queries.policies import Blind
 from scm_world.queries.traces import ALL, Trace, intervene, note_parameters, write
 from scm_world.queries.units import Unit
 from scm_world.world import World
-from scm_world.world.batch import Batch
-from scm_world.world.columns import Table
+from scm_world.world.batch import Batch, Table
 from scm_world.world.commands import clipped
 
 

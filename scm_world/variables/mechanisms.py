@@ -237,7 +237,7 @@ class Concatenation(Frozen):
 
     def bind(self) -> Joined:
         """Give the function of the parents."""
-        return Joined(self.shapes, self.slices)
+        return Joined(self.shapes)
 
     def split(self, value: Value) -> tuple[Value, ...]:
         """Give the values of the parents; the numbers are the last axis of the value."""
@@ -256,11 +256,10 @@ class Joined:
 
     Args:
         shapes: Of the parts.
-        slices: Where they stand in the bundle.
     """
 
-    def __init__(self, shapes: tuple[tuple[int, ...], ...], slices: tuple[slice, ...]) -> None:
-        self._shapes, self._slices = shapes, slices
+    def __init__(self, shapes: tuple[tuple[int, ...], ...]) -> None:
+        self._shapes = shapes
 
     def __call__(self, *parts: Value) -> Value:
         """Put values together, shape ``(..., n)``; leading axes broadcast."""
@@ -269,12 +268,6 @@ class Joined:
         flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
         whole = np.broadcast_shapes(*leads)
         return np.concatenate([np.broadcast_to(f, (*whole, f.shape[-1])) for f in flat], axis=-1)
-
-    def into(self, *given: Value) -> None:
-        """Write values, all but the last, into the last, shape (n,)."""
-        *parts, out = given
-        for where, part in zip(self._slices, parts, strict=True):
-            out[where] = part.ravel()
 
 
 Equation = Annotated[Function | Linear | Concatenation, Field(discriminator="kind")]

@@ -9,15 +9,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
+from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import UnknownOption
 from scm_world.work.threads import cores
-from scm_world.world.columns import Table
 from scm_world.world.declaration import Declaration
 from scm_world.world.start import whole_number
 from scm_world.world.world import World
 
 KEPT = 4
 """Tables of structures that are kept for when these come again."""
+
+
+@final
+class Table:
+    """The present of worlds of one structure: a row for each world, columns for variables.
+
+    Args:
+        declaration: Of the structure.
+        names: What is computed after every step.
+        n: How many worlds there could be.
+
+    Attributes:
+        declaration: Of the structure.
+        matrix: Shape (n, width); the first columns are those of the state.
+        state_size: How many these are.
+        where: The columns of each variable. What is computed and not in ``names`` may be old.
+    """
+
+    def __init__(self, declaration: Declaration, names: Iterable[str], n: int) -> None:
+        self.declaration = declaration
+        self.names = tuple(name for name in names if name in declaration.model)
+        mechanisms = declaration.mechanisms
+        self.matrix = np.repeat(mechanisms.start[None], n, axis=0)  # rows are views of this
+        self.state_size, self.where = mechanisms.state_size, mechanisms.where
+
+    def column(self, name: str) -> Floats:
+        """Give the values of a variable in all rows, shape (n, k), as a view."""
+        return self.matrix[:, self.where[name]]
+
+    def actions(self) -> Floats:
+        """Give the actions of all rows, shape (n, n_actions), as a view."""
+        return self.matrix[:, self.declaration.mechanisms.actions]
+
+    def clock(self, row: int) -> int:
+        """Give the control step of a row."""
+        return int(self.matrix[row, self.where[CONTROL_INDEX].start])
 
 
 @final
@@ -31,7 +67,7 @@ class Batch:
     Args:
         worlds: They belong to the batch from now on.
         threads: Of the engine, if it can use several; as many as there are cores if None.
-        names: What ``table`` is to have besides the states.
+        names: What is computed after every step.
 
     Raises:
         UnknownOption: The worlds are not alike, or the number of threads is none.
@@ -59,18 +95,17 @@ class Batch:
         backends = [world.backend for world in self._worlds]
         self._engine = backends[0].batch(backends, count)
         self._names = tuple(names)
+        n = len(self._worlds)
         self._tables: dict[Declaration, Table] = {}
-        self._homes: list[Table | None] = [None] * len(self._worlds)
-        self._shared: Table | None = None  # in which all worlds are, if they are in one
-        self._tempo: list[Any] = [None] * len(self._worlds)
-        self._in_time: Any = None  # the pace of all worlds, if they have one
-        self._away = np.zeros(len(self._worlds), dtype=np.bool_)  # it went on in its row only
-        self._loaded = np.zeros(len(self._worlds), dtype=np.bool_)  # its row is as it is
-        self._all = np.arange(len(self._worlds))
+        self._kinds: list[tuple[Any, ...]] = [()] * n  # table, mode and substeps of each world
+        self._groups: list[tuple[Any, Integers]] | None = None  # all worlds, by these
+        self._stepped = np.zeros(n, dtype=np.bool_)  # the world does not know yet
+        self._ready = np.zeros(n, dtype=np.bool_)  # nobody did anything to it since it was stepped
+        self._fresh = np.zeros(n, dtype=np.bool_)  # what is remembered has been computed
+        self._all = np.arange(n)
         self._held: set[int] = set()
         self._translating: set[int] = set()
-        commands = self._worlds[0].structure.n_commands
-        self._told = np.zeros((len(self._worlds), commands))
+        self._commands = np.zeros((n, self._worlds[0].structure.n_commands))
 
     def __len__(self) -> int:
         """Count the worlds."""
@@ -79,35 +114,32 @@ class Batch:
     def world(self, index: int) -> World:
         """Give a world as it is now."""
         world = self._worlds[index]
-        if self._away[index]:
-            table = self._homes[index]
-            if table is not None:
-                table.hand_over(index, world)
-            self._away[index] = False
-        self._loaded[index] = False
+        if self._stepped[index]:
+            world.arrive(self.table(index).clock(index))
+            self._stepped[index] = False
+        self._ready[index] = False
         return world
 
     def fill(self, rows: Integers) -> None:
-        """Write the present of some worlds into their rows, where it is not there already."""
-        for row in rows[~self._loaded[rows]].tolist():
-            self._load(row)
+        """Let the present of some worlds be in their rows, with what is computed.
+
+        Raises:
+            NotReset: A world has no episode yet.
+        """
+        for row in rows[~self._ready[rows]].tolist():
+            self._take(row)
 
     def table(self, index: int) -> Table:
-        """Give the table in whose row of this number the present of a world is.
-
-        The row is as it was after the last step of that world.
-        """
-        return self._homes[index] or self._table(self._worlds[index])
+        """Give the table in whose row of this number the present of a world is."""
+        kind = self._kinds[index]
+        return kind[0] if kind else self._table(self._worlds[index].declaration)
 
     def tables(self, rows: Integers) -> list[tuple[Table, Integers]]:
         """Give the tables of some worlds, each with the rows of those that are in it."""
-        if self._shared is not None and len(rows):
-            return [(self._shared, rows)]
-        found: dict[int, tuple[Table, list[int]]] = {}
-        for row in rows.tolist():
-            table = self.table(row)
-            found.setdefault(id(table), (table, []))[1].append(row)
-        return [(table, np.array(members)) for table, members in found.values()]
+        found: dict[Table, list[Integers]] = {}
+        for (table, *_), members in self._grouped(rows):
+            found.setdefault(table, []).append(members)
+        return [(table, np.sort(np.concatenate(parts))) for table, parts in found.items()]
 
     def advance(
         self, commands: Floats, which: NDArray[np.bool_] | None = None, *, evaluate: bool = True
@@ -130,58 +162,59 @@ class Batch:
             commands = commands.copy()
             for row in held:
                 commands[row] = self.world(row).decided(commands[row])
-        tables = self.tables(rows)
-        for table, members in tables:
-            self._step(table, members, commands)
-        for table, members in tables if evaluate else ():
-            table.evaluate(members)
+        groups = self._grouped(rows)
+        for (table, mode, substeps), members in groups:
+            self._step(table, mode, substeps, members, commands)
+        for (table, *_), members in groups if evaluate else ():
+            table.declaration.mechanisms.evaluate(table.names, table.matrix, members)
+            self._fresh[members] = True
 
-    def _step(self, table: Table, rows: Integers, commands: Floats) -> None:
-        self._tell(table, rows, commands)
-        table.remember(rows)
-        table.advance(rows, commands)
-        self._away[rows] = self._loaded[rows] = True
+    def _step(
+        self, table: Table, mode: Any, substeps: int, rows: Integers, commands: Floats
+    ) -> None:
+        matrix, mechanisms = table.matrix, table.declaration.mechanisms
+        if not self._translating:
+            self._commands[rows] = commands[rows]
+        for row in rows.tolist() if self._translating else ():
+            self._commands[row] = self._worlds[row].told(commands[row], table.clock(row))
+        stale = rows[~self._fresh[rows]]
+        if len(stale):
+            mechanisms.evaluate((), matrix, stale)
+        mechanisms.remember(matrix, rows)
+        table.actions()[rows] = commands[rows]
+        matrix[rows, table.where[CONTROL_INDEX].start] += 1.0
+        self._fresh[rows] = False
+        self._stepped[rows] = self._ready[rows] = True
         try:
-            for (mode, substeps), members in self._paces(rows):
-                self._engine.step(members, mode, self._told, substeps, table.matrix)
+            self._engine.step(rows, mode, self._commands, substeps, matrix)
         except BaseException:  # a state is lost, or somebody interrupts: the others were stepped
             for row in rows.tolist():
                 world = self.world(row)
                 world.backend.read(world.current()[1])
             raise
 
-    def _tell(self, table: Table, rows: Integers, commands: Floats) -> None:
-        """Write what the engine is told; mostly these are the actions."""
-        told = self._told
-        if not self._translating:
-            told[rows] = commands[rows]
-            return
+    def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
+        """Tell worlds of different structures and presets apart."""
+        if self._groups is not None and len(self._groups) == 1:
+            return [(self._groups[0][0], rows)] if len(rows) else []
+        found: dict[tuple[Any, ...], list[int]] = {}
         for row in rows.tolist():
-            vector = table.matrix[row, : table.state_size]
-            told[row] = self._worlds[row].translated(commands[row], vector, table.clock(row))
+            found.setdefault(self._kinds[row] or (self.table(row), None, 0), []).append(row)
+        return [(kind, np.array(members)) for kind, members in found.items()]
 
-    def _paces(self, rows: Integers) -> list[tuple[Any, Integers]]:
-        """Tell worlds with different presets apart."""
-        if self._in_time is not None:
-            return [(self._in_time, rows)]
-        found: dict[Any, list[int]] = {}
-        for row in rows.tolist():
-            found.setdefault(self._tempo[row], []).append(row)
-        return [(pace, np.array(members)) for pace, members in found.items()]
-
-    def _load(self, row: int) -> None:
-        """Take a world as it is now into its row."""
+    def _take(self, row: int) -> None:
+        """Let the present of a world be in its row."""
         world = self._worlds[row]
-        table = self._table(world)
-        if self._homes[row] is not table:
-            self._homes[row] = table
-            alike = all(home is table for home in self._homes)
-            self._shared = table if alike else None
-        table.load(row, world)
-        if self._tempo[row] != world.pace:
-            self._tempo[row] = world.pace
-            self._in_time = world.pace if len(set(self._tempo)) == 1 else None
-        self._loaded[row] = True
+        table = self._table(world.declaration)
+        world.evaluate(table.names)
+        if world.numbers.base is not table.matrix:
+            world.move(table.matrix[row : row + 1])
+        kind = (table, *world.pace)
+        if self._kinds[row] != kind:
+            self._kinds[row] = kind
+            alike = all(other == kind for other in self._kinds)
+            self._groups = [(kind, self._all)] if alike else None
+        self._ready[row] = self._fresh[row] = True
         both = ((self._held, world.holds_action), (self._translating, world.translates))
         for rows, belongs in both:
             if belongs:
@@ -189,16 +222,15 @@ class Batch:
             else:
                 rows.discard(row)
 
-    def _table(self, world: World) -> Table:
-        declaration = world.declaration
+    def _table(self, declaration: Declaration) -> Table:
         found = self._tables.get(declaration)
         if found is None:
-            used = {id(table) for table in self._homes}
+            used = {id(kind[0]) for kind in self._kinds if kind}
             unused = [key for key, table in self._tables.items() if id(table) not in used]
             for key in unused[: max(0, len(self._tables) + 1 - KEPT)]:
                 del self._tables[key]
-            there = [name for name in self._names if name in declaration.model]
-            found = self._tables[declaration] = Table(world, there, len(self._worlds))
+            found = Table(declaration, self._names, len(self._worlds))
+            self._tables[declaration] = found
         return found
 
     def close(self) -> None:

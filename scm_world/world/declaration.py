@@ -17,7 +17,7 @@ from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.tasks import Conventions, Task, Timing, conventions
 from scm_world.variables import Action, Derived, Exogenous, Measured
 from scm_world.world.absence import put_together
-from scm_world.world.readouts import computed_order, static_order
+from scm_world.world.mechanisms import Mechanisms
 from scm_world.world.start import whole_number
 
 
@@ -133,8 +133,8 @@ class Declaration:
         )
         ordered = map(self.model.declared, self.model.structure.order)
         self.carried = tuple(v for v in ordered if isinstance(v, Measured) and v.set_parents())
-        self.computed = computed_order(self.model)
-        self.static_names = static_order(self.model, self.computed)
+        self.computed = _computed(self.model)
+        self.static_names = _static(self.model, self.computed)
         self.random = tuple(
             v.name
             for v in self.model.variables
@@ -148,6 +148,14 @@ class Declaration:
     def plan(self) -> Hashable:
         """What stands in the world, and what was taken out of it."""
         return put_together(self.task.plan, self.task.absent)
+
+    @cached_property
+    def mechanisms(self) -> Mechanisms:
+        """The mechanisms of what is computed in every step, bound to a row of values."""
+        sizes = (self._start.vector.size, self.n_actions)
+        static = frozenset(self.static_names)
+        where = (self.slices, self.commanded)
+        return Mechanisms(self.model, self.computed, static, *where, sizes)
 
     @cached_property
     def entity_names(self) -> frozenset[str]:
@@ -241,6 +249,24 @@ class Declaration:
             parameters[key] = values[name]
         made = self.composition
         return Scene(structure, parameters, state, made.goals(values), made.light(values))
+
+
+def _computed(model: SCM) -> tuple[str, ...]:
+    """List the variables that are computed from what moves, causes before effects."""
+    moving = {v.name for v in model.variables if isinstance(v, Measured)}
+    follow = {*moving, *model.structure.instant_descendants(moving)}
+    # Other coordinates of a quantity have no effects: computing them can wait until asked.
+    follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
+    kinds = (Derived, Measured)
+    ordered = (model.declared(name) for name in model.structure.order if name in follow)
+    return tuple(v.name for v in ordered if isinstance(v, kinds) and v.mechanism is not None)
+
+
+def _static(model: SCM, computed: Iterable[str]) -> tuple[str, ...]:
+    """List what is decided by interventions alone, causes before effects."""
+    moves = {v.name for v in model.variables if v.role in {"state", "action"}}
+    moves |= {*computed, *(v.name for v in model.variables if isinstance(v, Measured))}
+    return tuple(name for name in model.structure.order if name not in moves)
 
 
 def _in_a_row(

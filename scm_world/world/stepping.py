@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scm_world._types import Floats, Value, Values
+from scm_world._types import Floats, Value
 from scm_world.backends import Backend
 from scm_world.errors import EngineFailure
 from scm_world.graph import SCM, Moment
@@ -16,7 +14,8 @@ from scm_world.models import ControlMode, State
 from scm_world.world.commands import clipped
 from scm_world.world.declared import Declared
 from scm_world.world.proposal import Instant
-from scm_world.world.readouts import Readouts
+
+_ROW = np.zeros(1, dtype=np.int64)  # the only one of a matrix of one row
 
 
 class Stepped(Declared):
@@ -33,20 +32,20 @@ class Stepped(Declared):
     evaluate: Callable[[tuple[str, ...]], dict[str, Value]]
     _require_episode: Callable[[], None]
     _now: dict[str, Value]
-    _before: dict[str, Value]
+    _matrix: Floats
+    _clock: Value
     _state: State
     _counted: tuple[tuple[Value, Value], ...]
     _held: SCM
-    _readouts: Readouts
     _instant: Instant | None
     _started: bool
     _substeps: int
     _index: int
-    _clock: NDArray[Any]
     _action: Floats
     _held_actions: tuple[str, ...]
     _translates: bool
     _inputs: tuple[str, ...]
+    _fresh: bool = False  # what a step remembers has been computed
     _lost: str = ""
 
     def advance(self, command: Floats) -> None:
@@ -54,10 +53,13 @@ class Stepped(Declared):
         self._require_episode()
         self._refuse_lost()
         command = self.decided(command)
-        self._readouts.remember()
-        self._act(command)
+        if not self._fresh:
+            self._compute(())
+        self.declaration.mechanisms.remember(self._matrix, _ROW)
+        self._action[:] = command
         try:
-            self.backend.step(self.composition.mode, self.told(command), self._substeps)
+            told = self.told(command, self._index)
+            self.backend.step(self.composition.mode, told, self._substeps)
         except EngineFailure as error:
             left = self.declaration.empty_state()
             self.backend.read(left)
@@ -65,7 +67,7 @@ class Stepped(Declared):
                 self._lost = f"the state was lost in control step {self._index}: {error}"
             raise
         self.backend.read(self._state)
-        self._goes_on(self._index + 1)
+        self.arrive(self._index + 1)
 
     def _refuse_lost(self) -> None:
         """Refuse to go on from a state that the engine has lost.
@@ -82,14 +84,18 @@ class Stepped(Declared):
         """Whether there is an episode."""
         return self._started
 
-    @property
-    def lagged(self) -> tuple[str, ...]:
-        """What a step remembers of the one before."""
-        return self._readouts.lagged
+    def _compute(self, names: tuple[str, ...] | None = None) -> None:
+        """Compute variables, and what a step remembers, into the present values; all if None."""
+        mechanisms = self.declaration.mechanisms
+        wanted = mechanisms.computed if names is None else names
+        mechanisms.evaluate(wanted, self._matrix, _ROW)
+        self._fresh = True
+        self._count()
 
-    def needed(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """List what has to be computed for some variables and for the memory, causes first."""
-        return self._readouts.needed(names)
+    def _forget(self) -> None:
+        """Let the present stand in for the step before, where there is none."""
+        self._compute(())
+        self.declaration.mechanisms.remember(self._matrix, _ROW)
 
     @property
     def pace(self) -> tuple[ControlMode, int]:
@@ -106,10 +112,6 @@ class Stepped(Declared):
         """Whether the engine is told something else than the action; see ``told``."""
         return self._translates
 
-    def _act(self, command: Floats) -> None:
-        """Remember the action; present values are views of it, which stay the same objects."""
-        self._action[:] = command
-
     def decided(self, command: Floats) -> Floats:
         """Give the action that is taken: the command, where no action has a mechanism."""
         held = self._held_actions
@@ -123,41 +125,25 @@ class Stepped(Declared):
             command[self.declaration.actions[name]] = np.ravel(solved[name])
         return clipped(command, *self.declaration.action_bounds, self.declaration.action_unit)
 
-    def told(self, action: Floats) -> Floats:
-        """Give what the engine is told in a step; it holds until the next call."""
-        return self.translated(action, self._state.vector, self._index)
-
-    def translated(self, action: Floats, vector: Floats, index: int) -> Floats:
-        """Turn an action into a command, at a state and a control step of this episode."""
+    def told(self, action: Floats, index: int) -> Floats:
+        """Turn an action into a command, at a control step; it holds until the next call."""
         commands = self.composition.commands
         if commands is None or not self._translates:
             return action
-        return commands.told(action, self._now, vector, self.moment(index))
+        return commands.told(action, self._now, self._state.vector, self.moment(index))
 
-    def _goes_on(self, index: int) -> None:
-        """Be at another control step; where everything is has been written already."""
-        self._index = index
-        self._clock[...] = index
-        self._count()
-        self._readouts.moved()
+    def arrive(self, index: int) -> None:
+        """Be at the next control step; where everything is has been written already."""
+        self._be_at(index)
         self._instant = None
 
+    def _be_at(self, index: int) -> None:
+        self._index = index
+        self._clock[...] = index
+        self._fresh = False
+        self._count()
+
     def _count(self) -> None:
-        """Take over the states that are whole numbers; the others are views of the vector."""
+        """Take over what is a whole number; the other values are views of the row."""
         for value, view in self._counted:
             value[...] = view
-
-    def arrive(self, vector: Floats, index: int, action: Floats, earlier: Values) -> None:
-        """Take over what happened while the engine was stepped by a ``Batch``.
-
-        Args:
-            vector: Where everything is.
-            index: The control step.
-            action: The last action.
-            earlier: Values of one control step ago.
-        """
-        self._state.vector[:] = vector
-        self._act(action)
-        for name, value in earlier.items():
-            self._before[name][...] = value
-        self._goes_on(index)

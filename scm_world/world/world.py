@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Value, Values
+from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.entities import CONTROL_INDEX
@@ -26,7 +26,6 @@ from scm_world.world.declaration import Declaration, Options
 from scm_world.world.family import Family, as_family
 from scm_world.world.following import policy_inputs
 from scm_world.world.proposal import Instant, Proposal
-from scm_world.world.readouts import Readouts
 from scm_world.world.snapshot import SavedInstant, WorldSnapshot
 from scm_world.world.start import (
     beginning,
@@ -109,9 +108,7 @@ class World(Stepped):
         self._translates = False
         self._inputs: tuple[str, ...] = ()
         self._index = 0
-        self._clock = np.zeros((), dtype=np.int64)
         self._instant: Instant | None = None
-        self._action = np.zeros(0)
         self._enter(self.family.natural(None))
         self._held = self.model
         check_held(self.variables_space, self.family)
@@ -136,19 +133,23 @@ class World(Stepped):
         """
         self.model.declared(name)
         self._require_episode()
-        self._readouts.evaluate()
+        self._compute()
         return np.array(self._now[name])
 
     def values(self) -> dict[str, Value]:
         """Give the present value of every variable, as copies."""
         self._require_episode()
-        self._readouts.evaluate()
+        self._compute()
         return {name: np.array(self._now[name]) for name in self.model}
 
     def previous(self) -> dict[str, Value]:
         """Give the values of one control step ago that present variables depend on."""
         self._require_episode()
-        return {name: np.array(value) for name, value in self._before.items()}
+        declared = self.model.declared
+        return {
+            name: value.astype(np.float64 if declared(name).dtype == "real" else np.int64)
+            for name, value in self._before.items()
+        }
 
     def evaluate(self, names: tuple[str, ...]) -> dict[str, Value]:
         """Compute some variables and give all present values without copying them.
@@ -159,7 +160,7 @@ class World(Stepped):
             NotReset: There is no episode yet.
         """
         self._require_episode()
-        self._readouts.evaluate(names)
+        self._compute(names)
         return self._now
 
     def scene(self) -> Scene:
@@ -207,12 +208,12 @@ class World(Stepped):
             self.backend.restore(self._origin.engine)
         else:
             self._build(origin)
-        self._act(np.zeros(self.declaration.n_actions))
+        self._action[:] = 0.0
         self.adopt(origin, origin.model, self._origin.static, 0)
         self._draw_nature()
-        self._readouts.forget()
+        self._forget()
         if self.task.checks_functions and not self._checked:
-            self._readouts.evaluate()
+            self._compute()
             check_functions(self.declaration, self._now)
             self._checked = True
         self._instant = self._present(at_start=True)
@@ -281,7 +282,7 @@ class World(Stepped):
         proposal, change = feasible(self, instant, request, space)
         audit, self._instant = commit(self, instant, proposal, change, request)
         if instant.at_start:
-            self._readouts.forget()
+            self._forget()
         return audit
 
     def _present(self, *, at_start: bool = False) -> Instant:
@@ -307,10 +308,16 @@ class World(Stepped):
             index: The control step.
             state: Where everything is; what the engine reports if None.
         """
-        earlier = dict(self._before)
+        earlier, action = dict(self._before), self._action
         changed = declaration is not self.declaration
         if changed:
             self._enter(declaration)
+            if self._action.shape == action.shape:
+                self._action[:] = action
+        row, where = self._matrix[0], declaration.mechanisms.where
+        for name, value in static.items():
+            if value is not self._static.get(name):
+                row[where[name]] = np.ravel(value)
         self._held, self._static = model, static
         held = model.interventions
         self._held_actions = tuple(name for name in declaration.actions if name in held)
@@ -322,31 +329,43 @@ class World(Stepped):
         self._substeps = max(1, round(self.control_period / timestep))
         self._now.update(static)
         self.version += 1
-        self._readouts.stale()
-        self._index = index
-        self._clock[...] = index
         if state is None:
             self.backend.read(self._state)
         else:
             self._state.vector[:] = state.vector
-        self._count()
+        self._be_at(index)
         if changed:
-            self._readouts.recall(earlier)
+            self._forget()
+            for name in earlier.keys() & self._before.keys():
+                self._before[name][...] = earlier[name]
 
     def _enter(self, declaration: Declaration) -> None:
-        """Make room for the values of a structure."""
+        """Make room for the values of a structure; actions are those of the last step."""
         self.declaration = declaration
-        if self._action.shape != (declaration.n_actions,):
-            self._action = np.zeros(declaration.n_actions)
-        self._now: dict[str, Value] = {CONTROL_INDEX: self._clock}
-        self._now.update(declaration.split(self._action))
-        self._before: dict[str, Value] = {}
-        self._state = declaration.empty_state()
-        self._now.update(declaration.states(self._state))
-        views = [(name, declaration.view(name, self._state)) for name in declaration.whole]
-        self._counted = tuple((self._now[name], view) for name, view in views)
-        order = tuple(name for name in declaration.computed if name not in self._now)
-        self._readouts = Readouts(declaration.model, self._now, self._before, order)
+        self._static = {}
+        self._occupy(declaration.mechanisms.start[None].copy())
+
+    def move(self, matrix: Floats) -> None:
+        """Keep the present in another matrix from now on, shape (1, width)."""
+        matrix[...] = self._matrix
+        self._occupy(matrix)
+
+    def _occupy(self, matrix: Floats) -> None:
+        """Look at the values in a matrix from now on, by views."""
+        self._matrix = matrix
+        row, mechanisms = matrix[0], self.declaration.mechanisms
+        self._state = self.declaration.empty_state(row[: mechanisms.state_size])
+        self._action, self._clock = row[mechanisms.actions], row[mechanisms.where[CONTROL_INDEX]]
+        self._now: dict[str, Value] = {n: mechanisms.view(row, n) for n in mechanisms.where}
+        counted = {n: (self._now[n].astype(np.int64), self._now[n]) for n in mechanisms.whole}
+        self._counted = tuple(counted.values())
+        self._now |= {name: whole for name, (whole, _) in counted.items()} | dict(self._static)
+        self._before = {n: mechanisms.view(row, n, earlier=True) for n in mechanisms.earlier}
+
+    @property
+    def numbers(self) -> Floats:
+        """The present as one row of numbers, shape (1, width); see ``Mechanisms.where``."""
+        return self._matrix
 
     def current(self) -> tuple[Values, State]:
         """Give the live values and the live state, for the parts of a ``do``."""
@@ -387,8 +406,8 @@ class World(Stepped):
         self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
         declaration = self.family.declaration(snapshot.plan)
         held = declaration.model.with_interventions(snapshot.interventions)
-        self._act(snapshot.action)
         self.adopt(declaration, held, snapshot.static, snapshot.index)
+        self._action[:] = snapshot.action
         for name, value in snapshot.previous.items():
             self._before[name][...] = value
         saved = snapshot.instant

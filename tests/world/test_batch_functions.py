@@ -38,7 +38,7 @@ def _first(place: Any) -> Any:
 
 
 def _rounded(value: Any) -> Any:
-    return round(value, 3) + hash(value) % 3
+    return round(float(value), 3) + value.astype(np.int64) % 3
 
 
 def _short(clock: Any) -> Any:

@@ -12,7 +12,6 @@ from numba.extending import is_jitted
 
 from scm_world import World
 from scm_world.env import ScmWorldEnv
-from scm_world.geometry.direct import direct
 from scm_world.tasks import TASKS
 from scm_world.tasks.building import filled
 from scm_world.tasks.reaching import minus_norm
@@ -25,7 +24,7 @@ def test_a_control_step_evaluates_compiled_functions_only(task: str) -> None:
     """What an environment needs in every step is a kernel, or the weighted sum."""
     env = ScmWorldEnv(task, backend="fake")
     env.reset(seed=0)
-    for name in env.world.needed(env._needed):
+    for name in env.world.declaration.mechanisms.needed(env._needed):
         mechanism = env.world.model.declared(name).mechanism
         function = mechanism.bind()
         function = function.func if isinstance(function, partial) else function
@@ -61,8 +60,3 @@ def test_a_norm_is_that_of_numpy() -> None:
     """The loop over a vector agrees with numpy's norm."""
     vector = np.random.default_rng(0).normal(size=9)
     assert minus_norm(vector) == pytest.approx(-np.linalg.norm(vector), rel=1e-15)
-
-
-def test_what_is_not_compiled_is_called_as_it_is() -> None:
-    """A function of Python is given back."""
-    assert direct(max, 1.0, 2.0) is max

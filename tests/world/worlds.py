@@ -66,7 +66,7 @@ def play(world: World, commands: Iterable[Any]) -> np.ndarray:
         world.step(command)
         now = world.evaluate(("reward", "fractional_success"))
         state = world.current()[1].vector
-        rows.append([*state, now["reward"], now["fractional_success"]])
+        rows.append([*state, float(now["reward"]), float(now["fractional_success"])])
     return np.array(rows)
 
 

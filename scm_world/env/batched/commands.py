@@ -13,8 +13,7 @@ from scm_world.env.batched.inside import Inside
 from scm_world.env.delta import JOINTS
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import ActionError
-from scm_world.world.batch import Batch
-from scm_world.world.columns import Table
+from scm_world.world.batch import Batch, Table
 
 
 @final

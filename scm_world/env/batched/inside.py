@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, final
 
-import numpy as np
-
 from scm_world._types import Floats
 from scm_world.env.delta import Delta
 from scm_world.env.environment import ScmWorldEnv
@@ -14,7 +12,6 @@ from scm_world.env.goals import Goals
 from scm_world.env.keypoints import KEYPOINTS
 from scm_world.env.observer import Together
 from scm_world.env.vector import Vector
-from scm_world.tasks import TIME
 
 
 @final
@@ -69,16 +66,3 @@ class Inside:
             env._scale,
             env.limit,
         )
-
-
-def scaling(vector: Vector) -> tuple[Floats, Floats]:
-    """Give how a vector is scaled.
-
-    Returns:
-        Lower bounds, upper bounds, gains and offsets, shape (4, k); and what is added to the
-        numbers before, shape (k,).
-    """
-    shifts = np.zeros(vector._scales.shape[1])
-    if vector._shift:
-        shifts[vector._slices[TIME]] = vector._shift
-    return vector._scales, shifts

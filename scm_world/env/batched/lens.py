@@ -8,16 +8,12 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.entities import CONTROL_INDEX
-from scm_world.env.batched.inside import Inside, scaling
+from scm_world.env.batched.inside import Inside
 from scm_world.env.batched.sheet import FLAGS, FRACTION, GOALS, TERMS, Sheet
 from scm_world.env.environment import REWARD, TERMINATED, ScmWorldEnv
-from scm_world.env.vector import Vector
-from scm_world.geometry.gather import places
-from scm_world.geometry.rows import scale_rows
 from scm_world.tasks.rewards import SUCCESS
-from scm_world.world.columns import Table
-
-OBSERVATION = "observation"
+from scm_world.world.batch import Table
+from scm_world.world.mechanisms import places
 
 
 @final
@@ -34,7 +30,7 @@ class Lens:
 
     def __init__(self, env: ScmWorldEnv, table: Table) -> None:
         inside = Inside.of(env)
-        self._vectors = {name: _Gathered(part, table) for name, part in inside.vectors.items()}
+        self._vectors = inside.vectors
         self.is_partial, self._shows_goals = inside.is_partial, inside.shows_goals
         sides = env.world.task.goal_names() if inside.goals is not None else ()
         self._goals = {
@@ -72,9 +68,8 @@ class Lens:
 
     def _show(self, numbers: Floats, rows: Integers, sheet: Sheet) -> None:
         for name, vector in self._vectors.items():
-            vector.write(
-                numbers, rows, sheet.observations if name is None else sheet.observations[name]
-            )
+            shown = sheet.observations if name is None else sheet.observations[name]
+            vector.write(numbers, rows, shown)
         infos: dict[str, Any] = sheet.infos
         if self._success is not None:
             infos[FLAGS[0]][rows] = infos[FLAGS[1]][rows] = numbers[rows, self._success] != 0.0
@@ -86,21 +81,3 @@ class Lens:
             found = infos[name][rows] = numbers[rows[:, None], columns]
             if self._shows_goals:
                 sheet.observations[name][rows] = np.clip(found, -self._bound, self._bound)
-
-
-@final
-class _Gathered:
-    """A vector of numbers that all stand in the columns of a table.
-
-    Args:
-        vector: That is read.
-        table: In which they are.
-    """
-
-    def __init__(self, vector: Vector, table: Table) -> None:
-        self._scale, self._shifts = scaling(vector)
-        self._sources = places(table.where[name] for name in vector.layouts[OBSERVATION])
-
-    def write(self, numbers: Floats, rows: Integers, out: Any) -> None:
-        """Write observations, shape (n, k)."""
-        scale_rows(numbers, rows, self._sources, self._shifts, self._scale, out)

@@ -23,8 +23,7 @@ from scm_world.errors import ScmWorldError
 from scm_world.tasks.rewards import one_number
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
-from scm_world.world.batch import Batch
-from scm_world.world.columns import Table
+from scm_world.world.batch import Batch, Table
 
 
 @final

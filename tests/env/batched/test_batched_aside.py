@@ -47,7 +47,7 @@ def test_what_belongs_to_a_structure_that_is_gone_is_freed() -> None:
     table = weakref.ref(crew._batch.table(0))
     crew._bring([0])
     crew._batch._tables.clear()
-    crew._batch._homes[0] = crew._batch._shared = None
+    crew._batch._kinds[0], crew._batch._groups = (), None
     gc.collect()
     assert table() is None
     assert np.isfinite(envs.step(actions(2, 1)[1])[1]).all()

@@ -1,0 +1,173 @@
+"""Compiled functions of a few variables, called on rows of a matrix of values.
+
+Each row is a world, and each variable has some of the columns. A step of a program is one compiled
+function with its columns; a whole program runs in one compiled call. The code between a row and
+a function depends on the types of the function only, and is kept on disk.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from numba import njit, types
+from numba.core import cgutils
+from numba.core.errors import NumbaError
+from numba.extending import intrinsic, is_jitted
+
+from scm_world._types import Floats, Integers
+
+_types: Any = types  # numba is untyped
+_cgutils: Any = cgutils
+VECTOR, NUMBER, WHOLE = types.float64[::1], types.float64, types.int64
+_WHERE = types.int64[:, ::1]
+_HEAD = (types.int64, VECTOR, _WHERE)
+
+
+def _read_number(row: Any, where: Any, i: int) -> Any:
+    return row[where[i, 0]]
+
+
+def _read_vector(row: Any, where: Any, i: int) -> Any:
+    return row[where[i, 0] : where[i, 1]]
+
+
+def _write_number(row: Any, where: Any, i: int, value: Any) -> None:
+    row[where[i, 0]] = value
+
+
+def _write_vector(row: Any, where: Any, i: int, value: Any) -> None:
+    row[where[i, 0] : where[i, 1]] = value
+
+
+def _called(typing: Any, address: Any, row: Any, where: Any, kinds: Any, result: Any) -> Any:
+    """Call the function at an address with values of a row, and write its result there."""
+    arguments, found = kinds.instance_type.types, result.instance_type
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        place, values = given[1:3], []
+        for i, kind in enumerate(arguments):
+            is_vector = isinstance(kind, types.Array)
+            read, raw = (_read_vector, VECTOR) if is_vector else (_read_number, NUMBER)
+            at = context.get_constant(types.intp, i)
+            typed = raw(VECTOR, _WHERE, types.intp)
+            value = context.compile_internal(builder, read, typed, [*place, at])
+            values.append(context.cast(builder, value, raw, kind))
+        calls = context.call_conv
+        kind = calls.get_function_type(found, arguments).as_pointer()
+        function = builder.inttoptr(given[0], kind)
+        status, value = calls.call_function(builder, function, found, arguments, values)
+        with _cgutils.if_unlikely(builder, status.is_error):
+            calls.return_status_propagate(builder, status)
+        write = _write_vector if isinstance(found, types.Array) else _write_number
+        at = context.get_constant(types.intp, len(arguments))
+        typed = types.void(VECTOR, _WHERE, types.intp, found)
+        context.compile_internal(builder, write, typed, [*place, at, value])
+        for kind, held in (*zip(arguments, values, strict=True), (found, value)):
+            context.nrt.decref(builder, kind, held)
+        return context.get_dummy_value()
+
+    return types.void(address, row, where, kinds, result), generate
+
+
+_call: Any = intrinsic(_called)
+
+
+def _adapter(address: Any, row: Any, where: Any, kinds: Any, result: Any) -> None:
+    _call(address, row, where, kinds, result)
+
+
+_LIKE = _types.TypeRef(_types.Tuple((NUMBER,))), _types.TypeRef(NUMBER)
+"""Types have no value at run time, so the adapters of all signatures are called alike."""
+
+
+def _adapted(typing: Any, adapter: Any, address: Any, row: Any, where: Any) -> Any:
+    """Call an adapter at its address."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        calls, kinds = context.call_conv, (*_HEAD, *_LIKE)
+        kind = calls.get_function_type(types.void, kinds).as_pointer()
+        function = builder.inttoptr(given[0], kind)
+        none = context.get_dummy_value()
+        values = [*given[1:], none, none]
+        status, _ = calls.call_function(builder, function, types.void, kinds, values)
+        with _cgutils.if_unlikely(builder, status.is_error):
+            calls.return_status_propagate(builder, status)
+        return context.get_dummy_value()
+
+    return types.void(adapter, *_HEAD), generate
+
+
+_call_adapter: Any = intrinsic(_adapted)
+
+
+def _address(function: Any, signature: Any) -> int:
+    compiled = function.get_compile_result(signature)
+    found: int = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
+    return found
+
+
+@cache
+def _adapter_of(signature: Any) -> tuple[Any, int]:
+    kinds = _types.TypeRef(_types.Tuple(signature.args)), _types.TypeRef(signature.return_type)
+    made = types.void(*_HEAD, *kinds)
+    compiled = njit(made, cache=True)(_adapter)
+    return compiled, _address(compiled, made)  # the code lives as long as the function does
+
+
+def addresses(function: Any, kinds: tuple[Any, ...], *, is_vector: bool) -> tuple[int, int] | None:
+    """Give the addresses of a compiled function and of what calls it on a row.
+
+    Args:
+        function: Compiled by numba or not. The caller keeps it.
+        kinds: Of its arguments: ``NUMBER``, ``WHOLE`` or ``VECTOR``.
+        is_vector: Whether a vector is wanted; else a number.
+
+    Returns:
+        The adapter and the function; None where it is not compiled, cannot be compiled for these
+        arguments, or gives something else.
+    """
+    if not is_jitted(function):
+        return None
+    try:
+        function.compile(kinds)
+        made: Any = function.overloads[kinds]
+    except (NumbaError, KeyError, RuntimeError):
+        return None
+    result = _types.unliteral(made.signature.return_type)
+    one = isinstance(result, types.Float | types.Integer | types.Boolean)
+    if not (result == VECTOR if is_vector else one):
+        return None
+    signature = result(*kinds)
+    return _adapter_of(signature)[1], _address(function, signature)
+
+
+@njit(cache=True)
+def run(matrix: Floats, rows: Integers, steps: Integers, where: Integers) -> None:
+    """Run the steps of a program on some rows.
+
+    Args:
+        matrix: The values, shape (n, width).
+        rows: Shape (m,).
+        steps: Adapter, function, and the first and last row of ``where``, shape (k, 4). Adapter 0
+            copies columns.
+        where: First and last column of each argument and, at the end, of the result; of a step
+            that copies, a column and where it goes. Shape (l, 2).
+    """
+    for k in range(steps.shape[0]):
+        adapter, function, first, stop = steps[k, 0], steps[k, 1], steps[k, 2], steps[k, 3]
+        for row in rows:
+            if adapter == 0:
+                for j in range(first, stop):
+                    matrix[row, where[j, 1]] = matrix[row, where[j, 0]]
+            else:
+                _call_adapter(adapter, function, matrix[row], where[first:stop])
+
+
+@njit(cache=True)
+def weighted_sum(numbers: Floats, weights: Floats, intercept: float) -> float:
+    """Add up numbers in the order of ``Linear``, whose rounding this has."""
+    total = 0.0 + intercept
+    for i in range(numbers.size):
+        total = total + weights[i] * numbers[i]
+    return total

@@ -1,0 +1,287 @@
+"""The mechanisms of a structure, evaluated for any number of worlds at once.
+
+The present of a world is one row of numbers: its state first, then its actions, its clock, every
+other variable, and what it remembers of one control step ago. A single world has a matrix of one
+row, a batch one of many; both are computed by the same program, so the bits are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from inspect import signature
+from typing import Any, final
+
+import numpy as np
+from numba.core.errors import NumbaError
+
+from scm_world._types import Floats, Integers, Value
+from scm_world.entities import CONTROL_INDEX
+from scm_world.errors import ModelError
+from scm_world.graph import SCM
+from scm_world.variables import Linear, Parent
+from scm_world.variables.mechanisms import Stacked, Unboxed
+from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses, run, weighted_sum
+
+
+@final
+class Mechanisms:
+    """How the computed variables of a structure follow from the others, and where each one is.
+
+    Args:
+        model: That declares them.
+        computed: Variables that are computed from what moves, causes before effects.
+        static: What interventions alone decide.
+        states: Columns of the states, which come first.
+        actions: Where each action is in the vector of all.
+        sizes: How many numbers the states and the actions have.
+
+    Attributes:
+        where: Columns of each variable.
+        earlier: Columns of the values of one control step ago.
+        actions: Columns of all actions.
+        start: A row before anything is written into it, shape (width,).
+        computed: What is computed, causes before effects.
+        whole: Variables that are whole numbers and that not only interventions decide.
+    """
+
+    def __init__(
+        self,
+        model: SCM,
+        computed: Iterable[str],
+        static: Container[str],
+        states: Mapping[str, slice],
+        actions: Mapping[str, slice],
+        sizes: tuple[int, int],
+    ) -> None:
+        self._model = model
+        self._width = self.state_size = sizes[0]
+        self._constants: list[tuple[slice, Any]] = []
+        self.actions = self._take(sizes[1])
+        first = self.actions.start
+        self.where = dict(states)
+        self.where |= {n: slice(first + at.start, first + at.stop) for n, at in actions.items()}
+        self.computed = tuple(name for name in computed if name not in self.where)
+        for name in (CONTROL_INDEX, *model):
+            if name not in self.where:
+                self.where[name] = self._take(_size(model.declared(name).shape))
+        parents = [p for name in self.computed for p in model.declared(name).all_parents]
+        lagged = dict.fromkeys(p.name for p in parents if p.lag)
+        self.earlier = {n: self._take(_size(model.declared(n).shape)) for n in lagged}
+        self._whole = frozenset(n for n in model if model.declared(n).dtype != "real")
+        self.whole = tuple(name for name in self._whole if name not in static)
+        self._steps = {name: self._bound(name) for name in self.computed}
+        remembered = [self.where[name] for name in self.earlier]
+        self._memory = _program([_copy(remembered, self.earlier.values())])
+        self._programs: dict[tuple[str, ...], list[Any]] = {}
+        self.start = np.zeros(self._width)
+        for place, value in self._constants:
+            self.start[place] = value
+
+    def _take(self, size: int) -> slice:
+        """Take the next columns."""
+        first, self._width = self._width, self._width + size
+        return slice(first, self._width)
+
+    def needed(self, names: Iterable[str]) -> tuple[str, ...]:
+        """List what is computed for some variables and for the memory, causes first."""
+        wanted: set[str] = set()
+        stack = [*names, *self.earlier]
+        while stack:
+            name = stack.pop()
+            if name in self._steps and name not in wanted:
+                wanted.add(name)
+                stack.extend(p.name for p in self._model.declared(name).all_parents if not p.lag)
+        return tuple(name for name in self.computed if name in wanted)
+
+    def evaluate(self, names: tuple[str, ...], matrix: Floats, rows: Integers) -> None:
+        """Compute variables and what they and the memory need, into rows of a matrix.
+
+        Raises:
+            ModelError: A function gives something that the variable cannot have.
+        """
+        program = self._programs.get(names)
+        if program is None:
+            steps = [step for name in self.needed(names) for step in self._steps[name]]
+            program = self._programs[names] = _program(steps)
+        _execute(program, matrix, rows)
+
+    def remember(self, matrix: Floats, rows: Integers) -> None:
+        """Let the present become what was one control step ago."""
+        _execute(self._memory, matrix, rows)
+
+    def view(self, row: Floats, name: str, *, earlier: bool = False) -> Value:
+        """Give a variable of a row, as a view."""
+        place = self.earlier[name] if earlier else self.where[name]
+        return row[place].reshape(self._model.declared(name).shape)
+
+    # --- binding ------------------------------------------------------------------------------
+
+    def _bound(self, name: str) -> list[_Step]:
+        """Bind a mechanism to columns: to compiled steps if it can be, else to one of Python."""
+        variable: Any = self._model.declared(name)
+        parents: tuple[Parent, ...] = tuple(variable.all_parents)
+        columns = [(self.earlier if p.lag else self.where)[p.name] for p in parents]
+        if variable.parts:
+            return [_copy(columns, [self.where[name]])]
+        shapes = [self._model.declared(p.name).shape for p in parents]
+        numbers = [self._model.declared(p.name).dtype == "real" for p in parents]
+        function, constants = _positional(variable.mechanism, len(parents))
+        called: Any = function.kernel if isinstance(function, Stacked | Unboxed) else function
+        scalars = [WHOLE if not real else NUMBER for real in numbers]
+        kinds = [VECTOR if shape else kind for shape, kind in zip(shapes, scalars, strict=True)]
+        flat = all(len(shape) <= 1 for shape in shapes)
+        if isinstance(function, Stacked):
+            kinds, flat = [VECTOR], True
+        elif not all(real or not shape for real, shape in zip(numbers, shapes, strict=True)):
+            flat = False
+        if isinstance(variable.mechanism, Linear) and any(shapes):
+            flat = False
+        kinds += [VECTOR if np.shape(value) else NUMBER for value in constants]
+        is_vector = variable.shape != ()
+        found = None
+        if parents and flat and len(variable.shape) < 2:
+            found = addresses(called, tuple(kinds), is_vector=is_vector)
+        if found is None:
+            return [_Python(self, name, variable, parents, columns)]
+        steps: list[_Step] = []
+        if isinstance(function, Stacked):
+            whole = self._take(sum(at.stop - at.start for at in columns))
+            steps, columns = [_copy(columns, [whole])], [whole]
+        for value in constants:
+            columns.append(self._take(np.size(value)))
+            self._constants.append((columns[-1], value))
+        where = [(at.start, at.stop) for at in (*columns, self.where[name])]
+        return [*steps, _Compiled(found, np.array(where), called)]
+
+    def arguments(self, row: Floats, parents: tuple[Parent, ...], columns: list[slice]) -> Any:
+        """Give values of parents as their declarations have them: arrays of floats or integers."""
+        for parent, place in zip(parents, columns, strict=True):
+            value = row[place].reshape(self._model.declared(parent.name).shape)
+            yield value.astype(np.int64) if parent.name in self._whole else value
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Compiled:
+    """A step of a program; see ``run``. It keeps the function whose address it has."""
+
+    addresses: tuple[int, int]
+    where: Integers
+    function: Any = None
+
+
+@final
+class _Python:
+    """A function of Python, called for one row after another.
+
+    Args:
+        mechanisms: Of the structure.
+        name: Of the variable.
+        variable: The variable.
+        parents: What it is given.
+        columns: Of the parents.
+    """
+
+    def __init__(
+        self,
+        mechanisms: Mechanisms,
+        name: str,
+        variable: Any,
+        parents: tuple[Parent, ...],
+        columns: list[slice],
+    ) -> None:
+        self._name, self._shape, self._place = name, variable.shape, mechanisms.where[name]
+        self._function: Callable[..., Any] = variable.mechanism.bind()
+        self._arguments = partial(mechanisms.arguments, parents=parents, columns=columns)
+
+    def __call__(self, row: Floats) -> None:
+        """Compute, into a row.
+
+        Raises:
+            ModelError: The function gives something else than numbers of the declared shape, or
+                numba cannot compile it.
+        """
+        try:
+            value = self._function(*self._arguments(row))
+        except NumbaError as error:
+            reason = str(error).strip().splitlines()[-1]
+            problem = f"numba cannot compile the function of {self._name!r}: {reason}"
+            raise ModelError([problem]) from error
+        try:
+            found = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            found = np.asarray([], dtype=np.float64)
+        if found.shape != self._shape:
+            wanted = f"finite numbers of shape {self._shape}" if self._shape else "a finite number"
+            problem = f"the function of {self._name!r} gives {value!r}, not {wanted}"
+            raise ModelError([problem])
+        row[self._place] = found.ravel()
+
+
+_Step = _Compiled | _Python
+
+
+def _copy(sources: Iterable[slice], targets: Iterable[slice]) -> _Compiled:
+    return _Compiled((0, 0), np.stack([places(sources), places(targets)], axis=1))
+
+
+def _program(steps: Iterable[_Step]) -> list[Any]:
+    """Put steps together: arrays for ``run``, and functions of Python between them."""
+    program: list[Any] = []
+    compiled: list[_Compiled] = []
+    for step in (*steps, None):
+        if isinstance(step, _Compiled):
+            compiled.append(step)
+            continue
+        if compiled:
+            ends = np.cumsum([0, *(len(one.where) for one in compiled)]).tolist()
+            rows = [(*c.addresses, a, b) for c, a, b in zip(compiled, ends, ends[1:], strict=False)]
+            where = np.concatenate([one.where for one in compiled]).astype(np.int64)
+            program.append((np.array(rows, dtype=np.int64), where))
+            compiled = []
+        if step is not None:
+            program.append(step)
+    return program
+
+
+def _execute(program: list[Any], matrix: Floats, rows: Integers) -> None:
+    for step in program:
+        if isinstance(step, _Python):
+            for row in rows:
+                step(matrix[row])
+        else:
+            run(matrix, rows, *step)
+
+
+def places(slices: Iterable[slice]) -> Integers:
+    """List the columns that slices stand for, one after another, shape (n,)."""
+    parts = [np.arange(where.start, where.stop) for where in slices]
+    return np.concatenate([np.empty(0, dtype=np.int64), *parts])
+
+
+def _size(shape: tuple[int, ...]) -> int:
+    return int(np.prod(shape))
+
+
+def _positional(mechanism: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
+    """Split the function of a mechanism into one without constants, and these in order.
+
+    Args:
+        mechanism: Of a variable.
+        count: How many parents it has.
+    """
+    if isinstance(mechanism, Linear):
+        return Stacked(weighted_sum), (np.array(mechanism.weights), mechanism.intercept)
+    function = mechanism.bind()
+    if not isinstance(function, partial):
+        return function, ()
+    inner: Any = function.func
+    kernel = inner.kernel if isinstance(inner, Stacked | Unboxed) else inner
+    count = 1 if isinstance(inner, Stacked) else count
+    compiled = getattr(kernel, "py_func", None)
+    names = () if compiled is None else tuple(signature(compiled).parameters)[count:]
+    if set(names) != set(function.keywords):
+        return function, ()
+    return inner, tuple(function.keywords[name] for name in names)
