@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from scm_world.evaluation import evaluate
-from scm_world.evaluation.outputs import draw_radar
+from scm_world.evaluation.outputs import radar_figure, save
 from scm_world.training.loop import train
 from scm_world.training.recipe import recipe
 
@@ -38,7 +38,7 @@ def main(steps: str = "100000", out: str = "", episodes: str = "20") -> None:
     for protocol in found.protocols:
         print(f"{protocol}: {found.score(protocol, agent='trained')}")
     print("better than nothing in P5 by", found.difference("trained", "still", "P5"))
-    draw_radar(found, folder / "radar.png")
+    save(radar_figure(found), folder / "radar.png")
     print(f"run, evaluation and radar.png are in {folder}")
 
 

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scm_world.evaluation.again import bench_of
 from scm_world.evaluation.outputs import (
-    draw_bars,
-    draw_causes,
-    draw_gap,
-    draw_profile,
-    draw_radar,
+    bars_figure,
+    causes_figure,
+    gap_figure,
+    profile_figure,
+    radar_figure,
     record_videos,
+    save,
     write_report,
 )
 from scm_world.evaluation.results import Evaluation
 from scm_world.output.durable import removed
 from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STALE = ("bars.png", "radar.png", "profile.png", "gap.png", "causes*.png", "report.html")
 """What an earlier evaluation may have left in the folder."""
@@ -38,7 +43,7 @@ def write_outputs(
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> tuple[Location, ...]:
-    """Write plots, the report, and videos if they are wanted.
+    """Write figures, the report, and videos if they are wanted.
 
     Args:
         evaluation: What is shown.
@@ -63,66 +68,34 @@ def write_outputs(
         for old in place.glob(name):
             removed(old)
     films: list[Location] = []
+    doers = [(agent, engine) for agent in evaluation.agents for engine in evaluation.engines]
     if videos:
-        films = _films(evaluation, place, metric, policy, trusted, progress)
+        with closing(bench_of(evaluation, policy=policy, trusted=trusted)) as bench:
+            for agent, engine in doers:
+                who: Any = {"agent": agent, "engine": engine, "metric": metric}
+                films += record_videos(bench, evaluation, place, **who, progress=progress)
+    drawn: dict[str, Callable[[], Figure]] = {"bars": lambda: bars_figure(evaluation, metric)}
+    if len(evaluation.protocols) >= CORNERS:
+        drawn["radar"] = lambda: radar_figure(evaluation, metric)
+    if _comparable(evaluation):
+        drawn["profile"] = lambda: profile_figure(evaluation, metric)
+    if len(evaluation.engines) > 1:
+        drawn["gap"] = lambda: gap_figure(evaluation, metric)
+    for agent, engine in doers if evaluation.drawn() else ():
+        name = "causes" if len(doers) == 1 else f"causes-{agent}-{engine}".replace("/", "_")
+        drawn[name] = partial(causes_figure, evaluation, agent, engine, metric)
     files = []
-    for name, draw in _pictures(evaluation, metric).items():
+    for name, draw in drawn.items():
         files.append(place / f"{name}.png")
-        draw(evaluation, files[-1])
+        save(draw(), files[-1])
     report = place / "report.html"
     write_report(evaluation, report, videos=films, metric=metric)
     return (*files, report, *films)
 
 
-def _pictures(evaluation: Evaluation, metric: str) -> dict[str, Callable[..., Any]]:
-    """List the pictures that an evaluation has enough for."""
-    found: dict[str, Callable[..., Any]] = {"bars": partial(draw_bars, metric=metric)}
-    if len(evaluation.protocols) >= CORNERS:
-        found["radar"] = partial(draw_radar, metric=metric)
-    if _comparable(evaluation):
-        found["profile"] = partial(draw_profile, metric=metric)
-    if len(evaluation.engines) > 1:
-        found["gap"] = partial(draw_gap, metric=metric)
-    if evaluation.drawn():
-        doers = [(agent, engine) for agent in evaluation.agents for engine in evaluation.engines]
-        for agent, engine in doers:
-            name = "causes" if len(doers) == 1 else f"causes-{agent}-{engine}"
-            draw = partial(draw_causes, agent=agent, engine=engine, metric=metric)
-            found[name.replace("/", "_")] = draw
-    return found
-
-
 def _comparable(evaluation: Evaluation) -> bool:
-    """Tell whether all agents have played the same protocols, and more than one episode of each."""
+    """Whether all agents have played the same protocols, and more than one episode of each."""
     agents = [evaluation.only(agent=agent) for agent in evaluation.agents]
     same = {frozenset(mine.protocols) for mine in agents} == {frozenset(evaluation.protocols)}
     least = min(len(mine) / len(mine.protocols) / len(mine.engines) for mine in agents)
     return same and least > 1
-
-
-def _films(
-    evaluation: Evaluation,
-    folder: Location,
-    metric: str,
-    policy: Any,
-    trusted: Sequence[str],
-    progress: Progress | None,
-) -> list[Location]:
-    bench = bench_of(evaluation, policy=policy, trusted=trusted)
-    try:
-        return [
-            film
-            for agent in evaluation.agents
-            for engine in evaluation.engines
-            for film in record_videos(
-                bench,
-                evaluation,
-                folder,
-                agent=agent,
-                engine=engine,
-                metric=metric,
-                progress=progress,
-            )
-        ]
-    finally:
-        bench.close()

@@ -1,15 +1,20 @@
-"""The sheet that all pictures are drawn on. matplotlib is loaded when one is drawn."""
+"""What all figures are drawn on. matplotlib is loaded when one is drawn, pyplot never."""
 
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from scm_world.output.durable import write_durably
 from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 WIDTH, HEIGHT, DPI = 1600, 900, 100  # [pixels], [pixels], [pixels/inch]
 INK, FAINT = "#222222", "#c9ced6"
@@ -20,20 +25,46 @@ Source:
     Okabe and Ito, *Color universal design*, 2008.
 """
 COLORS = 64  # of a picture in a page: a third of the bytes
+STYLE: Any = {
+    "text.parse_math": False,  # a name with two dollar signs is no formula
+    "font.size": 8,
+    "axes.titlesize": 10,
+    "axes.labelsize": 9,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.5,
+    "axes.edgecolor": "#8a94a3",
+    "legend.frameon": False,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), INK),
+}
 
 
-def blank() -> Figure:
-    """Begin a picture."""
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
+    """Draw in the style of all figures of evaluations."""
+
+    @wraps(draw)
+    def inside(*args: P.args, **options: P.kwargs) -> T:
+        import matplotlib
+
+        with matplotlib.rc_context(STYLE):
+            return draw(*args, **options)
+
+    return inside
+
+
+def blank(width: float = WIDTH / DPI, height: float = HEIGHT / DPI, **options: Any) -> Figure:
+    """Begin a figure of a width and a height [inches]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", **options)
     FigureCanvasAgg(figure)
     return figure
 
 
 def save(figure: Figure, path: Location | str) -> None:
-    """Write the picture whole or not at all.
+    """Write a figure whole or not at all; the same figure gives the same bytes.
 
     Raises:
         UnwritableFolder: There is no such folder, no room, or no permission.
@@ -42,14 +73,18 @@ def save(figure: Figure, path: Location | str) -> None:
 
 
 def png(figure: Figure) -> bytes:
-    """Give the picture as it is."""
+    """Return a figure as PNG: of 1600 x 900 pixels, or else with all that is drawn on it."""
+    whole = {} if tuple(figure.get_size_inches() * DPI) == (WIDTH, HEIGHT) else WHOLE
     made = io.BytesIO()
-    figure.savefig(made, format="png")
+    figure.savefig(made, format="png", **whole)
     return made.getvalue()
 
 
+WHOLE: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15}
+
+
 def small_png(figure: Figure) -> bytes:
-    """Give the picture with 64 colors, for a page that holds its pictures in itself."""
+    """Return a figure with 64 colors, for a page that holds its figures in itself."""
     from PIL import Image  # matplotlib brings it
 
     small = io.BytesIO()

@@ -1,7 +1,7 @@
-"""Pages of results: one HTML file that needs nothing else, and no network.
+"""Pages of results: each is one HTML file that needs nothing else, and no network.
 
-Functions with an argument ``title``, ``text`` or ``facts`` escape it. What is called ``inside`` or
-``parts`` is HTML already.
+Pages are jinja2 templates that extend ``output/page.html`` and use the macros of
+``output/parts.html``. Whatever a template is given is escaped.
 """
 
 from __future__ import annotations
@@ -10,16 +10,18 @@ import json
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from typing import final
+from functools import cache
+from pathlib import Path
+from typing import Any, final
 
-from scm_world.output.pages_style import script, style
+FOLDER = Path(__file__).parents[1]
+"""Names of templates are relative to the package."""
 
 
 @final
 @dataclass(frozen=True)
 class Entry:
-    """What stands in a table, if there is more to it than a text.
+    """An entry of a table that is more than a text.
 
     Attributes:
         text: What is read.
@@ -32,6 +34,39 @@ class Entry:
     looks: str = ""
 
 
+def render(template: str, **given: Any) -> str:
+    """Return what a template makes of its data.
+
+    Args:
+        template: Its file, relative to the package, such as ``"output/page.html"``.
+        given: What the template names; all of it has to be there.
+
+    Raises:
+        TypeError: Data to be embedded are nothing that JSON can hold.
+        ValueError: A number in them is not finite.
+    """
+    return str(_templates().get_template(template).render(**given))
+
+
+@cache
+def _templates() -> Any:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    found = Environment(
+        loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    found.filters["base64"] = lambda data: b64encode(data).decode()
+    found.filters["json"] = lambda data: json.dumps(data, ensure_ascii=False, allow_nan=False)
+    found.filters["words"] = lambda value: (
+        value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    )
+    return found
+
+
+# --- pages that are put together in Python -----------------------------------------------------
+
+
 def page(
     title: str,
     parts: Iterable[str],
@@ -42,66 +77,40 @@ def page(
     early_style: str = "",
     extra_script: str = "",
 ) -> str:
-    """Write a whole page.
+    """Return a whole page.
 
     Args:
         title: In the head and above all.
-        parts: What stands in it, one below the other.
+        parts: HTML, one below the other.
         lead: A sentence below the title.
         contents: Anchors and names of the sections that are listed at the top.
-        extra_style: Rules that override those of every page.
+        extra_style: Rules that override those of every page; each line ends.
         early_style: Rules that those of every page override.
-        extra_script: Statements of its own.
-
-    Example:
-        >>> made = page("Doors & keys", [section("all", "All", "<p>None.</p>")])
-        >>> made.count("Doors &amp; keys"), "http" in made
-        (2, False)
+        extra_script: Statements of its own; each line ends.
     """
-    named, said = escape(title), f"<p>{escape(lead)}</p>" if lead else ""
-    listed = "".join(
-        f'<li><a href="#{escape(anchor)}">{escape(name)}</a></li>' for anchor, name in contents
+    from markupsafe import Markup
+
+    html: dict[str, Any] = {"extra_style": extra_style, "early_style": early_style}
+    html = {name: Markup(text) for name, text in (html | {"extra_script": extra_script}).items()}  # noqa: S704
+    inside = [Markup(part) for part in parts]  # noqa: S704 - HTML, as it says
+    return render(
+        "output/page.html", title=title, parts=inside, lead=lead, contents=contents, **html
     )
-    nav = f"<nav aria-label='Contents'><ul>{listed}</ul></nav>" if listed else ""
-    whole = [
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">',
-        f"<title>{named}</title><style>{style(extra_style, early=early_style)}</style>"
-        "</head><body>",
-        f"<header><h1>{named}</h1>{said}</header>",
-        f"{nav}<main>",
-        *parts,
-        f"</main><script>{script(extra_script)}</script></body></html>\n",
-    ]
-    return "\n".join(whole)
 
 
 def section(anchor: str, title: str, inside: str) -> str:
-    """Write a section with its heading.
+    """Return a section with its heading; ``inside`` is HTML."""
+    return part("section", anchor, title, inside=inside)
 
-    Example:
-        >>> section("s1", "a < b", "<p>Yes.</p>")
-        '<section id="s1"><h2>a &lt; b</h2><p>Yes.</p></section>'
-    """
-    return f'<section id="{escape(anchor)}"><h2>{escape(title)}</h2>{inside}</section>'
+
+def folded(title: str, inside: str) -> str:
+    """Return what is seen only after a click, and on paper; ``inside`` is HTML."""
+    return part("folded", title, inside=inside)
 
 
 def facts(about: Mapping[str, object]) -> str:
-    """Write names and what they stand for; nothing if there are none.
-
-    Example:
-        >>> facts({"seed": 3, "engine": "fake"})
-        '<dl><dt>seed</dt><dd>3</dd><dt>engine</dt><dd>fake</dd></dl>'
-    """
-    lines = "".join(
-        f"<dt>{escape(str(key))}</dt><dd>{escape(_words(value))}</dd>"
-        for key, value in about.items()
-    )
-    return f"<dl>{lines}</dl>" if lines else ""
-
-
-def _words(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    """Return names and what they stand for; nothing if there are none."""
+    return part("facts", about)
 
 
 def table(
@@ -111,80 +120,31 @@ def table(
     left: int = 0,
     sortable: bool = False,
 ) -> str:
-    """Write a table.
-
-    Args:
-        heads: Above the columns.
-        rows: As many entries in each.
-        left: How many of the first columns are texts; numbers are aligned to the right.
-        sortable: Whether a click on a head sorts it. Such a table may be wider than the page.
+    """Return a table, of which the first ``left`` columns are texts.
 
     Example:
         >>> made = table(["who", "hits"], [["ann", Entry("3 ± 1", by="3")]], left=1)
         >>> print(made.partition("<tbody>")[2])
         <tr><td class="l">ann</td><td data-v="3">3 ± 1</td></tr></tbody></table>
     """
-    above = "".join(
-        f'<th scope="col"{_class("l" if i < left else "")}>{escape(head)}</th>'
-        for i, head in enumerate(heads)
-    )
-    lines = "".join(
-        f"<tr>{''.join(_entry(e, i < left) for i, e in enumerate(row))}</tr>" for row in rows
-    )
-    inside = f"<thead><tr>{above}</tr></thead><tbody>{lines}</tbody></table>"
-    return (
-        f'<div class="wide"><table class="sort">{inside}</div>' if sortable else f"<table>{inside}"
-    )
-
-
-def _entry(given: str | Entry, is_left: bool) -> str:
-    entry = Entry(given) if isinstance(given, str) else given
-    looks = " ".join(filter(None, ("l" if is_left else "", entry.looks)))
-    by = "" if entry.by is None else f' data-v="{escape(entry.by)}"'
-    return f"<td{_class(looks)}{by}>{escape(entry.text)}</td>"
-
-
-def _class(looks: str) -> str:
-    return f' class="{looks}"' if looks else ""
+    return part("table", heads, rows, left, sortable)
 
 
 def picture(png: bytes, text: str, caption: str = "") -> str:
-    """Write a picture into the page.
+    """Return a picture; ``text`` says what it shows, ``caption`` stands below it."""
+    return part("picture", png, text, caption)
+
+
+def part(name: str, *given: Any, inside: str | None = None) -> str:
+    """Return what a macro of ``output/parts.html`` makes of its arguments.
 
     Args:
-        png: The picture.
-        text: What it shows, for those who do not see it.
-        caption: Below it.
+        name: Of the macro.
+        given: Its arguments, which it escapes.
+        inside: HTML that it puts something around.
     """
-    data = b64encode(png).decode()
-    below = f"<figcaption>{escape(caption, quote=False)}</figcaption>" if caption else ""
-    return f'<figure><img alt="{escape(text)}" src="data:image/png;base64,{data}">{below}</figure>'
+    from markupsafe import Markup
 
-
-def folded(title: str, inside: str) -> str:
-    """Write what is seen only after a click, and on paper.
-
-    Example:
-        >>> folded("3 more", "<p>…</p>")
-        '<details><summary>3 more</summary><p>…</p></details>'
-    """
-    return f"<details><summary>{escape(title)}</summary>{inside}</details>"
-
-
-def embedded(anchor: str, data: object) -> str:
-    r"""Write data into the page, so that whoever has the page has the numbers.
-
-    Args:
-        anchor: Id of the element that holds them.
-        data: Anything that JSON can hold.
-
-    Raises:
-        TypeError: It is something that JSON cannot hold.
-        ValueError: A number is not finite.
-
-    Example:
-        >>> embedded("data", {"a": "</script>"})
-        '<script type="application/json" id="data">{"a": "\\u003c/script>"}</script>'
-    """
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
-    return f'<script type="application/json" id="{escape(anchor)}">{text}</script>'
+    macro = getattr(_templates().get_template("output/parts.html").module, name)
+    caller = {} if inside is None else {"caller": lambda: Markup(inside)}  # noqa: S704 - HTML
+    return str(macro(*given, **caller))

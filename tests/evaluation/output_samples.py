@@ -57,6 +57,7 @@ def made(
                                 10,
                                 scores,
                                 drawn if p else {},
+                                f"{agent} {engine} {run} {protocol.name} {i}",
                             )
                         )
     about = {

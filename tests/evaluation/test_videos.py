@@ -14,8 +14,7 @@ from output_samples import made
 
 from scm_world.errors import MissingExtra, SnapshotMismatch, UnknownOption, UnwritableFolder
 from scm_world.evaluation.outputs import record_videos
-from scm_world.evaluation.outputs.captions import Caption
-from scm_world.evaluation.outputs.videos import choose
+from scm_world.evaluation.outputs.videos import captioned, choose
 from scm_world.evaluation.pipeline import Bench, played
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, prepare
@@ -155,13 +154,11 @@ def test_moviepy_is_optional(
         record_videos(bench, evaluation, tmp_path)
 
 
-def test_captions_say_how_many_values_do_not_fit() -> None:
-    """Heads stand above; values are put side by side, and the rest is counted."""
-    drawn = {f"robot_finger_60.link_{k}.mass": f"0.{k}" for k in range(40)}
-    lines = Caption(["P8: everything", "x " * 300], drawn).lines(640)
-    assert lines[0] == "P8: everything"
-    assert lines[1].endswith("…")
-    shown = sum(line.count("robot_finger") for line in lines)
-    assert 0 < shown < 40
-    assert lines[-1].endswith(f"and {40 - shown} more")
-    assert Caption(["P0"], {}).lines(640) == ["P0"]
+def test_captions_are_cut_where_they_do_not_fit() -> None:
+    """Lines that are too long end with dots; of the values seven lines are shown."""
+    frame = np.zeros((20, 641, 3), dtype=np.uint8)
+    drawn = ", ".join(f"robot_finger_60.link_{k}.mass 0.{k}" for k in range(400))
+    full = captioned(frame, (["P8: everything", "x " * 300], drawn), "0.00 s")
+    assert full.shape == (20 + 2 * 8 + 9 * 18, 642, 3)
+    assert captioned(frame, (["P0"], ""), "0.00 s").shape == (20 + 2 * 8 + 18, 642, 3)
+    assert full[20:, :641].min() < 100 < 250 < full[20:, :641].max()

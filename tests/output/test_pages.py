@@ -10,10 +10,10 @@ import pytest
 
 from scm_world.output.pages import (
     Entry,
-    embedded,
     facts,
     folded,
     page,
+    part,
     picture,
     section,
     table,
@@ -109,12 +109,12 @@ def test_own_rules_stand_where_they_override() -> None:
 def test_numbers_in_a_page_can_be_read_again() -> None:
     """As they were, even where they would end the element."""
     data = {"rows": [1, 0.1, None, "</script><b>"], "é": "→"}
-    seen = Reader(page("T", [embedded("data", data)]))
+    seen = Reader(page("T", [part("embedded", "data", data)]))
     (written,) = (text for text in seen.texts if text.startswith("{"))
     assert json.loads(written) == data
     assert not seen.named("b")
     with pytest.raises(ValueError, match="JSON"):
-        embedded("data", {"x": float("nan")})
+        part("embedded", "data", {"x": float("nan")})
 
 
 def test_no_facts_are_nothing() -> None:

@@ -1,19 +1,23 @@
-"""What people look at: pictures, a page and videos of an evaluation."""
+"""What people look at: figures, a page and videos of an evaluation."""
 
-from scm_world.evaluation.outputs.bars import draw_bars
-from scm_world.evaluation.outputs.causes import draw_causes
-from scm_world.evaluation.outputs.gap import draw_gap
-from scm_world.evaluation.outputs.profiles import draw_profile
-from scm_world.evaluation.outputs.radar import draw_radar
+from scm_world.evaluation.outputs.figures import (
+    bars_figure,
+    causes_figure,
+    gap_figure,
+    profile_figure,
+)
+from scm_world.evaluation.outputs.radar import radar_figure
 from scm_world.evaluation.outputs.report import write_report
 from scm_world.evaluation.outputs.videos import record_videos
+from scm_world.output.canvas import save
 
 __all__ = [
-    "draw_bars",
-    "draw_causes",
-    "draw_gap",
-    "draw_profile",
-    "draw_radar",
+    "bars_figure",
+    "causes_figure",
+    "gap_figure",
+    "profile_figure",
+    "radar_figure",
     "record_videos",
+    "save",
     "write_report",
 ]

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+import textwrap
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, final
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import SnapshotMismatch, UnknownOption, UnwritableFolder
-from scm_world.evaluation.outputs.captions import Caption, Frame
-from scm_world.evaluation.outputs.looks import metric_words, protocol_words
+from scm_world.evaluation.outputs.labels import metric_words, protocol_words
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.results import DRAWN, KEYS, Evaluation
 from scm_world.evaluation.setups import Setup
@@ -28,6 +29,9 @@ from scm_world.scene.camera import OVERVIEW, Camera
 
 WHICH = ("best", "median", "worst")
 FASTEST = 25.0  # frames per second
+INK, PAPER = (34, 34, 34), (255, 255, 255)
+SIZE, LINE, EDGE = 13, 18, 8  # [pixels]: letters, from a line to the next, room around
+MOST = 7  # lines of drawn values
 
 
 def record_videos(
@@ -46,7 +50,7 @@ def record_videos(
 
     They are chosen over all runs and protocols; among equal scores the return decides, and then
     which was played first. An episode that was chosen twice is recorded once. The videos run in
-    real time, with at most 25 frames per second.
+    real time, with at most 25 frames per second; what was drawn stands below the picture.
 
     Args:
         given: What was evaluated; ``again.bench_of`` makes it from an evaluation.
@@ -72,19 +76,30 @@ def record_videos(
     metric = evaluation.metric(metric)
     writer = load("moviepy.video.io.ffmpeg_writer", "moviepy", "video").FFMPEG_VideoWriter
     chosen = choose(evaluation, agent=agent, engine=engine, metric=metric, which=which)
-    total = sum(int(evaluation.columns["steps"][place]) for place in chosen.values())
-    made, done = [], 0
-    with _benched(given) as bench, TemporaryDirectory(prefix="videos-") as drafts:
+    steps = {word: int(evaluation.columns["steps"][place]) for word, place in chosen.items()}
+    files, done, total = [], 0, sum(steps.values())
+    with (
+        nullcontext(given) if isinstance(given, Bench) else closing(Bench(given)) as bench,
+        TemporaryDirectory(prefix="videos-") as drafts,
+    ):
         for word, place in chosen.items():
-            name = _name(evaluation, place, word)
-            film = Film(
-                writer, Path(drafts) / name, camera, _caption(evaluation, place, word, metric)
-            )
-            film.tell = lambda steps, so_far=done: progress and progress(so_far + steps, total)
-            _play(bench, evaluation, place, film)
-            made.append(_keep(located(folder) / name, film.path))
-            done += int(evaluation.columns["steps"][place])
-    return made
+            draft = Path(drafts) / _name(evaluation, place, word)
+            texts = _texts(evaluation, place, word, metric)
+
+            def tell(step: int, before: int = done) -> None:
+                if progress is not None and step:
+                    progress(before + step, total)
+
+            _film(bench, evaluation, place, partial(writer, str(draft)), camera, texts, tell)
+            path = located(folder) / draft.name
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise UnwritableFolder(str(path.parent), error.strerror or str(error)) from None
+            write_durably(path, draft.read_bytes())
+            files.append(path)
+            done += steps[word]
+    return files
 
 
 def choose(
@@ -121,99 +136,83 @@ def choose(
     return found
 
 
-@contextmanager
-def _benched(given: Setup | Bench) -> Iterator[Bench]:
-    """Give a bench; one that was made here is closed here."""
-    if isinstance(given, Bench):
-        yield given
-        return
-    bench = Bench(given)
-    try:
-        yield bench
-    finally:
-        bench.close()
-
-
-def _play(bench: Bench, evaluation: Evaluation, place: int, film: Film) -> None:
-    """Play an episode again and film it.
+def _film(
+    bench: Bench,
+    evaluation: Evaluation,
+    place: int,
+    opened: Callable[..., Any],
+    camera: Camera,
+    texts: tuple[Sequence[str], str],
+    tell: Callable[[int], None],
+) -> None:
+    """Play an episode again and write its frames.
 
     Raises:
         SnapshotMismatch: Something else happened, or it is none of the bench.
     """
+    from scm_world.backends.renderer import render
+
     row = {name: evaluation.columns[name][place].item() for name in (*KEYS, "hash")}
-    where = ", ".join(f"{key} {row[key]}" for key in KEYS)
     shard = bench.setup.shard_of(row)
-    with film:
-        again = bench.play(shard, shard.first, watch=film)
+    video: Any = None
+
+    def watch(env: ScmWorldEnv) -> None:
+        nonlocal video
+        step, period = env.world.index, env.world.control_period
+        every = math.ceil(round(1.0 / (FASTEST * period), 9))
+        if step % every == 0:
+            frame = captioned(
+                render(env.world.scene(), camera).rgb, texts, f"{step * period:.2f} s"
+            )
+            if video is None:
+                video = opened(frame.shape[1::-1], 1.0 / (every * period), "libx264")
+            video.write_frame(frame)
+        tell(step)
+
+    try:
+        again = bench.play(shard, shard.first, watch=watch)
+    finally:
+        if video is not None:
+            video.close()
     if again.hash != row["hash"]:
+        where = ", ".join(f"{key} {row[key]}" for key in KEYS)
         raise SnapshotMismatch(
             f"{where}: played again, something else happened; give the policies and the versions "
             "with which the evaluation was made"
         )
 
 
-def _keep(path: Location, draft: Path) -> Location:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        data = draft.read_bytes()
-    except OSError as error:
-        raise UnwritableFolder(str(path.parent), error.strerror or str(error)) from None
-    write_durably(path, data)
-    return path
+def captioned(
+    frame: NDArray[np.uint8], texts: tuple[Sequence[str], str], time: str
+) -> NDArray[np.uint8]:
+    """Return a frame with a bar of texts below it.
 
+    Args:
+        frame: Shape (height, width, 3).
+        texts: Lines, and a longer text below them, of which seven lines are shown.
+        time: In the upper right corner of the bar.
 
-@final
-@dataclass
-class Film:
-    """Writes frames of an episode; it is called at every instant.
-
-    Attributes:
-        writer: What moviepy writes videos with.
-        path: Of the draft.
-        camera: Where from.
-        caption: Below the frames.
-        tell: Told how many control steps are over.
+    Returns:
+        Shape (height + bar, width, 3), both even, as videos want it.
     """
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
 
-    writer: Any
-    path: Path
-    camera: Camera
-    caption: Caption
-    tell: Any = None
-    _stream: Any = field(default=None, init=False)
-    _every: int = field(default=1, init=False)
-    _last: Frame | None = field(default=None, init=False)
-
-    def __call__(self, env: ScmWorldEnv) -> None:
-        """Write a frame, if it is time for one."""
-        step, period = env.world.index, env.world.control_period
-        if self._stream is None:
-            self._every = math.ceil(round(1.0 / (FASTEST * period), 9))
-        if step % self._every == 0:
-            self._write(self._frame(env, step * period), 1.0 / (self._every * period))
-        if self.tell is not None and step:
-            self.tell(step)
-
-    def _frame(self, env: ScmWorldEnv, time: float) -> Frame:
-        from scm_world.backends.renderer import render
-
-        return self.caption.below(render(env.world.scene(), self.camera).rgb, f"{time:.2f} s")
-
-    def _write(self, frame: Frame, rate: float) -> None:
-        if self._stream is None:
-            size = (frame.shape[1], frame.shape[0])
-            self._stream = self.writer(str(self.path), size, rate, codec="libx264")
-        self._stream.write_frame(frame)
-
-    def __enter__(self) -> Film:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._stream is not None:
-            self._stream.close()
-
-
-# --- words ------------------------------------------------------------------------------------
+    face = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSansMono.ttf"
+    font = ImageFont.truetype(str(face), SIZE)
+    width = frame.shape[1]
+    letters = max(8, int((width - 2 * EDGE) / font.getlength("m")))
+    heads, more = texts
+    lines = [textwrap.shorten(head, letters, placeholder=" …") for head in heads]
+    lines += textwrap.wrap(more, letters, max_lines=MOST, placeholder=" …")
+    bar = Image.new("RGB", (width, 2 * EDGE + LINE * len(lines)), PAPER)
+    pen = ImageDraw.Draw(bar)
+    for number, line in enumerate(lines):
+        pen.text((EDGE, EDGE + LINE * number), line, fill=INK, font=font)
+    pen.text((width - EDGE, EDGE), time, fill=INK, font=font, anchor="ra")
+    whole = np.concatenate([frame, np.asarray(bar, dtype=np.uint8)])
+    odd = [(0, whole.shape[0] % 2), (0, width % 2), (0, 0)]
+    return np.pad(whole, odd, constant_values=255)
 
 
 def _name(evaluation: Evaluation, place: int, word: str) -> str:
@@ -229,28 +228,25 @@ def _name(evaluation: Evaluation, place: int, word: str) -> str:
     return "-".join(re.sub(r"[^\w@.+]+", "_", part) for part in parts) + ".mp4"
 
 
-def _caption(evaluation: Evaluation, place: int, word: str, metric: str) -> Caption:
+def _texts(evaluation: Evaluation, place: int, word: str, metric: str) -> tuple[list[str], str]:
+    """Return what is played and how it went, and the values that were drawn."""
     columns = evaluation.columns
     row = {key: columns[key][place].item() for key in KEYS}
     words = protocol_words(evaluation)[row["protocol"]]
-    what = f"{row['protocol']}: {words}" if words else row["protocol"]
     heads = [
-        f"{what}, episode {row['episode']}, seed {row['seed']}",
-        f"{row['agent']}, run {row['run']}, on {row['engine']}",
+        f"{row['protocol']}: {words}" if words else row["protocol"],
+        f"episode {row['episode']}, seed {row['seed']}; {row['agent']}, run {row['run']}, "
+        f"on {row['engine']}",
         f"{word}: {metric_words(metric)} {columns[metric][place]:.3f}, "
         f"return {columns['return'][place]:.2f}",
     ]
-    return Caption(heads, _values(evaluation, place))
-
-
-def _values(evaluation: Evaluation, place: int) -> dict[str, str]:
-    """List the values that were drawn in an episode."""
-    found: dict[str, list[str]] = {}
-    for name, column in evaluation.columns.items():
+    drawn: dict[str, list[str]] = {}
+    for name, column in columns.items():
         if name.startswith(DRAWN) and not math.isnan(column[place]):
             variable = name.removeprefix(DRAWN).partition("[")[0]
-            found.setdefault(variable, []).append(f"{column[place]:.4g}")
-    return {
-        name: parts[0] if len(parts) == 1 else f"({', '.join(parts)})"
-        for name, parts in found.items()
-    }
+            drawn.setdefault(variable, []).append(f"{column[place]:.4g}")
+    values = (
+        f"{name} {parts[0] if len(parts) == 1 else '(' + ', '.join(parts) + ')'}"
+        for name, parts in drawn.items()
+    )
+    return heads, ", ".join(values)
