@@ -46,6 +46,8 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     Raises:
         UnknownOption: There are fewer protocols, or there is no such metric.
     """
+    from matplotlib.lines import Line2D
+
     metric = evaluation.metric(metric)
     words, looks = protocol_words(evaluation), looks_of(lines_of(evaluation))
     if len(words) < 3:
@@ -59,53 +61,21 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     low, high = min(seen), max(seen)
     room = 0.05 * ((high - low) or 1.0)
     fraction = is_fraction(metric)
-    return radars(
-        groups,
-        scores,
-        words,
-        looks,
-        title=f"{evaluation.task}: {metric_words(metric)}",
-        note=f"Means of {counted(evaluation)}; bands are 95 % intervals.",
-        limits=(min(0.0, low), max(1.0, high)) if fraction else (low - room, high + room),
-    )
-
-
-@styled
-def radars(
-    groups: Mapping[str, Sequence[Line]],
-    scores: Scores,
-    words: Mapping[str, str],
-    looks: Mapping[Line, Look],
-    *,
-    title: str,
-    note: str = "",
-    limits: tuple[float, float] = (0.0, 1.0),
-) -> Figure:
-    """Draw radars side by side.
-
-    Args:
-        groups: The lines of each radar, by its name.
-        scores: Of the lines, by line and protocol.
-        words: What varies in each protocol: an axis each, the first one up.
-        looks: Of all lines.
-        title: Above all.
-        note: Small, below the title.
-        limits: Score at the centers and at the rims.
-    """
-    from matplotlib.lines import Line2D
-
+    limits = (min(0.0, low), max(1.0, high)) if fraction else (low - room, high + room)
+    note = f"Means of {counted(evaluation)}; bands are 95 % intervals."
     labels = {p: (textwrap.wrap(p, 16), textwrap.wrap(doc, 20)) for p, doc in words.items()}
     if len(groups) > 1 or len(words) > ON_RIM:
         note += " " + "; ".join(f"{name}: {doc}" for name, doc in words.items() if doc)
         labels = {p: (name, []) for p, (name, _) in labels.items()}
-    high = max(0.18 * len(name) + 0.15 * len(doc) for name, doc in labels.values())
-    # Neighbors near the top, of which both lie to the right, lie h below one another.
-    radius = max(2.4 if len(groups) == 1 else 1.25, high * len(words) ** 2 / 59.0)
+    tall = max(0.18 * len(name) + 0.15 * len(doc) for name, doc in labels.values())
+    wide = 0.1 * max(len(line) for name, doc in labels.values() for line in (*name, *doc))
+    # Neighbors near the top, of which both lie to the right, lie their height below one another.
+    radius = max(2.4 if len(groups) == 1 else 1.25, tall * len(words) ** 2 / 59.0)
     across = math.ceil(math.sqrt(len(groups)))
     down = math.ceil(len(groups) / across)
-    beyond = high + 0.25
-    step = (2.0 * radius + 1.4, 2.0 * radius + 2.0 * beyond + 0.3)
-    width, height = across * step[0] - 1.4, down * step[1] - 2.0 * beyond - 0.3
+    beyond = tall + 0.25
+    step = (2.0 * radius + 2.0 * wide + 0.5, 2.0 * radius + 2.0 * beyond + 0.3)
+    width, height = (across - 1) * step[0] + 2.0 * radius, (down - 1) * step[1] + 2.0 * radius
     figure = blank(width, height)
     for number, (name, lines) in enumerate(groups.items()):
         left, top = number % across * step[0], height - number // across * step[1]
@@ -115,6 +85,7 @@ def radars(
         if name:
             ax.set_title(textwrap.fill(name, 30), weight="bold", pad=72 * (beyond - 0.05))
     handles = [Line2D([], [], label=look.label, **look.line) for look in looks.values()]
+    title = f"{evaluation.task}: {metric_words(metric)}"
     return framed(figure, title, note, handles, beyond + (0.3 if len(groups) > 1 else 0.0))
 
 

@@ -38,13 +38,8 @@ class Look:
     bar: Mapping[str, Any]
 
 
-def looks_of(lines: Sequence[Line], between: str = " on ") -> dict[Line, Look]:
-    """Choose how lines look.
-
-    Args:
-        lines: All of a figure.
-        between: Stands between agent and engine in a label, if there are several engines.
-    """
+def looks_of(lines: Sequence[Line]) -> dict[Line, Look]:
+    """Choose how all lines of a figure look."""
     agents = list(dict.fromkeys(line.agent for line in lines))
     engines = list(dict.fromkeys(line.engine for line in lines))
     found = {}
@@ -53,7 +48,7 @@ def looks_of(lines: Sequence[Line], between: str = " on ") -> dict[Line, Look]:
         color, group = PALETTE[a % len(PALETTE)], a // len(PALETTE)
         white, rgb = PALER[e % len(PALER)], [int(color[i : i + 2], 16) for i in (1, 3, 5)]
         face = "#" + "".join(f"{round(part + (255 - part) * white):02x}" for part in rgb)
-        name = line.agent if len(engines) == 1 else f"{line.agent}{between}{line.engine}"
+        name = line.agent if len(engines) == 1 else f"{line.agent} on {line.engine}"
         found[line] = Look(
             textwrap.fill(name, 60),
             {
