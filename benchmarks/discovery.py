@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from scm_world.discovery.data import Dataset, Design, collect
-from scm_world.discovery.exam.families import DONE, model
 from scm_world.discovery.learners import learn
-from scm_world.discovery.learners.apparatus import Model
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
+from scm_world.discovery.learners.simulators import SCMSimulator
 from scm_world.discovery.metrics import evaluate
+from scm_world.discovery.problems import DONE, random_model
 from scm_world.discovery.run import discover
 from scm_world.queries.experiments.versions import versions
 
@@ -29,7 +29,7 @@ HERE = Path(__file__).parent / "discovery"
 
 def table(name: str, seed: int, seen: int, each: int) -> tuple[Any, Dataset]:
     """Collect watched rows and some for each variable set to N(2, 1)."""
-    scm = model(name, seed)
+    scm = random_model(name, seed)
     targets = tuple(scm)
     n = seen + each * len(targets)
     design = Design("single", targets, DONE, seen / n)
@@ -94,13 +94,15 @@ def moving() -> Any:
     for name in ("er2:20", "er2:50", "er2:100", "sf2:100", "tanh4:20", "tanh4:50", "tanh4:100"):
         rows = []
         for seed in range(20):
-            scm = model(name, seed)
+            scm = random_model(name, seed)
             truth = [edge.key for edge in scm.edges]
             kinds = (
-                paired(Model(scm, seed), budget=1),
-                sparse_pooled(Model(scm, seed), seed=seed),
-                verified(Model(scm, seed), declared=truth, seed=seed, units=1, thorough=False),
-                verified(Model(scm, seed), declared=truth, seed=seed, units=1),
+                paired(SCMSimulator(scm, seed), budget=1),
+                sparse_pooled(SCMSimulator(scm, seed), seed=seed),
+                verified(
+                    SCMSimulator(scm, seed), declared=truth, seed=seed, units=1, thorough=False
+                ),
+                verified(SCMSimulator(scm, seed), declared=truth, seed=seed, units=1),
             )
             rows.append([(f.experiments, f.bound, evaluate(f, truth).shd) for f in kinds])
         for number, kind in enumerate(KINDS):

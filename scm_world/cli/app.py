@@ -94,10 +94,10 @@ def discover(
     task: Annotated[
         str,
         typer.Argument(
-            metavar="SUBJECT",
+            metavar="SYSTEM",
             help="A task, a model.xml or model.urdf, or module:function; with --learner also a "
             "family with a size (er2:20, sf2:50, tanh4:100), "
-            "the JSON file of a model, or several with commas between them.",
+            "the JSON file of an SCM, or several with commas between them.",
         ),
     ],
     backend: Backend = "mujoco",
@@ -110,11 +110,14 @@ def discover(
     resolution: Resolution = None,
     learner: Annotated[
         str | None,
-        typer.Option(help="Examine these, with commas between them; see 'scm-world list'."),
+        typer.Option(help="Benchmark these, with commas between them; see 'scm-world list'."),
     ] = None,
     data: Annotated[
         str | None,
-        typer.Option(help="see, do, paired, with commas; what each can use best by default."),
+        typer.Option(
+            help="observational, interventional, paired, with commas; by default what each "
+            "learner can use best."
+        ),
     ] = None,
     budget: Annotated[
         str,
@@ -145,11 +148,11 @@ def discover(
     engine: Engine = None,
     address: Address = None,
 ) -> None:
-    """Recover a causal graph by experiments, and score it; or examine learners.
+    """Recover a causal graph by experiments, and score it; or benchmark learners.
 
     Without --learner the one-step graph of a task is recovered by paired experiments. With it, and
-    for models, learners are run over budgets and seeds, and a table, a picture and a report are
-    written, on any --engine. After an interruption the same command goes on. Ctrl-C gives the
+    for SCMs, learners are run over budgets and seeds, and a table, a picture and a report are
+    written, on any --engine. After an interruption the same command resumes. Ctrl-C gives the
     result so far (exit code 130).
     """
     if learner is None and not is_scm(task):
@@ -158,10 +161,19 @@ def discover(
         Work(engine, workers, address).refuse_others("discover without --learner")
         options = Options(task, backend, preset, probes, seed, tuple(option or ()), resolution)
         raise typer.Exit(run(options, out=out, strict=strict))
-    from scm_world.cli import exam
+    from scm_world.cli import benchmark
+    from scm_world.discovery.problems import TaskView
 
-    chosen = exam.view(view, cause, outcome, policy, steps, sensor_noise, backend, preset)
-    sitting = exam.Options(
+    chosen = TaskView(
+        view=view,
+        causes=tuple(cause) if cause else None,
+        outcomes=tuple(outcome) if outcome else None,
+        policy=policy,
+        steps=steps,
+        sensor_noise=sensor_noise,
+        options={"backend": backend, **({"preset": preset} if preset else {})},
+    )
+    code = benchmark.run(
         task,
         learner or "paired",
         data,
@@ -171,8 +183,9 @@ def discover(
         timeout,
         Work(engine, workers, address),
         tuple(option or ()),
+        out,
     )
-    raise typer.Exit(exam.run(sitting, out=out))
+    raise typer.Exit(code)
 
 
 for _command in (evaluate, explain, collect, sweep, plan, train, clone):

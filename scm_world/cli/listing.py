@@ -6,8 +6,8 @@ from rich.text import Text
 
 from scm_world.backends import backends, make_backend
 from scm_world.cli.console import console, table
-from scm_world.discovery.exam.families import FAMILIES
 from scm_world.discovery.learners import Learner, learners
+from scm_world.discovery.problems import FAMILIES
 from scm_world.entities import ACTIONS
 from scm_world.env import IDS
 from scm_world.errors import EngineError
@@ -79,7 +79,7 @@ def run() -> None:
         "learners": {name: _learner(chosen) for name, chosen in learners().items()},
         "protocols": _protocols(),
         "trained policies": {name: _trained(about) for name, about in zoo().items()},
-        "families": {f"{family.name}:N": family.doc for family in FAMILIES.values()},
+        "families": {f"{name}:N": _first_line(draw.__doc__) for name, draw in FAMILIES.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }
     for title, rows in sections.items():

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from scm_world.discovery import learners
+    from scm_world.discovery.benchmarks import BenchmarkResult, benchmark
     from scm_world.discovery.data import Dataset, Design, Levels, collect, sweep
-    from scm_world.discovery.exam.study import Study, examine
-    from scm_world.discovery.exam.subjects import TaskView, subject
     from scm_world.discovery.learners import Found, Learner, learn, register
     from scm_world.discovery.metrics import evaluate
+    from scm_world.discovery.problems import TaskView, problem
     from scm_world.discovery.report import DiscoveryReport
     from scm_world.discovery.run import discover
     from scm_world.discovery.scores import Score, score
@@ -25,13 +25,14 @@ _HOMES = {
     "DiscoveryReport": "report",
     **dict.fromkeys(("Found", "Learner", "learn", "register"), "learners"),
     **dict.fromkeys(("Score", "score"), "scores"),
-    **dict.fromkeys(("Study", "examine"), "exam.study"),
-    **dict.fromkeys(("TaskView", "subject"), "exam.subjects"),
+    **dict.fromkeys(("BenchmarkResult", "benchmark"), "benchmarks"),
+    **dict.fromkeys(("TaskView", "problem"), "problems"),
     "discover": "run",
     "evaluate": "metrics",
 }
 
 __all__ = [
+    "BenchmarkResult",
     "Dataset",
     "Design",
     "DiscoveryReport",
@@ -39,17 +40,16 @@ __all__ = [
     "Learner",
     "Levels",
     "Score",
-    "Study",
     "TaskView",
+    "benchmark",
     "collect",
     "discover",
     "evaluate",
-    "examine",
     "learn",
     "learners",
+    "problem",
     "register",
     "score",
-    "subject",
     "sweep",
 ]
 

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data import Dataset, Design, collect
-from scm_world.discovery.exam.families import DONE
 from scm_world.discovery.learners import Found, Learner, learn, learner
+from scm_world.discovery.problems import DONE
 from scm_world.graph import SCM
 from scm_world.variables import Derived, Linear
 from scm_world.variables.distributions import Normal
@@ -42,9 +42,9 @@ def collider() -> SCM:
 
 @cache
 def table(kind: str) -> Dataset:
-    """Collect rows of that model: ``"see"`` or ``"do"``."""
+    """Collect ``"observational"`` or ``"interventional"`` rows of that model."""
     targets = tuple(collider())
-    design = Design() if kind == "see" else Design("single", targets, DONE, seen=0.3)
+    design = Design() if kind == "observational" else Design("single", targets, DONE, seen=0.3)
     return collect(collider(), design, ROWS, seed=5)
 
 
@@ -55,7 +55,7 @@ def _numpys() -> Any:
 
 
 class LearnerConformance:
-    """What the exam relies on, as tests: for learners that are given a dataset.
+    """What benchmarks rely on, as tests: for learners that are given a dataset.
 
     Attributes:
         learner: The learner, or its name.
@@ -72,7 +72,7 @@ class LearnerConformance:
     def data(self) -> Dataset:
         """The rows that the learner can use best."""
         chosen = learner(self.learner) if isinstance(self.learner, str) else self.learner
-        return table("do" if "do" in chosen.takes else "see")
+        return table("interventional" if "interventional" in chosen.takes else "observational")
 
     def found(self, data: Dataset) -> Found:
         """Let it learn."""

@@ -244,3 +244,23 @@ def test_normal_scores_are_those_of_blom() -> None:
     expected = stats.norm.ppf((stats.rankdata(values) - 0.375) / 101.25)
     np.testing.assert_allclose(normal_scores(values), expected, atol=1e-9)
     assert normal_scores(np.full(4, 2.0)).tolist() == [0.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("matrix", "reason"),
+    [
+        (np.array([[0.0, np.nan], [0.0, 0.0]]), "not finite"),
+        (Found.of_edges(["a", "b"], [("a", "b", 0)]), "which is not in the data"),
+    ],
+    ids=["nan", "names"],
+)
+def test_what_is_no_graph_of_the_data_is_refused(matrix: Any, reason: str) -> None:
+    """NaN is no edge, and other names are not those of the data."""
+    with pytest.raises(ModelError, match=reason):
+        learn(Learner("mine", lambda data, seed: matrix), TABLE.select(["x", "y"]))
+
+
+def test_sureness_is_not_turned_around() -> None:
+    """Log-probabilities are refused: their absolute value would rank them backwards."""
+    with pytest.raises(ModelError, match="negative"):
+        Found.of(["x", "y"], [[0, 1], [0, 0]], sureness=[[0.0, -0.1], [0.0, 0.0]])

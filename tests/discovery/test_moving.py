@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from scm_world._types import Floats
-from scm_world.discovery.exam.families import model
 from scm_world.discovery.learners import Found, learn
-from scm_world.discovery.learners.apparatus import Model
+from scm_world.discovery.learners.moving import sparse_pooled
+from scm_world.discovery.learners.simulators import SCMSimulator
+from scm_world.discovery.problems import random_model
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
-from scm_world.variables import Box, Derived, Exogenous, Function, Linear, Measured
+from scm_world.variables import Box, Derived, Exogenous, Function, Linear, Measured, Parent
 from scm_world.variables.distributions import Normal
 
 FAMILIES = ("er2:20", "sf2:20", "tanh4:20")
@@ -32,9 +33,9 @@ def wrong(found: Found, scm: SCM) -> int:
 
 
 class Counted:
-    """An apparatus that counts the lives of units by itself."""
+    """A simulator that counts the lives of units by itself."""
 
-    def __init__(self, inner: Model) -> None:
+    def __init__(self, inner: SCMSimulator) -> None:
         self.inner, self.lives = inner, 0
 
     def __getattr__(self, name: str) -> Any:
@@ -76,37 +77,37 @@ def first_of(first: Any, vector: Any) -> Any:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_one_variable_at_a_time_finds_the_graph(family: str, seed: int) -> None:
     """Four units are enough; what is spent is counted, and twice the budget changes nothing."""
-    scm = model(family, seed)
-    found = learn("paired", Model(scm, seed), budget=88)
+    scm = random_model(family, seed)
+    found = learn("paired", SCMSimulator(scm, seed), budget=88)
     assert wrong(found, scm) == 0
     assert 66 <= found.experiments <= 88
     assert "floor 0," in found.notes[0]
     assert found.bound is not None
     assert found.bound <= found.experiments
-    assert wrong(learn("paired", Model(scm, seed), budget=176), scm) == 0
+    assert wrong(learn("paired", SCMSimulator(scm, seed), budget=176), scm) == 0
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_moving_all_at_once_finds_the_graph(family: str, seed: int) -> None:
     """Few random experiments are enough, and the signs of the weights do not matter."""
-    scm = model(family, seed)
-    apparatus = Counted(Model(scm, seed))
-    found = learn("pooled", apparatus, seed=seed)
+    scm = random_model(family, seed)
+    simulator = Counted(SCMSimulator(scm, seed))
+    found = learn("pooled", simulator, seed=seed)
     assert wrong(found, scm) == 0
-    assert found.experiments == apparatus.lives <= 28
+    assert found.experiments == simulator.lives <= 28
     assert found.notes == ()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_hundred_variables_need_forty_experiments(seed: int) -> None:
     """Pooled, the graph of 100 variables is exact; by color six experiments confirm it."""
-    scm = model("tanh4:100", seed)
-    found = learn("pooled", Model(scm, seed), seed=seed)
+    scm = random_model("tanh4:100", seed)
+    found = learn("pooled", SCMSimulator(scm, seed), seed=seed)
     assert wrong(found, scm) == 0
     assert found.experiments <= 40
     settings: dict[str, Any] = {"declared": true_edges(scm), "units": 1, "thorough": False}
-    checked = learn("coloring", Model(scm, seed), **settings)
+    checked = learn("coloring", SCMSimulator(scm, seed), **settings)
     assert wrong(checked, scm) == 0
     assert checked.experiments <= 6
     assert checked.bound is not None
@@ -116,7 +117,7 @@ def test_a_hundred_variables_need_forty_experiments(seed: int) -> None:
 def test_the_weights_are_found() -> None:
     """The sureness of a pooled edge is its absolute weight."""
     scm = lines(x={}, y={"x": -2.0}, z={"x": 0.5, "y": 1.0})
-    found = learn("pooled", Model(scm), budget=20)
+    found = learn("pooled", SCMSimulator(scm), budget=20)
     expected = [[0.0, 2.0, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     np.testing.assert_allclose(found.sureness[0], expected, rtol=1e-6)
 
@@ -127,32 +128,32 @@ def test_the_weights_are_found() -> None:
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_dropped_edge_is_found(family: str) -> None:
     """Whichever edge is left out of the declaration, it cannot hide behind declared ones."""
-    scm = model(family, 1)
+    scm = random_model(family, 1)
     for edge in sorted(true_edges(scm))[::3]:
-        apparatus = Counted(Model(scm, 1))
-        found = learn("coloring", apparatus, declared=true_edges(scm) - {edge})
+        simulator = Counted(SCMSimulator(scm, 1))
+        found = learn("coloring", simulator, declared=true_edges(scm) - {edge})
         assert wrong(found, scm) == 0
         assert "1 edges are not declared, 0 declared ones did not show" in found.notes
-        assert found.experiments == apparatus.lives <= 50
+        assert found.experiments == simulator.lives <= 50
 
 
 def test_what_hides_behind_declared_causes_is_told() -> None:
     """Colors alone leave pairs that nobody looked at; they are counted in a note."""
-    scm = model("er2:20", 1)
+    scm = random_model("er2:20", 1)
     settings: dict[str, Any] = {"declared": true_edges(scm), "units": 1}
-    quick = learn("coloring", Model(scm), thorough=False, **settings)
+    quick = learn("coloring", SCMSimulator(scm), thorough=False, **settings)
     assert any(note.endswith("pairs hid behind declared causes") for note in quick.notes)
-    whole = learn("coloring", Model(scm), **settings)
+    whole = learn("coloring", SCMSimulator(scm), **settings)
     assert quick.experiments < whole.experiments < 25
     assert not any("hid behind" in note for note in whole.notes)
 
 
 def test_culprits_are_counted_as_experiments() -> None:
     """To look for a cause costs more than to confirm one."""
-    scm = model("er2:20", 2)
+    scm = random_model("er2:20", 2)
     edge = max(true_edges(scm))
-    whole = learn("coloring", Model(scm), declared=true_edges(scm), units=1)
-    part = learn("coloring", Model(scm), declared=set(), units=1)
+    whole = learn("coloring", SCMSimulator(scm), declared=true_edges(scm), units=1)
+    part = learn("coloring", SCMSimulator(scm), declared=set(), units=1)
     assert part.experiments > whole.experiments + len(true_edges(scm))
     assert set(part.directed) == true_edges(scm)
     assert edge in part.directed
@@ -162,23 +163,23 @@ def test_a_declared_edge_that_never_shows_is_told() -> None:
     """An edge without effect is left out, and counted in a note."""
     scm = lines(x={}, y={"x": 1.0}, z={"y": 1.0})
     declared = {*true_edges(scm), ("x", "z", 0)}
-    found = learn("coloring", Model(scm), declared=declared)
+    found = learn("coloring", SCMSimulator(scm), declared=declared)
     assert set(found.directed) == true_edges(scm)
     assert "0 edges are not declared, 1 declared ones did not show" in found.notes
 
 
 def test_edges_of_another_lag_are_not_checked() -> None:
-    """An apparatus moves causes at one lag; what is declared of another one is left aside."""
-    scm = model("tanh4:20")
+    """A simulator moves causes at one lag; what is declared of another one is left aside."""
+    scm = random_model("tanh4:20")
     within = {(c, e, 0) for c, e, _ in true_edges(scm) if c != e}
-    found = learn("coloring", Model(scm), declared=true_edges(scm) | within)
+    found = learn("coloring", SCMSimulator(scm), declared=true_edges(scm) | within)
     assert wrong(found, scm) == 0
 
 
 def test_colors_end_with_the_budget() -> None:
     """No unit is begun that the budget has no room for."""
-    scm = model("er2:20")
-    found = learn("coloring", Model(scm), declared=true_edges(scm), budget=7)
+    scm = random_model("er2:20")
+    found = learn("coloring", SCMSimulator(scm), declared=true_edges(scm), budget=7)
     assert found.notes[0].startswith("2 units")
 
 
@@ -187,7 +188,7 @@ def test_colors_end_with_the_budget() -> None:
 
 def test_what_the_budget_does_not_explain_is_told() -> None:
     """With too few experiments no edge is made up, and the variables are named."""
-    found = learn("pooled", Model(model("er2:20")), budget=5)
+    found = learn("pooled", SCMSimulator(random_model("er2:20")), budget=5)
     assert found.directed == ()
     assert found.experiments == 5
     assert found.notes[0].startswith("not explained within the budget: x00, x01")
@@ -197,10 +198,10 @@ def test_what_depends_on_nearly_everything_is_not_explained_early() -> None:
     """An effect with many causes stays open while the others are found."""
     names = [f"x{i:02d}" for i in range(24)]
     many = lines(**{name: {} for name in names}, y=dict.fromkeys(names, 1.0), z={"x00": 1.0})
-    found = learn("pooled", Model(many), budget=25)
+    found = learn("pooled", SCMSimulator(many), budget=25)
     assert set(found.directed) == {("x00", "z", 0)}
     assert found.notes == ("not explained within the budget: y",)
-    assert wrong(learn("pooled", Model(many), budget=200), many) == 0
+    assert wrong(learn("pooled", SCMSimulator(many), budget=200), many) == 0
 
 
 @pytest.mark.parametrize("learner", ["paired", "pooled", "coloring"])
@@ -209,23 +210,25 @@ def test_a_budget_of_nothing_is_refused(learner: str, budget: int) -> None:
     """The message has the budget."""
     settings: dict[str, Any] = {"declared": ()} if learner == "coloring" else {}
     with pytest.raises((ModelError, UnknownOption), match="budget"):
-        learn(learner, Model(model("er2:5")), budget=budget, **settings)
+        learn(learner, SCMSimulator(random_model("er2:5")), budget=budget, **settings)
 
 
 def test_a_model_without_edges_has_none() -> None:
     """Nothing answers, and no experiment is wasted on it."""
     scm = lines(x={}, y={}, z={})
     for name in ("paired", "pooled"):
-        found = learn(name, Model(scm))
+        found = learn(name, SCMSimulator(scm))
         assert found.directed == ()
-    assert learn("coloring", Model(scm), declared=()).experiments == 8  # 4 units, one color each
+    assert (
+        learn("coloring", SCMSimulator(scm), declared=()).experiments == 8
+    )  # 4 units, one color each
 
 
 def test_what_cannot_be_set_is_named() -> None:
     """A measured variable has no mechanism that could be asked alone."""
     scm = SCM([Exogenous(name="a"), Measured(name="b", parents=("a",))])
     with pytest.raises(ModelError, match="'b' cannot be set"):
-        Model(scm)
+        SCMSimulator(scm)
 
 
 def test_vectors_and_whole_numbers_are_not_moved_a_little() -> None:
@@ -239,11 +242,11 @@ def test_vectors_and_whole_numbers_are_not_moved_a_little() -> None:
         ]
     )
     with pytest.raises(ModelError) as told:
-        learn("pooled", Model(scm))
+        learn("pooled", SCMSimulator(scm))
     assert [problem.split()[0] for problem in told.value.problems] == ["'v'", "'k'"]
     with pytest.raises(ModelError, match="cannot be moved a little"):
-        learn("coloring", Model(scm), declared=())
-    assert learn("paired", Model(scm), budget=20).directed == (("k", "y", 0),)
+        learn("coloring", SCMSimulator(scm), declared=())
+    assert learn("paired", SCMSimulator(scm), budget=20).directed == (("k", "y", 0),)
 
 
 def test_moves_are_in_the_size_of_a_variable() -> None:
@@ -254,7 +257,20 @@ def test_moves_are_in_the_size_of_a_variable() -> None:
             Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
         ]
     )
-    apparatus = Model(scm)
-    apparatus.prepare(0)
-    np.testing.assert_allclose(apparatus.answers({"x": 0.1}), [0.0, 200.0])
-    assert apparatus.used == 2
+    simulator = SCMSimulator(scm)
+    simulator.prepare(0)
+    np.testing.assert_allclose(simulator.answers({"x": 0.1}), [0.0, 200.0])
+    assert simulator.used == 2
+
+
+def test_pooled_says_that_it_sees_one_lag() -> None:
+    """A model with edges of both lags is not found whole, and a note says so."""
+    model = SCM(
+        [
+            Derived(name="x", parents=(Parent("x", 1),), mechanism=Linear(weights=(0.5,))),
+            Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
+        ]
+    )
+    assert sparse_pooled(SCMSimulator(model)).notes == (
+        "edges of lag 1 only, and there are others",
+    )

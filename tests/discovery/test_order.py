@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data import Column, Dataset, Design, collect
-from scm_world.discovery.exam.families import DONE, model
 from scm_world.discovery.learners import Found, learn
+from scm_world.discovery.problems import DONE, problem, random_model
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.variables import Derived, Linear, Parent
@@ -53,7 +53,7 @@ CHAIN: Edges = {("a", "b", 0), ("b", "c", 0)}
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_it_finds_every_edge_and_no_other(seed: int) -> None:
     """With 500 rows for each target the graph is exact."""
-    scm = model("er2:20", seed)
+    scm = random_model("er2:20", seed)
     assert wrong(scm, drawn(scm, 11_000, seed)) == 0
 
 
@@ -62,7 +62,7 @@ def test_a_tenth_of_the_rows_is_mostly_enough(family: str) -> None:
     """With 50 rows for each target, 8 of 10 graphs are exact and no one is far off."""
     found = []
     for seed in range(10):
-        scm = model(family, seed)
+        scm = random_model(family, seed)
         found.append(wrong(scm, drawn(scm, 1_100, seed)))
     assert sum(count == 0 for count in found) >= 8
     assert max(found) <= 3
@@ -71,13 +71,13 @@ def test_a_tenth_of_the_rows_is_mostly_enough(family: str) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_half_of_the_variables_may_be_set_at_once(seed: int) -> None:
     """Random halves of the variables as targets tell the graph, too."""
-    scm = model("er2:20", seed)
+    scm = random_model("er2:20", seed)
     assert wrong(scm, drawn(scm, 3_000, seed, design="half", seen=0.3)) <= 1
 
 
 def test_what_is_always_set_together_is_not_told_apart() -> None:
     """If all are set or none is, no edge between them is claimed, and a note says why."""
-    scm = model("er2:8")
+    scm = random_model("er2:8")
     found = learn("do_order", drawn(scm, 1_000, 0, design="all", seen=0.3))
     assert found.directed == found.undirected == ()
     assert any("edges are not told: x0, x1" in note for note in found.notes)
@@ -94,7 +94,7 @@ def test_what_is_always_set_together_still_has_effects() -> None:
 
 def test_scales_do_not_matter() -> None:
     """Raw, standardised and stretched columns give the same edges."""
-    scm = model("er2:12", 3)
+    scm = random_model("er2:12", 3)
     data = drawn(scm, 600, 3, seen=0.2)
     factors = 10.0 ** np.random.default_rng(0).uniform(-4.0, 4.0, len(data.names))
     stretched = replace(data, values=data.values * factors + 5.0 * factors)
@@ -106,7 +106,7 @@ def test_scales_do_not_matter() -> None:
 
 def test_the_order_of_rows_does_not_matter() -> None:
     """Shuffled rows give the same graph, and the table is left as it was."""
-    scm = model("er2:12", 4)
+    scm = random_model("er2:12", 4)
     data = drawn(scm, 600, 4, seen=0.2)
     before = data.values.copy()
     shuffled = data.rows(np.random.default_rng(1).permutation(len(data)))
@@ -132,7 +132,7 @@ def test_q_bounds_the_share_of_false_edges() -> None:
     """A generous q finds more false edges than a strict one, and few enough."""
     false, every = {0.001: 0, 0.3: 0}, {0.001: 0, 0.3: 0}
     for seed in range(20):
-        scm = model("er2:12", seed)
+        scm = random_model("er2:12", seed)
         data = drawn(scm, 1_200, seed, seen=0.2)
         for q in false:
             found = set(learn("do_order", data, q=q).directed)
@@ -174,7 +174,7 @@ def test_time_gives_lagged_edges() -> None:
 
 def test_saturating_mechanisms_through_time_are_mostly_found() -> None:
     """Watched only, nearly all lagged edges of a nonlinear model are found."""
-    scm = model("tanh4:20")
+    scm = random_model("tanh4:20")
     found = learn("do_order", collect(scm, Design(), 100, seed=0, steps=10))
     assert {lag for *_, lag in found.directed} == {1}
     assert len(set(found.directed) & true_edges(scm)) >= 0.9 * len(true_edges(scm))
@@ -312,3 +312,13 @@ def test_settings_are_checked(setting: str, value: Any) -> None:
     rows, targets = chain(8)
     with pytest.raises(UnknownOption, match=f"{setting} cannot be"):
         learn("do_order", Dataset.of(rows, "abc", targets=targets), **{setting: value})
+
+
+def test_do_order_says_where_its_bound_does_not_hold() -> None:
+    """On straight lines there is no note; on curves there is one."""
+    notes: dict[str, Any] = {
+        name: learn("do_order", problem(name).data("interventional", 3000, 0)).notes
+        for name in ("er2:10", "tanh4:8")
+    }
+    assert not any("adds up" in note or "add up" in note for note in notes["er2:10"])
+    assert any("add up to" in note for note in notes["tanh4:8"])

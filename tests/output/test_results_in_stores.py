@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +9,8 @@ import pytest
 from stores import everything, fresh
 
 from scm_world.discovery import discover
+from scm_world.discovery.benchmarks import BenchmarkResult, benchmark
 from scm_world.discovery.data import Dataset, Design, collect, load, save
-from scm_world.discovery.exam.results import Exam
-from scm_world.discovery.exam.study import Study, examine
 from scm_world.discovery.run import Checkpoint
 from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation import Evaluation, evaluate
@@ -110,21 +108,21 @@ def test_a_saved_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
         save(table.first(3), str(folder), format="csv")
 
 
-def test_an_exam_goes_on_from_a_store() -> None:
+def test_a_benchmark_resumes_from_a_store() -> None:
     """Run once, it is only read the second time; tables, pictures and report are there."""
-    study = Study(("er2:4",), ("do_order",), budgets=(40, 80), seeds=1, standardised=False)
+    asked: Any = {"budgets": [40, 80], "seeds": 1, "standardised": False}
     folder = fresh()
-    done = examine(study, str(folder))
+    done = benchmark(["do_order"], ["er2:4"], **asked, out=str(folder))
     first = everything(folder)
-    again = examine(study, str(folder))
-    assert [cell.as_dict() for cell in again.ordered] == [cell.as_dict() for cell in done.ordered]
+    again = benchmark(["do_order"], ["er2:4"], **asked, out=str(folder))
+    assert [run.as_dict() for run in again.runs] == [run.as_dict() for run in done.runs]
     assert everything(folder) == first
-    assert sum(name.startswith("cells/") for name in first) == 2
-    names = {"budget.png", "exam.json", "report.html", "results.csv", "results.md", "study.json"}
-    assert {name for name in first if "/" not in name} == names
-    assert Exam.from_dict(json.loads(first["exam.json"])).subjects.keys() == {"er2:4"}
-    with pytest.raises(UnreadableFile, match="another exam: seeds"):
-        examine(Study(("er2:4",), ("do_order",), budgets=(40, 80), seeds=2), str(folder))
+    assert sum(name.startswith("runs/") for name in first) == 2
+    files = {"benchmark.json", "budget.png", "report.html", "results.csv", "results.md"}
+    assert {name for name in first if "/" not in name} == {*files, "settings.json"}
+    assert BenchmarkResult.read(str(folder)).problems.keys() == {"er2:4"}
+    with pytest.raises(UnreadableFile, match="another benchmark: seeds"):
+        benchmark(["do_order"], ["er2:4"], **{**asked, "seeds": 2}, out=str(folder))
 
 
 def test_a_discovery_goes_on_from_a_store() -> None:

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from work_samples import Task, make, no_bench
 
+from scm_world.discovery.benchmarks import benchmark
 from scm_world.discovery.data import Design, collect, sweep
-from scm_world.discovery.exam.study import Study, examine
 from scm_world.errors import ActionError, EngineFailure, UnknownOption
 from scm_world.evaluation import evaluate
 from scm_world.queries import World
@@ -181,20 +181,19 @@ def test_a_sweep_on_ray_has_the_same_files(ray: Executor, tmp_path: Path) -> Non
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
 
 
-def test_an_exam_on_ray_finds_the_same_graphs(ray: Executor, tmp_path: Path) -> None:
+def test_a_benchmark_on_ray_finds_the_same_graphs(ray: Executor, tmp_path: Path) -> None:
     """Only the seconds differ; each run is kept, and none is done again."""
-    study = Study(("er2:4",), ("pooled",), budgets=(40, 80), seeds=1, standardised=False)
+    asked: Any = {"budgets": [40, 80], "seeds": 1, "standardised": False}
     told: list[tuple[int, int]] = []
-    here = examine(study, tmp_path / "here", workers=1)
-    there = examine(study, tmp_path / "there", engine=ray, progress=lambda *at: told.append(at))
-    graphs = [{c.key: c.found.edges.tolist() for c in exam.cells} for exam in (here, there)]
+    here = benchmark(["pooled"], ["er2:4"], **asked)
+    how: Any = {"out": tmp_path / "there", "engine": ray}
+    there = benchmark(["pooled"], ["er2:4"], **asked, **how, progress=lambda *at: told.append(at))
+    graphs = [{r.key: r.found.edges.tolist() for r in result.runs} for result in (here, there)]
     assert graphs[0] == graphs[1]
-    assert here.subjects == there.subjects
+    assert here.problems == there.problems
     assert told == [(1, 2), (2, 2)]
-    again = examine(study, tmp_path / "there", engine=ray)
-    assert {cell.key: cell.seconds for cell in again.cells} == {
-        cell.key: cell.seconds for cell in there.cells
-    }
+    again = benchmark(["pooled"], ["er2:4"], **asked, **how)
+    assert [run.seconds for run in again.runs] == [run.seconds for run in there.runs]
 
 
 # --- the driver -----------------------------------------------------------------------------------

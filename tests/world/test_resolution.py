@@ -16,7 +16,7 @@ from worlds import NEEDS_BULLET, REST, actions
 
 from scm_world import discover
 from scm_world.curricula.targets import GROUPS, matching, settable
-from scm_world.discovery.exam.subjects import TaskView, subject
+from scm_world.discovery.problems import TaskView, problem
 from scm_world.entities import RESOLUTIONS
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
@@ -409,7 +409,7 @@ def test_what_is_learnt_by_step_has_one_truth() -> None:
     truths = []
     for resolution in RESOLUTIONS:
         options = {"resolution": resolution, "backend": "fake"}
-        made = subject("pushing", view=TaskView("step", options=options))
+        made = problem("pushing", view=TaskView("step", options=options))
         assert set(made.data("see", 5, 0).variables) == set(made.truth.names)
         edges = set(made.truth.edges)
         commands = {cause for cause, _, _ in edges if cause.endswith("action")}

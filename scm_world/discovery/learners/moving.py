@@ -10,8 +10,8 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools
 from scm_world.discovery.design import bounds, coloring, culprits, pooled
-from scm_world.discovery.learners.apparatus import SMALL, Apparatus, Movable
 from scm_world.discovery.learners.found import Found
+from scm_world.discovery.learners.simulators import SMALL, MultiTargetSimulator, PairedSimulator
 from scm_world.errors import ModelError
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.world.start import whole_number
@@ -21,12 +21,12 @@ CONFIRMED = 6  # experiments in a row that have to come out as foretold; 3 err i
 ROUNDING = 1e-9  # of the size of the answers, in the size of the moves
 
 
-def paired(apparatus: Apparatus, *, seed: int = 0, budget: int = 1000) -> Found:
+def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> Found:
     """Find a graph by moving one variable at a time, in paired experiments.
 
     Args:
-        apparatus: Does the experiments.
-        seed: Not used: the apparatus has its own.
+        simulator: Does the experiments.
+        seed: Not used: the simulator has its own.
         budget: How many experiments there are.
 
     Returns:
@@ -35,8 +35,8 @@ def paired(apparatus: Apparatus, *, seed: int = 0, budget: int = 1000) -> Found:
     """
     del seed
     whole_number("budget", budget, least=1)
-    effects = apparatus.effects(budget)
-    names = apparatus.names
+    effects = simulator.effects(budget)
+    names = simulator.names
     at = {name: i for i, name in enumerate(names)}
     lags = 1 + max((lag for *_, lag in effects.largest), default=0)
     size = np.zeros((lags, len(names), len(names)))
@@ -56,7 +56,9 @@ def paired(apparatus: Apparatus, *, seed: int = 0, budget: int = 1000) -> Found:
 # --- pooled -------------------------------------------------------------------------------------
 
 
-def sparse_pooled(apparatus: Movable, *, seed: int = 0, budget: int = 200, unit: int = 0) -> Found:
+def sparse_pooled(
+    simulator: MultiTargetSimulator, *, seed: int = 0, budget: int = 200, unit: int = 0
+) -> Found:
     """Find a graph with few causes each by moving all variables at once, at random.
 
     Every experiment moves each variable a little up or down. What answers is a weighted sum of
@@ -64,7 +66,7 @@ def sparse_pooled(apparatus: Movable, *, seed: int = 0, budget: int = 200, unit:
     in a row come out as foretold.
 
     Args:
-        apparatus: Does the experiments.
+        simulator: Does the experiments.
         seed: Of the moves.
         budget: How many experiments there are at most.
         unit: Which unit lives again and again.
@@ -77,25 +79,25 @@ def sparse_pooled(apparatus: Movable, *, seed: int = 0, budget: int = 200, unit:
         Orthogonal matching pursuit: Tropp and Gilbert 2007, Algorithm 3. Bound: Donoho and Elad,
         *Optimally sparse representation in general dictionaries*, PNAS 2003.
     """
-    n, q = len(apparatus.causes), len(apparatus.watched)
+    n, q = len(simulator.causes), len(simulator.watched)
     most = min(budget - 1, 4 * n)
     if most < 1:
         raise ModelError([f"pooled experiments need a budget of 2 or more, got {budget}"])
     signs = pooled(n, max(most, n.bit_length() + 1), np.random.default_rng(seed))[:most]
-    apparatus.prepare(unit)
+    simulator.prepare(unit)
     answers = np.empty((0, q))
     weights = np.zeros((n, q))
     open_ = np.ones(q, bool)
     settled = 0
     for count in range(1, most + 1):
-        moves = dict(zip(apparatus.causes, SMALL * signs[count - 1], strict=True))
-        answers = np.vstack([answers, apparatus.answers(moves) / SMALL])
+        moves = dict(zip(simulator.causes, SMALL * signs[count - 1], strict=True))
+        answers = np.vstack([answers, simulator.answers(moves) / SMALL])
         open_ |= np.abs(signs[count - 1] @ weights - answers[-1]) > _allowed(answers)
         settled = 0 if open_.any() else settled + 1
         _explain(signs[:count], answers, weights, open_)
         if settled >= CONFIRMED:
             break
-    return _pooled_found(apparatus, weights, open_)
+    return _pooled_found(simulator, weights, open_)
 
 
 def _allowed(answers: Floats) -> Floats:
@@ -132,21 +134,21 @@ def _pursued(signs: Floats, answer: Floats) -> Floats | None:
     return None
 
 
-def _pooled_found(apparatus: Movable, weights: Floats, open_: Bools) -> Found:
-    names = apparatus.names
-    cause = [names.index(name) for name in apparatus.causes]
-    effect = [names.index(name) for name in apparatus.watched]
-    matrix = np.zeros((apparatus.lag + 1, len(names), len(names)))
-    matrix[apparatus.lag][np.ix_(cause, effect)] = weights
+def _pooled_found(simulator: MultiTargetSimulator, weights: Floats, open_: Bools) -> Found:
+    names = simulator.names
+    cause = [names.index(name) for name in simulator.causes]
+    effect = [names.index(name) for name in simulator.watched]
+    matrix = np.zeros((simulator.lag + 1, len(names), len(names)))
+    matrix[simulator.lag][np.ix_(cause, effect)] = weights
     degree = max(1, int((weights != 0).sum(axis=0).max(initial=0)))
-    left = [name for name, is_open in zip(apparatus.watched, open_, strict=True) if is_open]
-    notes = apparatus.notes
+    left = [name for name, is_open in zip(simulator.watched, open_, strict=True) if is_open]
+    notes = simulator.notes
     if left:
         notes += (f"not explained within the budget: {', '.join(left)}",)
     return Found.of(
         names,
         matrix,
-        experiments=apparatus.used,
+        experiments=simulator.used,
         bound=2 * degree,  # numbers that fix so few weights and their places, in principle
         notes=notes,
     )
@@ -156,7 +158,7 @@ def _pooled_found(apparatus: Movable, weights: Floats, open_: Bools) -> Found:
 
 
 def verified(
-    apparatus: Movable,
+    simulator: MultiTargetSimulator,
     *,
     declared: Iterable[EdgeKey],
     seed: int = 0,
@@ -173,8 +175,8 @@ def verified(
     pair is left that was never looked at.
 
     Args:
-        apparatus: Does the experiments.
-        declared: Edges: cause, effect, lag; those of the apparatus's lag are checked.
+        simulator: Does the experiments.
+        declared: Edges: cause, effect, lag; those of the simulator's lag are checked.
         seed: Of the orders and of the moves.
         budget: How many experiments there are at most, but for finding culprits.
         units: In how many units.
@@ -185,21 +187,21 @@ def verified(
     """
     whole_number("budget", budget, least=1)
     whole_number("units", units, least=1)
-    names, lag = apparatus.names, apparatus.lag
+    names, lag = simulator.names, simulator.lag
     rng = np.random.default_rng(seed)
     wanted = {(c, e) for c, e, at in declared if at == lag}
-    account = _Account(apparatus, wanted)
+    account = _Account(simulator, wanted)
     colors = []
     for unit in range(units):
-        if apparatus.used >= budget:
+        if simulator.used >= budget:
             break
-        apparatus.prepare(unit)
-        order = [apparatus.causes[i] for i in rng.permutation(len(apparatus.causes))]
-        classes = _classes(order, apparatus.watched, account.known)
+        simulator.prepare(unit)
+        order = [simulator.causes[i] for i in rng.permutation(len(simulator.causes))]
+        classes = _classes(order, simulator.watched, account.known)
         colors.append(len(classes))
         for together in classes:
             account.check(_moves(together, rng))
-    while thorough and apparatus.used < budget and (others := account.revealing()):
+    while thorough and simulator.used < budget and (others := account.revealing()):
         account.check(_moves(others, rng))
     made = Found.of_edges(names, [(c, e, lag) for c, e in sorted(account.found)])
     degree = max((sum(e == effect for _, e in wanted) for effect in names), default=0)
@@ -210,7 +212,7 @@ def verified(
     ]
     if not account.looked.all():
         notes.append(f"{int((~account.looked).sum())} pairs hid behind declared causes")
-    return made.told(experiments=apparatus.used, bound=degree, notes=tuple(notes))
+    return made.told(experiments=simulator.used, bound=degree, notes=tuple(notes))
 
 
 def _moves(together: Iterable[str], rng: np.random.Generator) -> dict[str, float]:
@@ -235,12 +237,12 @@ class _Account:
         looked: Shape (causes, effects): declared, or the cause was moved without a known one.
     """
 
-    def __init__(self, apparatus: Movable, wanted: set[tuple[str, str]]) -> None:
-        self._apparatus, self._wanted = apparatus, wanted
+    def __init__(self, simulator: MultiTargetSimulator, wanted: set[tuple[str, str]]) -> None:
+        self._simulator, self._wanted = simulator, wanted
         self.seen: set[tuple[str, str]] = set()
         self.intruders: set[tuple[str, str]] = set()
-        pairs = [[(c, e) for e in apparatus.watched] for c in apparatus.causes]
-        itself = [[c == e and not apparatus.lag for c, e in row] for row in pairs]
+        pairs = [[(c, e) for e in simulator.watched] for c in simulator.causes]
+        itself = [[c == e and not simulator.lag for c, e in row] for row in pairs]
         self._parents = np.array([[pair in wanted for pair in row] for row in pairs])
         self.looked = self._parents | np.array(itself)
 
@@ -256,23 +258,23 @@ class _Account:
 
     def check(self, moves: Mapping[str, float]) -> None:
         """Move some causes, and account for what answers."""
-        apparatus = self._apparatus
-        here = np.array([name in moves for name in apparatus.causes])
+        simulator = self._simulator
+        here = np.array([name in moves for name in simulator.causes])
         alone = ~self._parents[here].any(axis=0)
-        answered = np.abs(apparatus.answers(moves)) > ROUNDING
+        answered = np.abs(simulator.answers(moves)) > ROUNDING
         self.looked[np.ix_(here, alone)] = True
         for j in np.flatnonzero(answered).tolist():
             if not alone[j]:
-                known = {(c, apparatus.watched[j]) for c in moves}
+                known = {(c, simulator.watched[j]) for c in moves}
                 self.seen |= known & self._wanted
                 continue
 
             def does(asked: tuple[str, ...], place: int = j) -> bool:
-                return bool(abs(apparatus.answers({c: moves[c] for c in asked})[place]) > ROUNDING)
+                return bool(abs(simulator.answers({c: moves[c] for c in asked})[place]) > ROUNDING)
 
             for cause in culprits(tuple(moves), does):
-                self.intruders.add((cause, apparatus.watched[j]))
-                self._parents[apparatus.causes.index(cause), j] = True
+                self.intruders.add((cause, simulator.watched[j]))
+                self._parents[simulator.causes.index(cause), j] = True
 
     def revealing(self) -> tuple[str, ...]:
         """Choose causes that, moved together, show many pairs that nobody has looked at."""
@@ -284,4 +286,4 @@ class _Account:
             shown = int(hidden[~fewer][:, alone].sum())
             if shown > most:
                 still, most = fewer, shown
-        return tuple(np.array(self._apparatus.causes)[~still].tolist()) if most else ()
+        return tuple(np.array(self._simulator.causes)[~still].tolist()) if most else ()

@@ -17,7 +17,7 @@ OTHERS = (
     Learner(
         "pc",
         pc,
-        takes=("see",),
+        takes=("observational",),
         extra=CAUSAL_LEARN,
         package=CAUSAL_LEARN,
         doc="tests of partial correlation",
@@ -25,7 +25,7 @@ OTHERS = (
     Learner(
         "ges",
         ges,
-        takes=("see",),
+        takes=("observational",),
         extra=CAUSAL_LEARN,
         package=CAUSAL_LEARN,
         doc="greedy search over equivalence classes by BIC",
@@ -33,7 +33,7 @@ OTHERS = (
     Learner(
         "boss",
         boss,
-        takes=("see",),
+        takes=("observational",),
         extra=CAUSAL_LEARN,
         package=CAUSAL_LEARN,
         doc="best order by BIC, moving one column at a time",
@@ -41,7 +41,7 @@ OTHERS = (
     Learner(
         "grasp",
         grasp,
-        takes=("see",),
+        takes=("observational",),
         extra=CAUSAL_LEARN,
         package=CAUSAL_LEARN,
         doc="sparsest order by BIC, by tucks",
@@ -49,7 +49,7 @@ OTHERS = (
     Learner(
         "gies",
         gies,
-        takes=("see", "do"),
+        takes=("observational", "interventional"),
         extra="discovery",
         package="gies",
         doc="greedy search over interventional equivalence classes by BIC",
@@ -57,7 +57,7 @@ OTHERS = (
     Learner(
         "pcmci+",
         pcmci_plus,
-        takes=("see",),
+        takes=("observational",),
         temporal=True,
         extra="tigramite",
         package="tigramite",

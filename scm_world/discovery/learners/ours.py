@@ -33,13 +33,15 @@ COLORING = register(
     )
 )
 DO_ORDER = register(
-    Learner("do_order", do_order, ("do",), doc="order by invariance, edges by regression")
+    Learner(
+        "do_order", do_order, ("interventional",), doc="order by invariance, edges by regression"
+    )
 )
 DO_ORDER_RANKS = register(
     Learner(
         "do_order_ranks",
         partial(do_order, features=2, ranks=True, spread=True),
-        ("do",),
+        ("interventional",),
         doc="do_order for curves, outliers, and causes of spread",
     )
 )

@@ -17,8 +17,8 @@ from scm_world.discovery.data.dataset import Dataset, Level
 from scm_world.discovery.learners.found import Found
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
-Source = Literal["see", "do", "paired"]
-SOURCES: tuple[Source, ...] = ("see", "do", "paired")
+Source = Literal["observational", "interventional", "paired"]
+SOURCES: tuple[Source, ...] = ("observational", "interventional", "paired")
 
 
 @final
@@ -30,11 +30,12 @@ class Learner:
         name: To call it by.
         learn: ``learn(data, seed=0, **settings)`` gives a ``Found``, or a matrix of shape (p, p)
             over the columns of the data: not zero at [i, j] where i acts on j; both ways for an
-            edge without direction. ``data`` is a ``Dataset``, or an ``Apparatus`` for ``"paired"``.
-        takes: The kinds of data it can use: ``"see"`` (nothing is done), ``"do"`` (known targets),
-            ``"paired"`` (it does its own experiments, with the same noise).
-        claims: Whether it is handed the declared graph, to check it: no exam for learners.
-        on: What its own experiments are done on: ``"any"`` apparatus, ``"models"`` whose variables
+            edge without direction. ``data`` is a ``Dataset``, or a ``PairedSimulator`` for
+            ``"paired"``.
+        takes: The kinds of data it can use: ``"observational"``, ``"interventional"`` (known
+            targets), ``"paired"`` (it does its own experiments, with the same noise).
+        claims: Whether it is given the true graph, to check it; it cannot be benchmarked.
+        on: What its own experiments are done on: ``"any"`` simulator, ``"models"`` whose variables
             are numbers, or ``"worlds"`` for a graph of their bodies.
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
             steps as further columns.
@@ -45,7 +46,7 @@ class Learner:
 
     name: str
     learn: Callable[..., Any]
-    takes: tuple[Source, ...] = ("see", "do")
+    takes: tuple[Source, ...] = ("observational", "interventional")
     on: Literal["any", "models", "worlds"] = "any"
     claims: bool = False
     temporal: bool = False
@@ -95,7 +96,7 @@ def learner(name: str) -> Learner:
 
     Args:
         name: One that is known, or ``"module:attribute"``: a ``Learner``, or a function that is
-            taken for one that uses ``"see"`` and ``"do"``.
+            taken for one that uses observational and interventional data.
 
     Raises:
         UnknownOption: There is none.
@@ -129,7 +130,7 @@ def learn(
 
     Args:
         given: A learner, or its name.
-        data: A ``Dataset``, or an ``Apparatus`` for a learner that does its own experiments.
+        data: A ``Dataset``, or a ``PairedSimulator`` for a learner that does its own experiments.
             Earlier control steps are put beside each row of a dataset with several rows per
             episode, if the learner does not use time by itself.
         seed: Of what the learner draws.

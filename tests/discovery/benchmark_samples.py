@@ -1,25 +1,23 @@
-"""A small exam with every kind of mistake, for the tests of what is written about it."""
+"""A small benchmark with every kind of mistake, for the tests of what is written about it."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 
-from scm_world.discovery.exam.results import (
-    Cell,
-    Exam,
-    Truth,
-)
+from scm_world.discovery.benchmarks import BenchmarkResult, Run
 from scm_world.discovery.learners import Found
+from scm_world.discovery.problems import GroundTruth
 from scm_world.discovery.scores import score
 
-CHAIN = Truth(
+CHAIN = GroundTruth(
     name="chain",
     names=("a", "b", "c", "d"),
     edges=(("a", "b", 0), ("b", "c", 0), ("c", "d", 0), ("d", "d", 1), ("a", "d", 1)),
-    left_out=(("b", "d"),),
+    unscored=(("b", "d"),),
     about={"kind": "synthetic"},
 )
-PUSHING = Truth(
+PUSHING = GroundTruth(
     name="pushing",
     names=("tool_block.mass", "tool_block.position", "goal_block.position", "reward", "floor"),
     edges=(
@@ -30,18 +28,23 @@ PUSHING = Truth(
         ("floor", "tool_block.position", 0),
         ("floor", "tool_block.position", 1),
     ),
-    left_out=(("floor", "tool_block.position"),),
+    unscored=(("floor", "tool_block.position"),),
 )
-INERT = Truth(
+INERT = GroundTruth(
     name="<script>alert(1)</script>",
     names=("<script>", 'x"&', "z"),
     edges=(("<script>", 'x"&', 0),),
 )
 TRUTHS = (CHAIN, PUSHING, INERT)
-WAYS = (("ours", "paired"), ("gies", "do"), ("pc", "see"), ("mine:learner", "do"))
+WAYS = (
+    ("ours", "paired"),
+    ("gies", "interventional"),
+    ("pc", "observational"),
+    ("mine:learner", "interventional"),
+)
 
 
-def found_of(truth: Truth, learner: str, budget: int) -> Found:
+def found_of(truth: GroundTruth, learner: str, budget: int) -> Found:
     """Make a graph with each kind of mistake; more of the truth for a larger budget."""
     edges = list(truth.edges)
     if learner == "ours":
@@ -55,14 +58,19 @@ def found_of(truth: Truth, learner: str, budget: int) -> Found:
     return Found.of_edges(truth.names, [*turned, extra, *edges[2:]])
 
 
-def cell(truth: Truth, learner: str, data: str, budget: int, seed: int) -> Cell:
+def run(truth: GroundTruth, learner: str, data: str, budget: int, seed: int) -> Run:
     """Make a run; the scores get better with the budget, and differ by seed."""
-    about = {"subject": truth.name, "learner": learner, "data": data, "budget": budget}
+    about: dict[str, Any] = {
+        "problem": truth.name,
+        "learner": learner,
+        "data": data,
+        "budget": budget,
+    }
     if learner == "gies" and seed == 2 and budget == 1000:
-        return Cell(**about, seed=seed, status="timeout", message="more than 60 s", seconds=60.0)
+        return Run(**about, seed=seed, status="timeout", message="more than 60 s", seconds=60.0)
     found = found_of(truth, learner, budget)
     known = score(found.directed, truth.edges)
-    numbers = {
+    numbers: dict[str, Any] = {
         "shd": known.shd + seed,
         "f1": known.f1,
         "precision": known.precision,
@@ -70,7 +78,7 @@ def cell(truth: Truth, learner: str, data: str, budget: int, seed: int) -> Cell:
         "sid": None if learner == "pc" else np.int64(3),
         "fdp": 1.0 - known.precision,
     }
-    return Cell(
+    return Run(
         **about,
         seed=seed,
         found=found,
@@ -81,10 +89,12 @@ def cell(truth: Truth, learner: str, data: str, budget: int, seed: int) -> Cell:
     )
 
 
-def sample_exam() -> Exam:
-    """Three subjects, four learners, three budgets, three seeds; one learner runs out of time."""
-    cells = tuple(
-        cell(truth, learner, data, budget, seed)
+def sample_result() -> BenchmarkResult:
+    """Three problems, four learners, three budgets, three seeds; one learner runs out of time."""
+    runs = tuple(
+        run(truth, learner, data, budget, seed)
         for truth, (learner, data), budget, seed in product(TRUTHS, WAYS, (10, 100, 1000), range(3))
     )
-    return Exam({truth.name: truth for truth in TRUTHS}, cells, {"versions": {"gies": "0.0.3"}})
+    return BenchmarkResult(
+        {truth.name: truth for truth in TRUTHS}, runs, {"versions": {"gies": "0.0.3"}}
+    )

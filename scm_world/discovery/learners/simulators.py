@@ -1,18 +1,24 @@
-"""Paired experiments on worlds: on one control step, and on what episodes end with."""
+"""Paired simulators: what learners get that do their own, paired experiments.
+
+A unit is run once as it is, and again with something moved and all else the same, noise included.
+An experiment is one such run. The graph is not shown.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
-from typing import Any, final
+from typing import Any, Protocol, final
 
 import numpy as np
 
-from scm_world._types import Value
+from scm_world._types import Floats, Value, Values
 from scm_world.discovery.data.recorded import first_label
-from scm_world.errors import InterventionError
+from scm_world.errors import InterventionError, ModelError
+from scm_world.graph import SCM, Moment
 from scm_world.queries.experiments.effects import Effects
+from scm_world.queries.experiments.models import paired_effects
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
 from scm_world.queries.experiments.series import Series
@@ -20,16 +26,157 @@ from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting
 from scm_world.queries.stages import stage_of
-from scm_world.variables import Exogenous
+from scm_world.variables import Box, Exogenous, Noise
 from scm_world.world import World
 
+SMALL = 1e-6  # of the size of a variable: so little that everything answers in proportion
 MOST = 10_000  # probe states, where the budget is what counts
 OTHER = 1_000_000
 """Units from here on lend their values to the others; none of them is a unit of the experiment."""
 
 
+class PairedSimulator(Protocol):
+    """Paired experiments on a system.
+
+    Attributes:
+        names: Of all variables of the graph that is looked for.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All variables of the graph that is looked for."""
+
+    def effects(self, budget: int) -> Effects:
+        """Move one variable at a time, in one unit after another, with all others held.
+
+        Args:
+            budget: How many experiments there are; the last unit is finished even if it takes a
+                few more.
+        """
+
+
+class MultiTargetSimulator(PairedSimulator, Protocol):
+    """A paired simulator that can move several variables at once."""
+
+    @property
+    def lag(self) -> int:
+        """How many control steps later the answers are read."""
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """What can be moved; each is one number."""
+
+    @property
+    def watched(self) -> tuple[str, ...]:
+        """What answers; each is one number."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What one should know of what it does not show."""
+
+    @property
+    def used(self) -> int:
+        """How many experiments there were."""
+
+    def prepare(self, unit: int) -> None:
+        """Run a unit as it is: one experiment."""
+
+    def answers(self, moves: Mapping[str, float]) -> Floats:
+        """Run it again with some causes moved: one experiment.
+
+        Args:
+            moves: How far each is moved, in its own size (1 for a variable without bounds).
+
+        Returns:
+            By how much what is watched differs, shape (len(watched),).
+        """
+
+
 @final
-class Steps:
+class SCMSimulator:
+    """Paired experiments in a causal model without physics, whose variables are numbers.
+
+    All others are held while some are moved: what each mechanism makes of that is the answer. So
+    answers are those of direct effects.
+
+    Args:
+        model: All its variables can be set.
+        seed: Of the units.
+        lag: Whether what is moved is moved at the same instant (0) or one control step before (1);
+            what the model has if None. 1 if it has both.
+
+    Raises:
+        ModelError: A variable cannot be set.
+    """
+
+    def __init__(self, model: SCM, seed: int = 0, *, lag: int | None = None) -> None:
+        _refuse([v.name for v in model.variables if not v.settable], "cannot be set")
+        self._model, self._seed = model, seed
+        lags = {edge.lag for edge in model.edges}
+        self.lag = max(lags, default=0) if lag is None else lag
+        others = lags - {self.lag}
+        self.notes = (f"edges of lag {self.lag} only, and there are others",) if others else ()
+        self.names = tuple(model)
+        self.causes = self.watched = self.names
+        self.used = 0
+
+    def effects(self, budget: int) -> Effects:
+        """Move one variable at a time; see ``PairedSimulator``."""
+        probes = max(1, budget // (len(self.names) + 2))
+        return paired_effects(self._model, probes=probes, seed=self._seed)
+
+    def prepare(self, unit: int) -> None:
+        """Draw a unit: two instants of it.
+
+        Raises:
+            ModelError: A variable is a vector or not real, so that it cannot be moved a little.
+        """
+        still = [v.name for v in self._model.variables if v.shape or v.dtype != "real"]
+        _refuse(still, "is not one real number, so it cannot be moved a little")
+        noise = Noise(self._seed)
+        self._before = self._model.solve(moment=Moment(noise, unit, 0))
+        self._moment = Moment(noise, unit, 1)
+        self._now = self._model.solve(previous=self._before, moment=self._moment)
+        self._base = self._mechanisms(self._now, self._before)
+        self.used += 1
+
+    def answers(self, moves: Mapping[str, float]) -> Floats:
+        """Say what every mechanism makes of a change of its causes."""
+        source = self._before if self.lag else self._now
+        moved = {
+            **source,
+            **{n: source[n] + by * self._size(n, source) for n, by in moves.items()},
+        }
+        self.used += 1
+        if self.lag:
+            return self._mechanisms(self._now, moved) - self._base
+        return self._mechanisms(moved, self._before) - self._base
+
+    def _size(self, name: str, values: Values) -> Value:
+        bounds = self._model[name].bounds
+        if not isinstance(bounds, Box):
+            return np.ones(())
+        low, high = bounds.bounds((), values)
+        return np.asarray(np.where(np.isfinite(high - low), high - low, 1.0))
+
+    def _mechanisms(self, now: Values, before: Values) -> Floats:
+        """Compute what each mechanism says; 0 where there is none, whatever the value is."""
+        found = (
+            self._model.solve(now, previous=before, moment=self._moment, only=(name,))[name]
+            if self._model[name].all_parents
+            else 0.0
+            for name in self.watched
+        )
+        return np.array([float(value) for value in found])
+
+
+def _refuse(names: list[str], why: str) -> None:
+    if names:
+        raise ModelError([f"{name!r} {why}" for name in names])
+
+
+@final
+class StepSimulator:
     """Paired experiments on one control step of a world, in one state after another.
 
     They find the whole graph, with what acts within an instant: see ``discover``.
@@ -45,7 +192,7 @@ class Steps:
         self.names = tuple(world.model)
 
     def effects(self, budget: int) -> Effects:
-        """Move one variable at a time; see ``Apparatus``."""
+        """Move one variable at a time; see ``PairedSimulator``."""
         series = Series(Paired(self._world, self._seed), MOST)
 
         def enough(effects: Effects, _: int) -> bool:
@@ -58,10 +205,10 @@ class Steps:
 
 
 @final
-class Outcomes:
+class EpisodeSimulator:
     """Paired experiments on whole episodes: what they begin with, and what they end with.
 
-    A unit is an episode. It lives again, with the same noise, while one cause has the value that
+    A unit is an episode. It is run again, with the same noise, while one cause has the value that
     it has in another unit. What else begins differently then is an effect; it is held while the
     rest is looked at, so that effects are direct.
 
@@ -95,7 +242,7 @@ class Outcomes:
         self.names = (*self._named.values(), *ends)
 
     def effects(self, budget: int) -> Effects:
-        """Move one variable at a time; see ``Apparatus``."""
+        """Move one variable at a time; see ``PairedSimulator``."""
         found = Effects()
         for unit in count():
             self._unit(unit, found)
@@ -107,8 +254,8 @@ class Outcomes:
 
     def _unit(self, unit: int, found: Effects) -> None:
         """Do all experiments on one unit."""
-        begin, end = self._begun(unit, {}, found), self._lived(unit, {}, found)
-        for what, again in zip(end, self._lived(unit, {}, found), strict=True):
+        begin, end = self._begun(unit, {}, found), self._ended(unit, {}, found)
+        for what, again in zip(end, self._ended(unit, {}, found), strict=True):
             found.floor = max(found.floor, float(np.max(np.abs(again - what), initial=0.0)))
         others = self._begun(OTHER + unit, {}, found)
         for cause in self._causes:
@@ -140,7 +287,7 @@ class Outcomes:
             there = self._begun(unit, {**do, **held}, found) if held else then
             found.see(self._named[cause], self._named[name], 0, there[name], begin[name])
         held = self._held(begin, (name for name in self._causes if name != cause))
-        after = self._lived(unit, {**held, cause: value}, found)
+        after = self._ended(unit, {**held, cause: value}, found)
         last = self.names[len(self._causes) :]
         for name, now, before in zip(last, after, end, strict=True):
             found.see(self._named[cause], name, 0, now, before)
@@ -159,12 +306,9 @@ class Outcomes:
         """Hold causes at what they were: the quantity itself, not its rounded coordinates."""
         return {self._target[name]: begin[self._target[name]] for name in names}
 
-    def _lived(self, unit: int, do: Mapping[str, Any], found: Effects) -> list[Value]:
-        """Live an episode, and look at what it ends with."""
+    def _ended(self, unit: int, do: Mapping[str, Any], found: Effects) -> list[Value]:
+        """Run an episode, and return what it ends with."""
         found.rollouts += 1
         names = tuple(outcome.name for outcome in self._outcomes)
         episode = self._setting_of(unit).episode(self._stage, self._world, do, unit, names)
         return [read(outcome, episode) for outcome in self._outcomes]
-
-
-__all__ = ["Outcomes", "Steps"]

@@ -1,0 +1,631 @@
+"""Benchmarks of learners: every learner on every problem, over budgets and seeds."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+from threading import Event, Lock
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+from pydantic import FiniteFloat, PlainValidator, TypeAdapter
+
+from scm_world.discovery.data import Dataset
+from scm_world.discovery.learners.found import Found
+from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
+from scm_world.discovery.metrics import effect_rmse, evaluate
+from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
+from scm_world.errors import (
+    EngineFailure,
+    MissingExtra,
+    ModelError,
+    UnknownOption,
+    UnreadableFile,
+    in_one_line,
+)
+from scm_world.output.durable import draft_of, locked, made, write_whole
+from scm_world.output.locations import Location, located
+from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.progress import Progress
+from scm_world.tasks import TASKS
+from scm_world.tasks.model import FILES
+from scm_world.work.executors import Executor, Processes, opened
+from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
+from scm_world.world.start import whole_number
+
+FORMAT = "scm_world/benchmark/1"
+SHARES = (8, 4, 2, 1)
+"""A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
+LONGEST = 1e6  # [s] that can be waited for at once
+
+# --- results --------------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One learner on one problem with one budget and one seed.
+
+    Attributes:
+        problem: Name of the problem, as it is shown.
+        learner: Name of the learner.
+        data: ``"observational"``, ``"interventional"`` or ``"paired"``.
+        budget: How many rows, episodes or experiments it might use.
+        seed: Of the model (of a family), the data and the learner.
+        standardised: Whether every column had mean 0 and deviation 1.
+        status: ``"done"``, ``"timeout"`` or ``"failed"``.
+        message: Why it was not done.
+        found: The estimated graph; None unless it was done.
+        scores: By name; None for one that does not exist here.
+        seconds: Wall time of the learner [s].
+        experiments: How many it used.
+        bound: Fewest that can do in theory, if known.
+        edges: The true edges, where this seed has another graph than the first one: each seed
+            draws its own model of a family.
+    """
+
+    problem: str
+    learner: str
+    data: Source
+    budget: int
+    seed: int
+    standardised: bool = False
+    status: Literal["done", "timeout", "failed"] = "done"
+    message: str = ""
+    found: Annotated[Found | None, PlainValidator(lambda v: v and Found.from_dict(v))] = None
+    scores: dict[str, int | FiniteFloat | None] = field(default_factory=dict)
+    seconds: float = 0.0
+    experiments: int = 0
+    bound: int | None = None
+    edges: tuple[EdgeKey, ...] | None = None
+
+    @property
+    def key(self) -> tuple[str, str, str, bool, int, int]:
+        """What it is a run of."""
+        return (
+            self.problem, self.learner, self.data, self.standardised, self.budget, self.seed
+        )  # fmt: skip
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Everything but the graphs: a row of the table."""
+        facts = {f.name: getattr(self, f.name) for f in fields(self)}
+        graphs = [facts.pop(name) for name in ("found", "edges", "scores")]
+        return {**facts, **graphs[-1]}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {**plain, "found": None if self.found is None else self.found.as_dict()}
+
+
+_RUN, _TRUTHS = TypeAdapter(Run), TypeAdapter(list[GroundTruth])
+
+
+@final
+@dataclass(frozen=True)
+class BenchmarkResult:
+    """Everything that a benchmark found.
+
+    Attributes:
+        problems: The true graphs by name; of a family, that of seed 0.
+        runs: By problem, learner, data, budget and seed.
+        settings: What was asked for, and the versions of all libraries.
+
+    Raises:
+        ModelError: A run has no problem, or there are two of one kind.
+    """
+
+    problems: dict[str, GroundTruth]
+    runs: tuple[Run, ...]
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check and sort the runs."""
+        place = {name: number for number, name in enumerate(self.problems)}
+        lost = sorted({run.problem for run in self.runs} - set(place))
+        wrong = [f"a run of {name!r}, which is no problem" for name in lost]
+        if len({run.key for run in self.runs}) < len(self.runs):
+            wrong.append("two runs of one problem, learner, data, budget and seed")
+        if wrong:
+            raise ModelError(wrong)
+        ordered = sorted(self.runs, key=lambda run: (place[run.problem], run.key))
+        object.__setattr__(self, "runs", tuple(ordered))
+
+    def truth_of(self, run: Run) -> GroundTruth:
+        """Return the graph that a run is compared with."""
+        truth = self.problems[run.problem]
+        return truth if run.edges is None else replace(truth, edges=run.edges)
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """One row per run: its settings, status, costs and scores."""
+        return [run.record for run in self.runs]
+
+    def to_dataframe(self) -> Any:
+        """Return the rows as a ``pandas.DataFrame``.
+
+        Raises:
+            MissingExtra: pandas is not installed.
+        """
+        if find_spec("pandas") is None:
+            raise MissingExtra("pandas", "data")
+        return import_module("pandas").DataFrame(self.records)
+
+    def write(self, folder: Location | str) -> None:
+        """Write ``benchmark.json``, ``results.csv``, ``results.md``, a picture and a report."""
+        from scm_world.discovery.benchmark_report import write_files
+
+        plain = {
+            "format": FORMAT,
+            "settings": self.settings,
+            "problems": [asdict(truth) for truth in self.problems.values()],
+            "runs": [run.as_dict() for run in self.runs],
+        }
+        write_whole(_as_json(plain), located(folder) / "benchmark.json")
+        write_files(self, located(folder))
+
+    @classmethod
+    def read(cls, folder: Location | str) -> BenchmarkResult:
+        """Read the folder of a benchmark.
+
+        Raises:
+            UnreadableFile: There is no finished benchmark in it.
+        """
+        path = located(folder) / "benchmark.json"
+        try:
+            plain = json.loads(path.read_text(encoding="utf-8"))
+            truths = _TRUTHS.validate_python(plain["problems"])
+            runs = tuple(_RUN.validate_python(run) for run in plain["runs"])
+            return cls({truth.name: truth for truth in truths}, runs, plain["settings"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            reason = " ".join(str(error).split())
+            raise UnreadableFile(str(path), reason, "run the benchmark again") from error
+
+
+def _as_json(plain: Any) -> str:
+    """Write JSON; numbers of numpy are numbers, and what is not finite is refused."""
+
+    def number(value: Any) -> Any:
+        if isinstance(value, np.generic | np.ndarray):
+            return value.tolist()
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON: {value!r}")
+
+    return json.dumps(plain, indent=1, allow_nan=False, default=number) + "\n"
+
+
+# --- the benchmark --------------------------------------------------------------------------------
+
+
+def benchmark(
+    learners: Sequence[str],
+    problems: Sequence[str],
+    budgets: Sequence[int] = (1000,),
+    seeds: int = 3,
+    *,
+    data: Sequence[str] = (),
+    view: TaskView | None = None,
+    timeout: float | None = 300.0,
+    standardised: bool = True,
+    out: Location | str | None = None,
+    workers: int | None = None,
+    engine: Executor | str | None = None,
+    address: str | None = None,
+    progress: Progress | None = None,
+) -> BenchmarkResult:
+    """Run learners on problems and score the graphs that they find.
+
+    With ``out`` every run is a file of its own, written whole or not at all. A benchmark that was
+    interrupted or killed resumes with the same call: at most the runs in work are lost.
+
+    Args:
+        learners: Names, or ``"module:attribute"`` of custom ones.
+        problems: As ``problem`` takes them.
+        budgets: How many rows, episodes or experiments a learner may use; a single one is also
+            divided by 2, 4 and 8.
+        seeds: How many: models, data and learners are drawn anew with each.
+        data: Kinds of data; what each learner can make most of if empty.
+        view: Of tasks and worlds.
+        timeout: Of a run [s]; None for no limit.
+        standardised: Whether the largest budget is also run on standardised data.
+        out: Folder or URL: new, empty, or one of the same benchmark. Nothing is written if None.
+        workers: How many runs are done at the same time; the graphs do not depend on it. None is
+            one; with an engine it is as many as there are cores.
+        engine: ``"process"``, ``"serial"``, ``"ray"``, or an executor; see ``engine_of``. A run has
+            a process of its own on all of them, which ends at the timeout. On Ray each worker
+            collects data for itself, and keeps no file of them.
+        address: Of a Ray cluster.
+        progress: Called with (done, planned) after each run.
+
+    Returns:
+        All runs and scores; in ``out`` also ``results.csv``, ``results.md``, ``budget.png`` and
+        ``report.html``.
+
+    Raises:
+        UnknownOption: Something does not exist, or a learner cannot use a kind of data.
+        MissingExtra: A learner is not installed.
+        UnreadableFile: The folder is one of another benchmark, a file in it is damaged, or another
+            process is writing to it.
+        ScmWorldError: A problem cannot be made, or data cannot be collected or written.
+
+    Example:
+        >>> result = benchmark(["pooled"], ["er2:4"], budgets=[40, 80], seeds=1)
+        >>> [run.scores["shd"] for run in result.runs]
+        [0, 0]
+    """
+    view = view or TaskView()
+    shown = [problem_label(name, view) for name in problems]
+    _check_names(problems=shown, learners=learners, data=data)
+    if timeout is not None and not 0.0 < timeout < math.inf:
+        raise UnknownOption("timeout", timeout, ("seconds, more than 0", "None"))
+    whole_number("seeds", seeds, least=1)
+    spent = sorted({whole_number("budget", budget, least=1) for budget in budgets})
+    if not spent:
+        raise UnknownOption("budgets", budgets, ("one or more",))
+    if len(spent) == 1:
+        spent = sorted({max(1, spent[0] // share) for share in SHARES})
+    kinds = {name: _kinds(learner(name), problems, data) for name in learners}
+    marks = {name: _learner_version(learner(name)) for name in learners}
+    truths: dict[str, GroundTruth] = {}
+    for name in problems:
+        with closing(problem(name, view=view)) as known:
+            truths[known.truth.name], marks[name] = known.truth, known.version
+    asked = {
+        "problems": problems,
+        "learners": learners,
+        "data": data,
+        "budgets": spent,
+        "seeds": seeds,
+        "view": asdict(view),
+        "timeout": timeout,
+        "standardised": standardised,
+    }
+    settings = json.loads(json.dumps({**asked, "versions": versions(), "marks": marks}))
+    folder = None if out is None else located(out)
+    groups = []
+    for (name, label), seed in product(zip(problems, shown, strict=True), range(seeds)):
+        runs = [
+            Run(problem=label, learner=who, data=kind, budget=n, seed=seed, standardised=even)
+            for who in learners
+            for kind, n, even in product(kinds[who], spent, (False, True))
+            if not even or (standardised and n == spent[-1] and kind != "paired")
+        ]
+        place = None if folder is None else folder / "data" / slug(label)
+        groups.append([_Job(name, run, spent[-1], view, place) for run in runs])
+    if engine is None:
+        engine, workers = PROCESS, 1 if workers is None else workers
+    with opened(engine, workers, address) as executor:
+        if folder is None:
+            runs = _all_runs(groups, truths, None, executor, timeout, progress)
+            return BenchmarkResult(truths, tuple(runs), settings)
+        _claim(folder, settings)
+        with locked(folder):
+            runs = _all_runs(groups, truths, folder, executor, timeout, progress)
+            result = BenchmarkResult(truths, tuple(runs), settings)
+            result.write(folder)
+            return result
+
+
+def _check_names(**given: Sequence[str]) -> None:
+    for what, names in given.items():
+        if isinstance(names, str) or not (names or what == "data"):
+            raise UnknownOption(what, names or "none", ("a list of one or more",))
+        if len(set(names)) < len(names):
+            raise UnknownOption(what, ", ".join(names), ("names, each of them once",))
+
+
+def _kinds(chosen: Learner, problems: Sequence[str], wanted: Sequence[str]) -> list[Source]:
+    """Return the kinds of data that a learner is given: the richest that it takes by default.
+
+    Raises:
+        UnknownOption: It cannot use one, or cannot be benchmarked on these problems.
+        MissingExtra: It is not installed.
+    """
+    if not chosen.is_installed:
+        raise MissingExtra(chosen.package, chosen.extra)
+    refused = ""
+    if chosen.claims:
+        refused = "a learner that is not given the graph; 'coloring' checks one"
+    elif chosen.on == "worlds":
+        refused = "a learner of variables; this one is of bodies: scm_world.discovery.learn(…)"
+    elif chosen.on == "models" and any(n in TASKS or n.endswith(FILES) for n in problems):
+        refused = "'paired' for a world; this one needs families of models or files of SCMs"
+    if refused:
+        raise UnknownOption("learner in a benchmark", chosen.name, (refused,))
+    given: list[Source] = []
+    for kind in wanted:
+        if kind not in SOURCES:
+            raise UnknownOption("kind of data", kind, SOURCES)
+        watches = kind == "interventional" and "observational" in chosen.takes
+        if kind not in chosen.takes and not watches:
+            raise UnknownOption(f"data for {chosen.name}", kind, chosen.takes)
+        given.append(kind)
+    return given or [chosen.takes[-1]]
+
+
+def _learner_version(chosen: Learner) -> str:
+    """Return what changes with a learner: its code, or the version of its library."""
+    function = getattr(chosen.learn, "func", chosen.learn)
+    try:
+        file = inspect.getsourcefile(inspect.unwrap(function))
+    except TypeError:
+        file = None
+    if file is None or function.__module__.startswith("scm_world."):
+        return chosen.version or ""
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
+
+
+def _claim(folder: Location, settings: dict[str, Any]) -> None:
+    """Write the settings into a new folder, or check that it is one of the same benchmark."""
+    path = folder / "settings.json"
+    if path.exists():
+        try:
+            there = json.loads(path.read_text(encoding="utf-8"))
+            different = [key for key in settings if there[key] != settings[key]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            reason, advice = f"it describes no benchmark: {error}", "give another folder"
+            raise UnreadableFile(str(path), reason, advice) from None
+        if different:
+            reason = f"it is one of another benchmark: {', '.join(different)} differ"
+            raise UnreadableFile(str(folder), reason, "give another folder")
+        return
+    if folder.exists():
+        allowed = {draft_of(path).name}  # of a beginning that was interrupted
+        if not folder.is_dir() or not {there.name for there in folder.iterdir()} <= allowed:
+            advice = "give an empty folder, or one of an earlier benchmark"
+            raise UnreadableFile(str(folder), "it holds something else", advice)
+    made(folder)
+    write_whole(_as_json(settings), path)
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class _Job:
+    """What to run: a learner on a problem.
+
+    Attributes:
+        name: Of the problem, as ``problem`` takes it.
+        run: The run without its results.
+        collected: Largest budget of the benchmark: so much is collected.
+        view: Of a task or a world.
+        folder: Where collected data are kept; nowhere if None.
+    """
+
+    name: str
+    run: Run
+    collected: int
+    view: TaskView
+    folder: Location | None
+
+
+def slug(name: str) -> str:
+    """Return a file name for a name, another one for each.
+
+    Example:
+        >>> slug("er2:20"), slug("pcmci+")
+        ('er2_20-45d3', 'pcmci_-be55')
+    """
+    plain = re.sub(r"[^A-Za-z0-9.-]", "_", name)
+    mark = hashlib.sha256(name.encode()).hexdigest()[:4]
+    return plain if plain == name else f"{plain}-{mark}"
+
+
+def run_path(folder: Location, run: Run) -> Location:
+    """Return where a run is kept."""
+    even = "-standardised" if run.standardised else ""
+    name = f"{slug(run.learner)}-{run.data}-{run.budget}-seed{run.seed}{even}.json"
+    return folder / "runs" / slug(run.problem) / name
+
+
+def _kept(folder: Location | None, run: Run) -> Run | None:
+    """Read a run; None if it was not done."""
+    path = None if folder is None else run_path(folder, run)
+    if path is None or not path.exists():
+        return None
+    advice = "delete it, and this run is done again"
+    try:
+        there = _RUN.validate_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from error
+    if there.key != run.key:
+        raise UnreadableFile(str(path), "it is of another run", advice)
+    return there
+
+
+def _all_runs(
+    groups: Sequence[Sequence[_Job]],
+    truths: dict[str, GroundTruth],
+    folder: Location | None,
+    executor: Executor,
+    timeout: float | None,
+    progress: Progress | None,
+) -> list[Run]:
+    """Read the runs that are done and do the others."""
+    runs, missing, lock = [], [], Lock()
+    for group in groups:
+        kept = [(job, _kept(folder, job.run)) for job in group]
+        runs += [run for _, run in kept if run is not None]
+        missing.append([job for job, run in kept if run is None])
+    planned = sum(map(len, groups))
+    if progress is not None:
+        for number in range(len(runs)):
+            progress(number + 1, planned)
+
+    def keep(run: Run) -> None:
+        if run.edges == truths[run.problem].edges:
+            run = replace(run, edges=None)
+        with lock:
+            if folder is not None:
+                path = run_path(folder, run)
+                made(path.parent)
+                write_whole(_as_json(run.as_dict()), path)
+            runs.append(run)
+            if progress is not None:
+                progress(len(runs), planned)
+
+    if isinstance(executor, Processes):
+        _run_here(missing, executor.workers, timeout, keep)
+    else:
+        jobs = [replace(job, folder=None) for group in missing for job in group]
+        for _, run in executor.run(partial(_Isolated, timeout), jobs):
+            keep(run)
+    return runs
+
+
+def _run_here(
+    groups: Sequence[Sequence[_Job]],
+    workers: int,
+    timeout: float | None,
+    keep: Callable[[Run], None],
+) -> None:
+    """Do the runs of each group in one process of this machine, which collects their data once.
+
+    The processes of a worker pool may not have children, so threads wait for these.
+    """
+    started: list[_Isolated] = []
+    stopped = Event()
+
+    def work(group: Sequence[_Job]) -> None:
+        with closing(_Isolated(timeout)) as process:
+            started.append(process)
+            for job in group:
+                if stopped.is_set():
+                    return
+                keep(process(job))
+
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(work, group) for group in groups if group]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            stopped.set()
+            for process in tuple(started):
+                process.interrupt()
+            raise
+
+
+@final
+class _Isolated:
+    """Does jobs in a process of its own, which is replaced if one takes too long.
+
+    Args:
+        timeout: Of a job [s]; None for no limit.
+    """
+
+    def __init__(self, timeout: float | None) -> None:
+        self._timeout = None if timeout is None else min(timeout, LONGEST)
+        self._worker = Worker(_Runner)
+        self.interrupt, self.close = self._worker.interrupt, self._worker.stop
+
+    def __call__(self, job: _Job) -> Run:
+        """Do a job; a learner that ends its process has failed.
+
+        Raises:
+            ScmWorldError: The problem cannot be made, its data cannot be collected, or the learner
+                is not installed.
+        """
+        try:
+            self._worker.ask("prepare", job)  # the time of a learner is that of learning
+        except Ended as ended:
+            raise EngineFailure(f"{job.name}: {ended}", PROCESS) from None
+        try:
+            run: Run = self._worker.ask("run", job, timeout=self._timeout)
+        except TookTooLong:
+            said = f"stopped after {self._timeout:g} s"
+            return replace(
+                job.run, status="timeout", message=said, seconds=float(self._timeout or 0.0)
+            )
+        except Ended as ended:
+            if ended.was_interrupted:
+                raise EngineFailure(str(ended), PROCESS) from None
+            return replace(job.run, status="failed", message=str(ended))
+        return run
+
+
+@final
+class _Runner:
+    """Does jobs one after another, and keeps the last problem and its data for the next one."""
+
+    def __init__(self) -> None:
+        self._key: tuple[Any, ...] = ()
+        self._problem: Problem | None = None
+        self._data: dict[str, Dataset] = {}
+        self._held_out: list[Dataset | None] = []
+
+    def prepare(self, job: _Job) -> None:
+        """Make the problem and collect its data, unless that is done."""
+        run, key = job.run, (job.name, job.run.seed, repr(job.view))
+        if self._problem is None or key != self._key:
+            if self._problem is not None:
+                self._problem.close()
+            self._problem = problem(job.name, seed=run.seed, view=job.view)
+            self._key, self._data, self._held_out = key, {}, []
+        if run.data != "paired" and run.data not in self._data:
+            options: dict[str, Any] = {}
+            if job.folder is not None and self._problem.truth.about.get("kind") != "model":
+                written = "parquet" if find_spec("pyarrow") else "csv"
+                options = {"out": job.folder / f"{run.data}-seed{run.seed}", "format": written}
+            self._data[run.data] = self._problem.data(run.data, job.collected, run.seed, **options)
+
+    def run(self, job: _Job) -> Run:
+        """Do a job that is prepared; what goes wrong in a learner is written down in the run."""
+        table = None if job.run.data == "paired" else self._rows(job.run)
+        started = time.perf_counter()
+        try:
+            run = self._learned(job.run, table)
+            _as_json(run.as_dict())  # what cannot be written has failed
+        except MissingExtra:
+            raise
+        except Exception as error:  # of whatever kind: learners are not all ours
+            seconds, said = time.perf_counter() - started, in_one_line(error)
+            return replace(job.run, status="failed", message=said, seconds=seconds)
+        return run
+
+    def _rows(self, run: Run) -> Dataset:
+        whole = self._data[run.data]
+        each = len(whole) / len(np.unique(whole.episode))
+        part = whole.first(math.ceil(run.budget / each))
+        return part.standardised() if run.standardised else part
+
+    def _learned(self, run: Run, table: Dataset | None) -> Run:
+        made: Any = self._problem
+        truth, chosen = made.truth, learner(run.learner)
+        if table is None:
+            found = learn(chosen, made.simulator(run.seed), seed=run.seed, budget=run.budget)
+        else:
+            found = learn(chosen, table, seed=run.seed)
+        compared = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
+        scores = {k: v for k, v in compared.as_dict().items() if isinstance(v, int | float | None)}
+        scores["sid"] = compared.sid
+        if table is not None and not run.standardised:
+            if not self._held_out:
+                self._held_out.append(made.held_out(run.seed))
+            test = self._held_out[0]
+            scores["effect_rmse"] = None if test is None else effect_rmse(found, table, test).rmse
+        return replace(
+            run,
+            found=found.restricted(truth.names),
+            scores=scores,
+            seconds=found.seconds,
+            experiments=found.experiments,
+            bound=found.bound,
+            edges=truth.edges if run.seed else None,
+        )

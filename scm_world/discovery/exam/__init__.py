@@ -1,1 +1,0 @@
-"""Learners examined: subjects, runs, tables, pictures."""

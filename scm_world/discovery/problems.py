@@ -1,0 +1,592 @@
+"""Benchmark problems for learners: causal models and worlds, each with its true graph."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import math
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, final, runtime_checkable
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world._types import Floats, Value
+from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
+from scm_world.discovery.data.recorded import first_label, settable
+from scm_world.discovery.learners.simulators import (
+    EpisodeSimulator,
+    PairedSimulator,
+    SCMSimulator,
+    StepSimulator,
+)
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
+from scm_world.graph import SCM, from_json, to_json
+from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.queries.identification import nature_graph
+from scm_world.queries.outcomes import as_outcome
+from scm_world.queries.policies import as_policy
+from scm_world.queries.samples import STEPS, Setting
+from scm_world.tasks import TASKS, TriFingerTask, make_task
+from scm_world.tasks.factories import load_factory
+from scm_world.tasks.model import FILES
+from scm_world.variables import Box, Derived, Draw, Exogenous, Function, Linear, Parent
+from scm_world.variables.distributions import Normal
+from scm_world.world import World
+
+# --- random models --------------------------------------------------------------------------------
+
+WEAKEST, STRONGEST = 0.5, 2.0  # absolute weights, uniform between them; the sign is drawn
+PER_NODE = 2  # edges per node of the static families
+MOST = 1000  # variables
+DONE = Normal(mean=2.0, std=1.0)
+"""What interventions draw in random models unless told otherwise: another mean, the same spread."""
+
+
+def random_model(name: str, seed: int = 0) -> SCM:
+    """Draw a model of a family.
+
+    Args:
+        name: ``"family:n"`` with n variables, such as ``"er2:20"``.
+        seed: Which model of the family.
+
+    Raises:
+        UnknownOption: There is no such family or size.
+
+    Source:
+        Zheng et al., *DAGs with NO TEARS*, NeurIPS 2018, section 5.1, for weights and densities;
+        Barabási and Albert, *Emergence of scaling in random networks*, Science 1999.
+
+    Example:
+        >>> drawn = random_model("er2:20", seed=0)
+        >>> len(list(drawn)), len(drawn.edges) == len(random_model("er2:20", seed=0).edges)
+        (20, True)
+    """
+    family, _, size = name.partition(":")
+    if family not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
+        shown = tuple(f"{known}:N" for known in FAMILIES)
+        raise UnknownOption("family of models", name, (*shown, f"with N from 2 to {MOST}"))
+    return FAMILIES[family](int(size), seed)
+
+
+def _erdos_renyi(n: int, seed: int) -> SCM:
+    """Erdős–Rényi DAG, 2 edges per node, linear Gaussian."""
+    rng = np.random.default_rng([seed, n, 1])
+    chance = min(1.0, 2.0 * PER_NODE / (n - 1))
+    return _linear(np.triu(rng.random((n, n)) < chance, 1), rng)
+
+
+def _scale_free(n: int, seed: int) -> SCM:
+    """Scale-free DAG (Barabási–Albert, 2 per node), linear Gaussian."""
+    rng = np.random.default_rng([seed, n, 2])
+    drawn = nx.barabasi_albert_graph(n, min(PER_NODE, n - 1), seed=int(rng.integers(2**31)))
+    upper = np.zeros((n, n), bool)
+    for one, other in drawn.edges:
+        upper[min(one, other), max(one, other)] = True  # hubs come early: they cause much
+    return _linear(upper, rng)
+
+
+def _one_step(n: int, seed: int) -> SCM:
+    """One control step, at most 4 causes each, tanh of a sum."""
+    rng = np.random.default_rng([seed, n, 3])
+    names, made = _names(n), []
+    for name in names:
+        causes = rng.choice(n, size=int(rng.integers(1, min(4, n) + 1)), replace=False)
+        size = rng.uniform(WEAKEST, STRONGEST, len(causes))
+        weights = size * rng.choice([-1.0, 1.0], len(causes))
+        made.append(
+            Derived(
+                name=name,
+                parents=tuple(Parent(names[i], 1) for i in causes),
+                mechanism=Function(tanh_of_sum, constants={"weights": tuple(weights.tolist())}),
+                noise=Normal(mean=0.0, std=0.1),
+            )
+        )
+    return SCM(made)
+
+
+def tanh_of_sum(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
+    """Return the hyperbolic tangent of a weighted sum, plus noise."""
+    total = sum(w * parent for w, parent in zip(weights, parents, strict=True))
+    return np.tanh(total) + noise
+
+
+def _linear(upper: NDArray[np.bool_], rng: np.random.Generator) -> SCM:
+    """Draw weights for the edges of a causal order, shuffle the order, add unit Gaussian noise."""
+    n = len(upper)
+    size = rng.uniform(WEAKEST, STRONGEST, (n, n)) * rng.choice([-1.0, 1.0], (n, n))
+    places = rng.permutation(n)
+    weights = np.zeros((n, n))
+    weights[np.ix_(places, places)] = np.where(upper, size, 0.0)
+    names, made = _names(n), []
+    for j, name in enumerate(names):
+        causes = np.flatnonzero(weights[:, j]).tolist()
+        mechanism = Linear(weights=tuple(weights[causes, j].tolist()))
+        parents, noise = tuple(names[i] for i in causes), Normal(mean=0.0, std=1.0)
+        made.append(Derived(name=name, parents=parents, mechanism=mechanism, noise=noise))
+    return SCM(made)
+
+
+def _names(n: int) -> list[str]:
+    return [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
+
+
+FAMILIES: Mapping[str, Callable[[int, int], SCM]] = {
+    "er2": _erdos_renyi,
+    "sf2": _scale_free,
+    "tanh4": _one_step,
+}
+"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``)."""
+
+
+# --- problems -------------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class GroundTruth:
+    """The true graph of a problem.
+
+    Attributes:
+        name: Of the problem.
+        names: Of its variables, in order.
+        edges: Cause, effect and lag [control steps].
+        unscored: Pairs that are not scored, in either direction and with any lag.
+        about: What else a reader of the results should know.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    edges: tuple[EdgeKey, ...]
+    unscored: tuple[tuple[str, str], ...] = ()
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def pairs(self) -> NDArray[np.bool_]:
+        """Which pairs are scored, shape (p, p)."""
+        at = {name: i for i, name in enumerate(self.names)}
+        mask = np.ones((len(at), len(at)), dtype=bool)
+        for one, other in self.unscored:
+            mask[at[one], at[other]] = mask[at[other], at[one]] = False
+        return mask
+
+
+@runtime_checkable
+class Problem(Protocol):
+    """A system with a true graph, which learners do not see.
+
+    Attributes:
+        truth: The true graph.
+        version: Changes whenever results of the problem cannot be compared any more.
+    """
+
+    truth: GroundTruth
+    version: str
+
+    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
+        """Collect ``"observational"`` or ``"interventional"`` rows.
+
+        The first rows are the same for any budget. Options are those of ``collect``.
+        """
+
+    def held_out(self, seed: int) -> Dataset | None:
+        """Collect rows under interventions that no learner sees; None where there are none."""
+
+    def simulator(self, seed: int) -> PairedSimulator:
+        """Return the paired simulator of the problem."""
+
+    def close(self) -> None:
+        """Close the backend."""
+
+
+@final
+class SCMProblem:
+    """A causal model without physics. The budget counts rows.
+
+    Args:
+        name: To call it by.
+        scm: The model.
+    """
+
+    EPISODE = 10  # control steps of an episode of a model with lags
+
+    def __init__(self, name: str, scm: SCM) -> None:
+        self._scm = scm
+        self._steps = self.EPISODE if any(edge.lag for edge in scm.edges) else None
+        edges = tuple(edge.key for edge in scm.edges)
+        about = {"kind": "model", "budget": "rows"}
+        self.truth = GroundTruth(name=name, names=tuple(scm), edges=edges, about=about)
+        self.version = hashlib.sha256(to_json(scm).encode()).hexdigest()[:16]
+        values = {v.name: _values_of(v) for v in scm.variables if v.settable}
+        self._values = {name: act for name, act in values.items() if act is not None}
+
+    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
+        """Collect rows; each target gets half as many rows as are observational.
+
+        The shares are those of 1,000 observational rows beside 500 for each variable.
+        """
+        observed = 2.0 / (len(self._values) + 2.0)
+        acts = kind != "observational" and self._values
+        design = Design("single", tuple(self._values), self._values, observed) if acts else Design()
+        episodes = budget if self._steps is None else -(-budget // self._steps)
+        steps: Any = {} if self._steps is None else {"steps": self._steps}
+        return collect(self._scm, design, episodes, seed=seed, **steps, **options)
+
+    def held_out(self, seed: int) -> Dataset | None:
+        """Set each variable in turn to 2, which no learner sees; None if one cannot be 2."""
+        if self._steps is not None or any(act != DONE for act in self._values.values()):
+            return None
+        design = Design("single", tuple(self._values), 2.0, 0.0)
+        return collect(self._scm, design, 200 * len(self._values), seed=seed + 1_000_000)
+
+    def simulator(self, seed: int) -> PairedSimulator:
+        """Return paired experiments on the mechanisms."""
+        return SCMSimulator(self._scm, seed)
+
+    def close(self) -> None:
+        """Do nothing: there is no backend."""
+
+
+def _values_of(variable: Any) -> Any:
+    """Return what a variable of a model is set to: its space A, its bounds, or N(2, 1).
+
+    None if it is an integer or bounded on one side, and no space says what it can be.
+    """
+    if variable.space("A") is not None:
+        return "A"
+    if variable.bounds is None:
+        return DONE if variable.dtype == "real" else None
+    if isinstance(variable.bounds, Box):
+        low, high = variable.bounds.low, variable.bounds.high
+        ends = np.ravel([low, high]) if not variable.bounds.parents() else np.zeros(2)
+        return variable.bounds if np.isfinite(ends.astype(float)).all() else None
+    return variable.bounds
+
+
+VIEWS = ("outcome", "step")
+SENSED = 0.005  # noise of the sensors, as a fraction of half a range
+HALF = 0.045  # [m] half the side of the square in which a block begins
+START, HEIGHT = ".cartesian_position", ".cylindrical_position"
+THROWN = ((1.5, 1.8, 0.0), (2.6, -1.5, 0.0))
+"""How fast blocks are thrown [m/s]: between two fingers to the wall, and so that they come back."""
+MOST_STARTS = 3  # blocks that find room, each in a sector of its own
+
+
+@final
+@dataclass(frozen=True)
+class TaskView:
+    """Which variables of a task or model are causes and outcomes, and how episodes run.
+
+    Attributes:
+        view: ``"outcome"``: one row per episode: what it begins with, and what it ends with.
+            ``"step"``: one row per control step.
+        causes: Patterns of what varies, as far as it has a space A; the physical parameters if
+            None, and in the view of outcomes where the blocks begin.
+        outcomes: Names of variables; the states of joints and blocks, and success, if None.
+        policy: As ``rollout`` takes it; ``"usual"`` is ``"sweep"`` for outcomes of the TriFinger's
+            tasks and ``"random"`` otherwise, so that actions have no causes.
+        steps: Control steps of an episode.
+        sensor_noise: Standard deviation, as a fraction of half the range of what is measured;
+            only worlds that declare sensor noise have it.
+        options: Of the world: backend, preset.
+        arguments: Of the task.
+
+    Raises:
+        UnknownOption: There is no such view.
+    """
+
+    view: str = "outcome"
+    causes: tuple[str, ...] | None = None
+    outcomes: tuple[str, ...] | None = None
+    policy: str | None = "usual"
+    steps: int = STEPS
+    sensor_noise: float = SENSED
+    options: dict[str, Any] = field(default_factory=dict)
+    arguments: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse other views."""
+        if self.view not in VIEWS:
+            raise UnknownOption("view", self.view, VIEWS)
+
+
+@final
+class WorldProblem:
+    """A task or a model with its physics. The budget counts episodes, or steps in the view by step.
+
+    Args:
+        name: Of a task, a file that is a model, or ``"module:function"``, as ``make_task`` takes.
+        view: Causes, outcomes and episodes.
+
+    Raises:
+        UnknownOption: There is no such task.
+        UnknownVariable: A pattern names nothing that can be set.
+    """
+
+    def __init__(self, name: str, view: TaskView) -> None:
+        self._view, self._by_step = view, view.view == "step"
+        self._world = World(make_task(name, **view.arguments), **view.options)
+        try:
+            robot = isinstance(self._world.task, TriFingerTask)
+            usual = "sweep" if robot and not self._by_step else "random"
+            self._policy = usual if view.policy == "usual" else view.policy
+            as_policy(self._policy)
+            self._causes = self._chosen()
+            found = default_outcomes(self._world, every_step=True)
+            self._outcomes = tuple(map(as_outcome, view.outcomes or found))
+            shown = problem_label(name, view)
+            self.truth = self._step_truth(shown) if self._by_step else self._outcome_truth(shown)
+        except BaseException:
+            self._world.close()
+            raise
+        backend = self._world.backend
+        self.version = f"{backend.name} {backend.version} {_source_version(name)}".strip()
+
+    def _chosen(self) -> tuple[str, ...]:
+        """Choose what varies: with what is computed from it, since that can be set, too."""
+        world, model = self._world, self._world.model
+        if self._view.causes is not None:
+            named = settable(world, self._view.causes)
+            found = tuple(name for name in named if self._varies(name))
+            if not found:
+                varying = [name for name in settable(world, ("*",)) if self._varies(name)]
+                raise UnknownVariable(", ".join(self._view.causes), varying)
+            return found
+        chosen = default_causes(world)
+        if not (chosen or self._by_step):
+            advice = "give variables a space A (spaces= of ModelTask), or take the view 'step'"
+            raise ModelError([f"nothing of {world.task.name} varies between episodes: {advice}"])
+        starts = tuple(name for name in settable(world, ("*",)) if self._is_start(name))
+        if self._by_step or len(starts) > MOST_STARTS:
+            starts = ()
+        follow = tuple(
+            name
+            for name in model
+            if isinstance(model.declared(name), Derived)
+            and model.target(name) == name
+            and model.declared(name).settable
+            and model.declared(name).space("A") is not None
+            and any(parent.name in chosen for parent in model.declared(name).all_parents)
+        )
+        return (*chosen, *follow, *starts)
+
+    def _varies(self, name: str) -> bool:
+        """Tell whether values can be drawn for a variable, which is no other name of one."""
+        model = self._world.model
+        if self._is_start(name):
+            return not self._by_step
+        return model.target(name) == name and model.declared(name).space("A") is not None
+
+    def _is_start(self, name: str) -> bool:
+        """Tell whether a variable is where a block begins."""
+        model = self._world.model
+        is_place = name.endswith(START) and name.removesuffix(START) + HEIGHT in model
+        return is_place and model.declared(name).role == "state"
+
+    @property
+    def _contexts(self) -> dict[str, Any]:
+        """Let everything vary by itself that has a space of its own.
+
+        Blocks begin near the middle, each in a sector of its own, so that no draw has to be
+        rejected: rejection would make everything that is drawn depend on everything else.
+        """
+        model = self._world.model
+        starts = [n for n in self._causes if self._is_start(n)]
+        drawn: dict[str, Any] = {
+            n: "A" for n in self._causes if isinstance(model.declared(n), Exogenous)
+        }
+        for number, name in enumerate(starts):
+            standing: Any = model.declared(name.removesuffix(START) + HEIGHT).a
+            drawn[name] = block_start(standing.low[2], number, len(starts))
+        if self._view.sensor_noise and "sensor_noise" in model:
+            drawn["sensor_noise"] = self._view.sensor_noise
+        return drawn
+
+    def _outcome_truth(self, shown: str) -> GroundTruth:
+        model = self._world.model
+        outcomes = [outcome.name for outcome in self._outcomes]
+        graph = nature_graph(model, self._contexts, outcomes)
+        named = {n: f"{first_label(model, n)} {n}".strip() for n in self._causes}
+        node = {f"{model.target(n)}@0" if first_label(model, n) else n: f for n, f in named.items()}
+        node |= {outcome: outcome for outcome in outcomes}
+        edges = tuple((node[c], node[e], 0) for c, e in projected(graph, node))
+        ends = tuple(dict.fromkeys(outcomes))
+        pairs = tuple((a, b) for i, a in enumerate(ends) for b in ends[i + 1 :])
+        names = (*named.values(), *ends)
+        return GroundTruth(
+            name=shown, names=names, edges=edges, unscored=pairs, about=self._about()
+        )
+
+    def _step_truth(self, shown: str) -> GroundTruth:
+        actions, bundles = self._world.declaration.actions, self._world.declaration.bundles
+        outcomes = (outcome.name for outcome in self._outcomes)
+        names = tuple(dict.fromkeys((*self._causes, *outcomes, *actions)))
+        known = set(names)
+        whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
+        found = (e.key for e in self._world.model.edges)
+        named = ((whole.get(c, c), whole.get(e, e), lag) for c, e, lag in found)
+        edges = tuple(
+            dict.fromkeys((c, e, lag) for c, e, lag in named if {c, e} <= known and (lag or c != e))
+        )
+        return GroundTruth(name=shown, names=names, edges=edges, about=self._about())
+
+    def _about(self) -> dict[str, Any]:
+        view, backend = self._view, self._world.backend
+        return {
+            "kind": f"task, view by {view.view}",
+            "budget": "control steps" if self._by_step else "episodes",
+            "backend": f"{backend.name} {backend.version}",
+            "policy": self._policy,
+            "steps": view.steps,
+            "sensor_noise": view.sensor_noise,
+            "options": {k: str(v) for k, v in view.options.items()},
+            "arguments": {k: str(v) for k, v in view.arguments.items()},
+        }
+
+    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
+        """Collect episodes; seven of ten interventional ones set half of the causes, in A|B."""
+        contexts, declared = self._contexts, self._world.model.declared
+        values = {name: contexts.get(name, "A") for name in self._causes}
+        values |= {n: "A|B" for n in self._causes if declared(n).space("B") is not None}
+        acts = kind != "observational" and self._causes
+        return collect(
+            self._world,
+            Design("half", self._causes, values) if acts else Design(),
+            -(-budget // self._view.steps) if self._by_step else budget,
+            seed=seed,
+            steps=self._view.steps,
+            policy=self._policy,
+            nature=contexts,
+            causes=self._causes,
+            outcomes=self._outcomes,
+            every_step=self._by_step,
+            **options,
+        )
+
+    def held_out(self, seed: int) -> Dataset | None:
+        """Return None: the effects of single values of a world are not linear."""
+        return None
+
+    def simulator(self, seed: int) -> PairedSimulator:
+        """Return paired experiments, without sensor noise, under several circumstances in turn.
+
+        On the TriFinger these are the policy of the view, a finger that pushes across, and blocks
+        that are thrown at the wall: past the fingers, and so hard that they come back and hit one.
+        """
+        if self._by_step:
+            return StepSimulator(self._world, seed)
+        contexts = {n: act for n, act in self._contexts.items() if n != "sensor_noise"}
+        length, blocks = self._view.steps, [n for n in self._causes if self._is_start(n)]
+        settings = [Setting(self._policy, contexts, length, seed)]
+        if isinstance(self._world.task, TriFingerTask):
+            settings.append(Setting("across", contexts, length, seed))
+            for fast in THROWN:
+                speeds = {f"{name.removesuffix(START)}.linear_velocity": fast for name in blocks}
+                settings.append(Setting(None, {**contexts, **speeds}, length, seed))
+        return EpisodeSimulator(self._world, self._causes, self._outcomes, settings)
+
+    def close(self) -> None:
+        """Close the backend."""
+        self._world.close()
+
+
+def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
+    """Leave out nodes that follow from others without noise: their causes act in their place."""
+    found = set()
+    for cause in kept:
+        ahead = [cause] if cause in graph else []
+        while ahead:
+            for effect in graph.successors(ahead.pop()):
+                if effect in kept:
+                    found.add((cause, effect))
+                else:
+                    ahead.append(effect)
+    return sorted(found)
+
+
+def block_start(height: Any, number: int, count: int) -> Draw:
+    """Return where one of several blocks begins: near the middle, as high as it has to be.
+
+    Args:
+        height: Of its center, as its space A says.
+        number: Of the block.
+        count: Of the blocks.
+    """
+    far = 0.0 if count == 1 else 0.075
+    angle = 2.0 * math.pi * number / count
+    x, y = far * math.cos(angle), far * math.sin(angle)
+    half = HALF if count == 1 else 0.2 * HALF
+    return Draw(Box((x - half, y - half, height), (x + half, y + half, height)))
+
+
+# --- by name --------------------------------------------------------------------------------------
+
+
+def problem(name: str, *, seed: int = 0, view: TaskView | None = None) -> Problem:
+    """Return a benchmark problem.
+
+    Args:
+        name: A family with a size (``"er2:20"``), a task, the file of a model (.xml, .urdf), the
+            JSON file of an ``SCM``, or ``"module:function"`` for a function that gives a task, a
+            world, an ``SCM`` or a ``Problem``.
+        seed: Which model of the family.
+        view: Of a task or a world.
+
+    Raises:
+        UnknownOption: There is nothing of this name.
+        UnreadableFile: The file holds no model.
+
+    Example:
+        >>> problem("er2:5").truth.names
+        ('x0', 'x1', 'x2', 'x3', 'x4')
+    """
+    view = view or TaskView()
+    if name.partition(":")[0] in FAMILIES:
+        return SCMProblem(name, random_model(name, seed))
+    if name.endswith(".json"):
+        return SCMProblem(Path(name).stem, _read(Path(name)))
+    if ":" in name:
+        made = load_factory(name)(**view.arguments)
+        if isinstance(made, SCM | Problem):
+            return SCMProblem(name, made) if isinstance(made, SCM) else made
+    elif name not in TASKS and not name.endswith(FILES):
+        families = (f"{family}:N" for family in FAMILIES)
+        raise UnknownOption(
+            "problem", name, (*TASKS, *families, "FILE.json", "FILE.xml", "FILE.urdf")
+        )
+    return WorldProblem(name, view)
+
+
+def problem_label(name: str, view: TaskView) -> str:
+    """Return the name of a problem as it is shown.
+
+    Example:
+        >>> problem_label("pushing", TaskView("step")), problem_label("er2:20", TaskView())
+        ('pushing/step', 'er2:20')
+    """
+    if name.partition(":")[0] in FAMILIES or name.endswith(".json"):
+        return Path(name).stem if name.endswith(".json") else name
+    home, colon, function = name.rpartition(":")
+    short = f"{Path(home).stem if home.endswith('.py') else home}:{function}" if colon else name
+    short = Path(name).stem if name.endswith(FILES) else short
+    return f"{short}/step" if view.view == "step" else short
+
+
+def _read(path: Path) -> SCM:
+    try:
+        return from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        advice = "give a file that scm_world.graph.to_json wrote"
+        raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from None
+
+
+def _source_version(name: str) -> str:
+    """Return a hash of the file that a world comes from; empty for the tasks of this package."""
+    if name in TASKS:
+        return ""
+    file = inspect.getsourcefile(load_factory(name)) if ":" in name else name
+    return "" if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]

@@ -1,0 +1,479 @@
+"""Benchmarks of learners: run, interrupted, resumed, and given bad learners."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import user_learners
+
+from scm_world.discovery import BenchmarkResult, TaskView, benchmark
+from scm_world.discovery.benchmarks import Run, run_path
+from scm_world.discovery.problems import problem, random_model
+from scm_world.errors import (
+    ActionError,
+    MissingExtra,
+    ScmWorldError,
+    UnknownOption,
+    UnreadableFile,
+)
+from scm_world.graph import to_json
+
+SMALL: dict[str, Any] = {
+    "problems": ["er2:5"],
+    "learners": ["do_order", "paired"],
+    "budgets": [70, 140],
+    "seeds": 2,
+}
+"""Two learners, two budgets, two seeds, and once more standardised: 10 runs."""
+
+
+def among(*names: str, **others: Any) -> dict[str, Any]:
+    """Benchmark users' learners on one graph with next to no data, beside one of ours."""
+    learners = [*(f"user_learners:{name}" for name in names), "paired"]
+    few = {"budgets": [1], "seeds": 1, "standardised": False}
+    return {"problems": ["er2:5"], "learners": learners, **few, **others}
+
+
+def plain(result: BenchmarkResult) -> list[dict[str, Any]]:
+    """Write the runs down without what depends on the machine."""
+    runs: list[dict[str, Any]] = json.loads(json.dumps([run.as_dict() for run in result.runs]))
+    for run in runs:
+        run["seconds"] = 0.0
+        if run["found"] is not None:
+            run["found"]["seconds"] = 0.0
+    return runs
+
+
+def files(folder: Path) -> dict[str, int]:
+    """List the runs with the instants at which they were written."""
+    return {str(path): path.stat().st_mtime_ns for path in (folder / "runs").rglob("*.json")}
+
+
+def by_learner(result: BenchmarkResult) -> dict[str, list[Run]]:
+    """Sort the runs by learner."""
+    found: dict[str, list[Run]] = {}
+    for run in result.runs:
+        found.setdefault(run.learner.removeprefix("user_learners:"), []).append(run)
+    return found
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[BenchmarkResult, Path]:
+    """Run the small benchmark once."""
+    folder = tmp_path_factory.mktemp("benchmark") / "small"
+    return benchmark(**SMALL, out=folder), folder
+
+
+# --- numbers --------------------------------------------------------------------------------------
+
+FAKE = {"backend": "fake"}
+REFERENCES: dict[str, dict[str, Any]] = {
+    "models": {
+        "learners": ["do_order", "do_order_ranks", "gies", "pooled", "paired"],
+        "problems": ["er2:6", "tanh4:5"],
+        "budgets": [60, 240],
+        "seeds": 2,
+    },
+    "outcome": {
+        "learners": ["do_order", "paired"],
+        "problems": ["pushing"],
+        "budgets": [40, 80],
+        "seeds": 1,
+        "view": TaskView(
+            steps=3,
+            causes=("block.size", "gravity", "*friction", "tool_block.mass"),
+            options=FAKE,
+        ),
+    },
+    "step": {
+        "learners": ["do_order"],
+        "problems": ["pushing"],
+        "budgets": [60, 120],
+        "seeds": 1,
+        "view": TaskView(
+            "step", steps=6, causes=("gravity", "*friction", "tool_block.mass"), options=FAKE
+        ),
+    },
+}
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_scores_are_those_of_the_reference(name: str) -> None:
+    """The same seeds give the scores of ``benchmark_reference.csv``, to twelve digits."""
+    with (Path(__file__).parent / "benchmark_reference.csv").open() as stream:
+        lines = [line for line in csv.DictReader(stream) if line.pop("benchmark") == name]
+    result = benchmark(**REFERENCES[name], workers=2)
+    assert len(result.runs) == len(lines)
+    for record, line in zip(result.records, lines, strict=True):
+        for key, said in line.items():
+            value = record.get(key)
+            if key in ("problem", "learner", "data", "standardised"):
+                assert str(value) == said
+            else:
+                expected = None if said == "" else pytest.approx(float(said), rel=1e-12)
+                assert value == expected, (key, line)
+
+
+def test_nothing_is_written_without_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The result is returned; it is a table with a row per run."""
+    monkeypatch.chdir(tmp_path)
+    result = benchmark(["pooled"], ["er2:4"], budgets=[40, 80], seeds=1)
+    assert not list(tmp_path.iterdir())
+    table = result.to_dataframe()
+    assert list(table.shd) == [0, 0]
+    assert list(table.budget) == [40, 80]
+
+
+# --- what comes out -------------------------------------------------------------------------------
+
+
+def test_everything_is_run_and_written(done: tuple[BenchmarkResult, Path]) -> None:
+    """Every run is done, exact where it has enough; the files are there and come back."""
+    result, folder = done
+    assert len(result.runs) == 2 * (2 + 1 + 2)
+    assert all(run.status == "done" for run in result.runs)
+    assert all(run.scores["shd"] == 0 for run in by_learner(result)["paired"])
+    assert set(files(folder)) == {str(run_path(folder, run)) for run in result.runs}
+    for name in ("benchmark.json", "results.csv", "results.md", "budget.png", "report.html"):
+        assert (folder / name).stat().st_size > 0
+    assert not list(folder.rglob("*.part"))
+    again = BenchmarkResult.read(folder)
+    assert plain(again) == plain(result)
+    assert again.problems == result.problems
+    assert again.settings == result.settings
+
+
+def test_each_seed_has_its_own_graph(done: tuple[BenchmarkResult, Path]) -> None:
+    """The result has that of the first seed; runs of the other one have their own."""
+    result, _ = done
+    assert result.problems["er2:5"] == problem("er2:5", seed=0).truth
+    assert {run.edges is None for run in result.runs if run.seed == 0} == {True}
+    others = {result.truth_of(run).edges for run in result.runs if run.seed == 1}
+    assert others == {tuple(edge.key for edge in random_model("er2:5", 1).edges)}
+
+
+def test_workers_change_nothing_but_seconds(
+    done: tuple[BenchmarkResult, Path], tmp_path: Path
+) -> None:
+    """Two processes find what one finds, and progress counts every run once."""
+    told: list[tuple[int, int]] = []
+    result = benchmark(**SMALL, out=tmp_path, workers=2, progress=lambda *at: told.append(at))
+    assert plain(result) == plain(done[0])
+    assert [count for count, _ in told] == list(range(1, 11))
+    assert {total for _, total in told} == {10}
+
+
+def test_a_benchmark_resumes(done: tuple[BenchmarkResult, Path]) -> None:
+    """Deleted runs are run again and give the same; the others are not touched."""
+    result, folder = done
+    before = files(folder)
+    lost = sorted(before)[::3]
+    for path in lost:
+        Path(path).unlink()
+    (folder / "benchmark.json").unlink()
+    assert plain(benchmark(**SMALL, out=folder)) == plain(result)
+    after = files(folder)
+    assert after.keys() == before.keys()
+    assert {path for path in after if after[path] != before[path]} == set(lost)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "",
+        lambda text: text[: len(text) // 2],
+        lambda text: "[]",
+        lambda text: text.replace('"budget": 140', '"budget": "ten"'),
+        lambda text: text.replace('"status": "done"', '"status": "perhaps"'),
+        lambda text: text.replace('"shd": 0', '"shd": "none"'),
+        lambda text: text.replace('"shd": 0', '"shd": NaN'),
+        lambda text: text.replace('"lags": 1', '"lags": -1'),
+        lambda text: text.replace("scm_world/found", "scm_world/lost"),
+        lambda text: text.replace('"seed": 0', '"seed": 1'),
+    ],
+)
+def test_a_damaged_run_is_named(
+    done: tuple[BenchmarkResult, Path], tmp_path: Path, damage: Callable[[str], str]
+) -> None:
+    """The error names the file and says what to do with it; the file is not touched."""
+    folder = tmp_path / "copy"
+    shutil.copytree(done[1], folder)
+    path = Path(run_path(folder, by_learner(done[0])["paired"][-2]))
+    damaged = damage(path.read_text())
+    assert damaged != path.read_text()
+    path.write_text(damaged)
+    with pytest.raises(UnreadableFile, match="run is done again") as told:
+        benchmark(**SMALL, out=folder)
+    assert path.name in str(told.value)
+    assert path.read_text() == damaged
+
+
+def test_a_folder_of_another_benchmark_is_refused(done: tuple[BenchmarkResult, Path]) -> None:
+    """The error names what differs."""
+    before = files(done[1])
+    with pytest.raises(UnreadableFile, match="another benchmark: seeds differ"):
+        benchmark(**{**SMALL, "seeds": 3}, out=done[1])
+    assert files(done[1]) == before
+
+
+def test_a_folder_of_something_else_is_untouched(tmp_path: Path) -> None:
+    """A folder with a file of the user's, and a file in place of a folder, are refused."""
+    (tmp_path / "thesis.txt").write_text("mine")
+    for place in (tmp_path, tmp_path / "thesis.txt"):
+        with pytest.raises(UnreadableFile, match="something else"):
+            benchmark(**SMALL, out=place)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+    (tmp_path / "settings.json").write_text("no json")
+    with pytest.raises(UnreadableFile, match="describes no benchmark"):
+        benchmark(**SMALL, out=tmp_path)
+    with pytest.raises(UnreadableFile, match=r"benchmark\.json"):
+        BenchmarkResult.read(tmp_path)
+
+
+def test_a_changed_model_or_library_is_another_benchmark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Results of different versions are never mixed."""
+    file, out = tmp_path / "mine.json", tmp_path / "out"
+    file.write_text(to_json(random_model("er2:5", 0)))
+    asked: dict[str, Any] = {"budgets": [40, 41], "seeds": 1, "standardised": False}
+    result = benchmark(["gies"], [str(file)], **asked, out=out)
+    assert list(result.problems) == ["mine"]
+    file.write_text(to_json(random_model("er2:5", 1)))
+    with pytest.raises(UnreadableFile, match="marks differ"):
+        benchmark(["gies"], [str(file)], **asked, out=out)
+    file.write_text(to_json(random_model("er2:5", 0)))
+    monkeypatch.setattr("scm_world.discovery.learners.registry._version", lambda _: "99")
+    with pytest.raises(UnreadableFile, match="marks differ"):
+        benchmark(["gies"], [str(file)], **asked, out=out)
+    fake = TaskView(options=FAKE)
+    assert problem("pushing", view=fake).version != problem("pushing").version
+
+
+# --- bad learners ---------------------------------------------------------------------------------
+
+
+def test_a_learner_that_takes_too_long_is_stopped(tmp_path: Path) -> None:
+    """Its runs are noted as such; others have their time, whatever was lost before."""
+    runs = by_learner(benchmark(**among("sleeper", timeout=0.5), out=tmp_path))
+    assert [run.status for run in runs["sleeper"]] == ["timeout"]
+    assert runs["sleeper"][0].message == "stopped after 0.5 s"
+    assert [run.status for run in runs["paired"]] == ["done"]
+
+
+def test_learners_that_fail_do_not_end_the_benchmark(tmp_path: Path) -> None:
+    """Their runs have failed, with a reason, and are not run again; all others are done."""
+    said = {
+        "refuses": "1 rows of seed 0 are not to its liking",
+        "confused": "KeyError: 'b'",
+        "hungry": "MemoryError",
+        "dies": "its process ended with exit code 3",
+        "leaves": "its process ended with exit code 4",
+        "unwritable": "cannot be written as JSON",
+        "infinite": "not finite",
+    }
+    asked = among(*said)
+    result = benchmark(**asked, out=tmp_path)
+    runs = by_learner(result)
+    for learner, why in said.items():
+        assert [run.status for run in runs[learner]] == ["failed"]
+        assert why in runs[learner][0].message
+    assert [run.status for run in runs["paired"]] == ["done"]
+    before = files(tmp_path)
+    assert plain(benchmark(**asked, out=tmp_path)) == plain(result)
+    assert files(tmp_path) == before
+
+
+# --- what is refused beforehand -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"learners": ("nobody",)},
+        {"learners": ("user_learners:nobody",)},
+        {"learners": ("coloring",)},
+        {"learners": ("local",)},
+        {"learners": "paired"},
+        {"learners": ()},
+        {"learners": ("paired", "paired")},
+        {"data": ("dreams",)},
+        {"data": ("interventional",)},
+        {"problems": ("mars",)},
+        {"problems": ("er2:1",)},
+        {"problems": ("er2:five",)},
+        {"problems": ()},
+        {"problems": ("er2:5", "er2:5")},
+        {"budgets": (0,)},
+        {"budgets": (1.5,)},
+        {"budgets": ()},
+        {"seeds": 0},
+        {"timeout": 0.0},
+        {"timeout": float("nan")},
+    ],
+)
+def test_what_does_not_exist_is_told_at_once(wrong: dict[str, Any]) -> None:
+    """An unknown learner, kind of data, problem, or a number that is none."""
+    with pytest.raises(UnknownOption):
+        benchmark(**{**SMALL, **wrong})
+
+
+def test_a_file_that_is_no_model_is_told_at_once(tmp_path: Path) -> None:
+    """Missing or damaged."""
+    (tmp_path / "bad.json").write_text("{}")
+    for name in ("bad.json", "none.json"):
+        with pytest.raises(ScmWorldError, match=name):
+            benchmark(**{**SMALL, "problems": [str(tmp_path / name)]})
+
+
+def test_workers_are_counted(tmp_path: Path) -> None:
+    """None are too few, before anything is written."""
+    with pytest.raises(UnknownOption, match="workers"):
+        benchmark(**SMALL, out=tmp_path / "out", workers=0)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("view", "error"),
+    [
+        ({"view": "sideways"}, UnknownOption),
+        ({"options": {"backend": "clay"}}, UnknownOption),
+        ({"policy": "dance"}, ActionError),
+        ({"causes": ("no_such_*",)}, ScmWorldError),
+    ],
+)
+def test_a_wrong_view_is_told_before_anything_is_written(
+    tmp_path: Path, view: Any, error: type[Exception]
+) -> None:
+    """There is no folder afterwards."""
+    with pytest.raises(error):
+        benchmark(["paired"], ["pushing"], view=TaskView(**view), out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_not_installed_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message says how to install it."""
+
+    def nothing(package: str) -> None:
+        """Pretend that no package is there."""
+
+    monkeypatch.setattr("scm_world.discovery.learners.registry._version", nothing)
+    with pytest.raises(MissingExtra, match=r"scm-world\[.+\]"):
+        benchmark(["gies"], ["er2:5"])
+
+
+# --- killed ---------------------------------------------------------------------------------------
+
+SCRIPT = """
+import sys
+from scm_world.discovery import benchmark
+if __name__ == "__main__":
+    benchmark(sys.argv[2].split(","), ["er2:5"], budgets=[40, 60], seeds=2, standardised=False,
+              timeout=None, out=sys.argv[1], workers=2)
+"""
+
+
+def started(out: Path, marks: Path, learners: str) -> subprocess.Popen[bytes]:
+    """Start a benchmark in a process of its own."""
+    marks.mkdir(exist_ok=True)
+    script = marks.parent / "run_benchmark.py"
+    script.write_text(SCRIPT)
+    path = os.pathsep.join((str(Path(user_learners.__file__).parent), os.getcwd()))
+    environment = {**os.environ, user_learners.MARK: str(marks), "PYTHONPATH": path}
+    command = [sys.executable, str(script), str(out), learners]
+    return subprocess.Popen(  # noqa: S603 # our own script
+        command, env=environment, stderr=subprocess.PIPE
+    )
+
+
+def wait_for(what: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Wait until something is so."""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it did not come about"
+        time.sleep(0.02)
+
+
+def is_alive(pid: int) -> bool:
+    """Tell whether a process runs."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def pids(marks: Path) -> set[int]:
+    """List the processes in which learners worked."""
+    return {int(path.name.partition("-")[0]) for path in marks.iterdir()}
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+
+
+@needs_proc
+@pytest.mark.parametrize("learner", ["sleeper", "busy"])
+def test_no_process_outlives_one_that_was_killed(tmp_path: Path, learner: str) -> None:
+    """A learner that would work for ten minutes ends with the benchmark, without a word."""
+    marks = tmp_path / "marks"
+    process = started(tmp_path / "out", marks, f"user_learners:{learner}")
+    wait_for(lambda: len(pids(marks)) == 2)
+    process.kill()
+    process.communicate()
+    wait_for(lambda: not any(map(is_alive, pids(marks))), 10.0)
+    assert not list((tmp_path / "out").rglob("runs/**/*.json"))
+
+
+@needs_proc
+def test_a_benchmark_that_was_killed_resumes(tmp_path: Path) -> None:
+    """What was written is kept, the rest is run, and nothing is half written."""
+    out, marks = tmp_path / "out", tmp_path / "marks"
+    learners = "user_learners:marked,paired"
+    process = started(out, marks, learners)
+    wait_for(lambda: len(files(out)) >= 2 if out.exists() else False)
+    process.kill()
+    process.communicate()
+    wait_for(lambda: not any(map(is_alive, pids(marks))), 10.0)
+    kept = files(out)
+    for path in kept:
+        assert json.loads(Path(path).read_text())["status"] == "done"
+    again = started(out, marks, learners)
+    _, said = again.communicate(timeout=120)
+    assert again.returncode == 0, said.decode()
+    assert len(files(out)) == 8
+    assert {path: files(out)[path] for path in kept} == kept
+    assert [run.status for run in BenchmarkResult.read(out).runs] == ["done"] * 8
+
+
+@needs_proc
+@pytest.mark.parametrize("everyone", [False, True])
+def test_ctrl_c_ends_a_benchmark_at_once(tmp_path: Path, everyone: bool) -> None:
+    """Whether the signal comes to one process or to all, nothing is written of what was run."""
+    out, marks = tmp_path / "out", tmp_path / "marks"
+    process = started(out, marks, "user_learners:sleeper")
+    wait_for(lambda: len(pids(marks)) == 2)
+    workers = pids(marks) if everyone else ()
+    process.send_signal(signal.SIGINT)
+    for pid in workers:
+        with suppress(ProcessLookupError):  # the benchmark may have ended it by now
+            os.kill(pid, signal.SIGINT)
+    _, said = process.communicate(timeout=20)
+    assert process.returncode != 0
+    assert said.decode().rstrip().endswith("KeyboardInterrupt")
+    assert not any(map(is_alive, pids(marks)))
+    assert files(out) == {}
+    assert [path.name for path in out.iterdir()] == ["settings.json"]
