@@ -29,8 +29,8 @@ import numpy as np
 
 from scm_world import World, make_task
 from scm_world.queries.local import RULES, LocalReport, RuleScore, local_report
-from scm_world.scene import trifinger
-from scm_world.scene.kinematics import inverse
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.kinematics import inverse
 
 TASKS: Mapping[str, dict[str, Any]] = {
     "pushing": {},
@@ -39,7 +39,7 @@ TASKS: Mapping[str, dict[str, Any]] = {
     "towers": {"number_of_blocks_in_tower": (1, 1, 3)},
     "general": {"nums_objects": 3},
 }
-TIP = trifinger.COLLISION["tip"].radius  # [m]
+TIP = hardware.COLLISION["tip"].radius  # [m]
 ANGLES = np.array([0.5, -1.6, 2.6])  # [rad] where the fingers stand around a block
 
 Policy = Callable[[World], Any]
@@ -53,7 +53,7 @@ def _ring(center: Any, radius: float, height: float, turn: float = 0.0) -> Any:
 
 
 def _joints(world: World, tips: Any) -> Any:
-    return inverse(tips, float(world["robot_height"]), np.array(trifinger.REST)).joint_positions
+    return inverse(tips, float(world["robot_height"]), np.array(hardware.REST)).joint_positions
 
 
 def _stack(world: World, dice: np.random.Generator, slide: float = 0.0) -> dict[str, Any]:

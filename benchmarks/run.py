@@ -21,10 +21,10 @@ import scm_world as sw
 from scm_world.backends.renderer import now_pixels
 from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
 from scm_world.queries.experiments.versions import versions
-from scm_world.scene import Structure, default_scene
-from scm_world.scene.camera import CAMERAS
-from scm_world.scene.kinematics import forward, inverse_kernel
-from scm_world.scene.trifinger import REST
+from scm_world.tasks.trifinger.cameras import CAMERAS
+from scm_world.tasks.trifinger.hardware import REST
+from scm_world.tasks.trifinger.kinematics import forward, inverse_kernel
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 from scm_world.variables import Normal
 
 REPEATS = 9

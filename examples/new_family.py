@@ -12,17 +12,11 @@ from typing import ClassVar, Unpack
 import numpy as np
 
 from scm_world import World
-from scm_world.entities import (
-    Entity,
-    GoalBlock,
-    ToolBlock,
-    block_mass,
-    block_size,
-    goal_orientation,
-    goal_position,
-)
-from scm_world.scene import trifinger
 from scm_world.tasks import Building, Common
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size
+from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation, goal_position
 from scm_world.variables import Exogenous, Function, Integers, Variable
 
 LEVELS, SIZE = "pyramid_levels", "block.size"
@@ -48,7 +42,7 @@ class Pyramid(Building):
     default_weights: ClassVar = {"fractional_success": 1.0}
     decided_by = (LEVELS,)  # what decides which entities there are …
     goal_causes = (LEVELS,)  # … and what a new goal is drawn for
-    rest = trifinger.RAISED  # the fingers begin out of the way
+    rest = hardware.RAISED  # the fingers begin out of the way
 
     def __init__(self, *, levels: int = 2, **common: Unpack[Common]) -> None:
         super().__init__(**common)  # weights, terms of one's own, where the robot begins

@@ -9,10 +9,11 @@ from typing import ClassVar, Unpack
 import gymnasium
 import numpy as np
 
-from scm_world.entities import Entity, goal_position
 from scm_world.evaluation import Protocol, evaluate
 from scm_world.tasks import register, term
-from scm_world.tasks.single import GOAL, TOOL, Alike, OneBlock
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.trifinger.entities.goals import goal_position
+from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock
 from scm_world.variables import Function, Parent, Variable
 
 

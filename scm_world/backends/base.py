@@ -30,8 +30,7 @@ class Contact:
 
     Attributes:
         bodies: Names of the two bodies. Of a ``Model`` as in its file, ``"world"`` for what is
-            fixed to it. Of the TriFinger: blocks, obstacles, ``"floor"``, ``"stage"`` or links
-            of the robot (the fingertip counts as link 3).
+            fixed to it; of other structures as they say.
         position: Of the point, shape (3,) [m].
         normal: Unit vector from the first body to the second, shape (3,).
         depth: How deep they intersect [m]; negative while they are apart.

@@ -99,6 +99,9 @@ class StepModel:
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
+    def realization(self, backend: str) -> None:
+        """Return None: the function itself says what happens."""
+
     @property
     def n_commands(self) -> int:
         """How many numbers a command has: those of the actions and those of the noise."""

@@ -12,9 +12,9 @@ from scm_world.cli.console import PAGE, RESULTS, check_writable, console
 from scm_world.cli.tasks import build, suffix, tag
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
+from scm_world.models import Scene
 from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import gap
-from scm_world.scene import Scene
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Audit, World
 

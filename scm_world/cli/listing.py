@@ -8,15 +8,15 @@ from scm_world.backends import backends, make_backend
 from scm_world.cli.console import console, table
 from scm_world.discovery.learners import Learner, learners
 from scm_world.discovery.problems import FAMILIES
-from scm_world.entities import ACTIONS
 from scm_world.env import IDS
 from scm_world.errors import EngineError
 from scm_world.evaluation import protocols_of
 from scm_world.evaluation.policies.cards import PolicyAbout
 from scm_world.evaluation.zoo import zoo
 from scm_world.evaluation.zoo.texts import COMMAND, best_known
-from scm_world.scene.presets import PRESETS
 from scm_world.tasks import CONVENTIONS, TASKS
+from scm_world.tasks.trifinger.entities.robot import ACTIONS
+from scm_world.tasks.trifinger.presets import PRESETS
 
 
 def _first_line(text: str | None) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from scm_world.errors import UnknownVariable
 from scm_world.variables import Exogenous, Variable
-from scm_world.variables.catalogue import PRESET
+from scm_world.variables.reserved import PRESET
 from scm_world.world.declaration import Declaration
 
 LOOKS = ("*color", "light_*", "camera_*")

@@ -24,7 +24,7 @@ from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import scaled_clip_kernel
-from scm_world.scene.camera import Camera
+from scm_world.models.camera import Camera
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName

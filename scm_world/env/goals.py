@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scm_world._types import Floats
 from scm_world.env.bounds import WIDE
 from scm_world.errors import UnknownOption
-from scm_world.tasks import Task, TriFingerTask
+from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Linear
 from scm_world.world import World
@@ -20,7 +20,7 @@ from scm_world.world.declaration import Declaration
 from scm_world.world.mechanisms import places
 
 BOUND = 10.0
-"""Goals of the robot are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
+"""Goals that saturate are positions [m], sizes [m] and unit quaternions; beyond they saturate."""
 
 TERMS: dict[str, Callable[[Task, Floats, Floats], Any]] = {
     FRACTION: lambda task, have, want: task.fraction(have, want),
@@ -49,7 +49,7 @@ class Goals:
         self.names = (*sides[0], *sides[1])
         where = declaration.mechanisms.where
         self._sides = tuple(places(where[name] for name in side) for side in sides)
-        self.bound = BOUND if isinstance(declaration.task, TriFingerTask) else WIDE
+        self.bound = BOUND if declaration.task.saturates else WIDE
         self.spaces: dict[str, gymnasium.Space[Any]] = {
             name: gymnasium.spaces.Box(-self.bound, self.bound, (side.size,), np.float64)
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)

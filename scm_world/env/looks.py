@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scm_world.env.observer import Observer
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
-from scm_world.scene.camera import OVERVIEW, Camera
-from scm_world.tasks import TriFingerTask
+from scm_world.models.camera import Camera
 from scm_world.world import World
 
 
@@ -46,14 +45,15 @@ class Looks:
         return dict(self._observer.layouts.get("context", {}))
 
     def _camera(self, camera: Camera | str | None) -> Camera:
+        from scm_world.backends.renderer import drawing_of, scene_camera
+
         if isinstance(camera, Camera):
             return camera
-        if not isinstance(self.world.task, TriFingerTask):
-            from scm_world.backends.renderer import scene_camera
-
+        overview = drawing_of(self.world.structure).overview
+        if overview is None:
             return scene_camera(self.world.scene(), camera)
-        camera = OVERVIEW.name if camera is None else camera
-        known = {one.name: one for one in (*self.world.cameras(), OVERVIEW)}
+        camera = overview.name if camera is None else camera
+        known = {one.name: one for one in (*self.world.cameras(), overview)}
         if camera not in known:
             raise UnknownOption("camera", camera, known)
         return known[camera]
@@ -74,10 +74,11 @@ class Looks:
 
     def _camera_of(self, scene: Scene) -> Camera:
         """Give the camera of pictures for people: of a model it follows what moves."""
-        if isinstance(self.world.task, TriFingerTask):
-            return OVERVIEW
-        from scm_world.backends.renderer import following_camera, scene_camera
+        from scm_world.backends.renderer import drawing_of, following_camera, scene_camera
 
+        overview = drawing_of(self.world.structure).overview
+        if overview is not None:
+            return overview
         if self._automatic is None:
             self._automatic = scene_camera(self.world.structure.default_scene())
         return following_camera(self._automatic, scene)

@@ -16,8 +16,8 @@ from scm_world.env.goals import Goals
 from scm_world.env.keypoints import CORNERS, KEYPOINTS, Keypoints
 from scm_world.env.vector import Layouts, Part, Vector
 from scm_world.errors import UnknownOption
-from scm_world.scene.camera import Camera
-from scm_world.tasks import HEAD, TIME, Building, Observed, TriFingerTask
+from scm_world.models.camera import Camera
+from scm_world.tasks import TIME, Observed
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
 
@@ -126,16 +126,10 @@ def observer(
     main: Observer
     if how.goals and goals is None:
         raise UnknownOption("goal_env", True, (f"False: {declaration.task.name} has no goals",))
-    if how.mode == "pixel" and not isinstance(declaration.task, TriFingerTask):
-        from scm_world.env.pixels import ModelPixels
+    if how.mode == "pixel":
+        from scm_world.env.pixels import pixel_observer
 
-        main = ModelPixels(world, how.cameras, how.image_size)
-    elif how.mode == "pixel":
-        from scm_world.env.pixels import Pixels, chosen, followed
-
-        original = world.conventions.published_observation
-        cameras = chosen(how.cameras, how.image_size, original=original)
-        main = Pixels(world, cameras, followed(how.cameras, original=original))
+        main = pixel_observer(world, how.cameras, how.image_size)
     else:
         main = _vector(world, declaration, how)
     parts: dict[str, Observer] = {"observation": main}
@@ -158,10 +152,10 @@ def context(declaration: Declaration) -> tuple[str, ...]:
 def published(world: World, declaration: Declaration) -> dict[str, Observed]:
     """List the parts of the structured observation, by variable."""
     parts = list(declaration.task.observed())
-    if isinstance(declaration.task, TriFingerTask):
+    if declaration.task.head:
         length = world.max_episode_length * world.control_period
         end = length if world.given_length is None else float(world.given_length)
-        parts = [Observed(TIME, (0.0, end)), *HEAD, *parts]
+        parts = [Observed(TIME, (0.0, end)), *declaration.task.head, *parts]
     return {part.variable: part for part in parts}
 
 
@@ -187,7 +181,7 @@ def _parts(world: World, declaration: Declaration, names: Iterable[str]) -> list
     """
     known = published(world, declaration)
     soft = frozenset[str]()
-    if not isinstance(declaration.task, TriFingerTask):
+    if not declaration.task.saturates:
         soft = frozenset(declaration.slices)
     as_published = world.conventions.published_observation
     parts = []
@@ -209,7 +203,7 @@ def _quiet(parts: Iterable[Part]) -> list[Part]:
 
 def _keypoints(declaration: Declaration) -> Keypoints:
     task = declaration.task
-    if not isinstance(task, Building):
+    if not task.tools():
         raise UnknownOption("keypoints", True, ("False: the task has no blocks",))
     return Keypoints((*task.tools(), *task.targets()))
 

@@ -14,6 +14,7 @@ from scm_world._types import Values
 from scm_world.backends.renderer import (
     ORIGINAL,
     PLAIN,
+    drawing_of,
     following_camera,
     goal_pixels,
     now_pixels,
@@ -22,7 +23,7 @@ from scm_world.backends.renderer import (
 from scm_world.env.vector import Layouts
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
-from scm_world.scene.camera import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW, Camera
+from scm_world.models.camera import Camera
 from scm_world.world import World
 
 Size = int | tuple[int, int]
@@ -31,26 +32,32 @@ AUTOMATIC = "automatic"
 """A camera that looks at what moves in a model, and follows it."""
 
 
-def chosen(
-    cameras: Sequence[str | Camera] | None, size: Size | None, *, original: bool
-) -> tuple[Camera, ...]:
-    """Look up cameras.
+def pixel_observer(
+    world: World, cameras: Sequence[str | Camera] | None, size: Size | None
+) -> Pixels | ModelPixels:
+    """Return what observes a world by pictures.
 
     Args:
-        cameras: Names, or cameras; the three of the robot if None.
+        world: That is observed.
+        cameras: Names, or cameras; those of policies if None.
         size: Height and width of the pictures, or both in one [pixels]; those of the cameras
             if None.
-        original: Whether the cameras of the robot are as the predecessor realises them.
 
     Raises:
         UnknownOption: There is no such camera, or the sizes are none or differ.
     """
-    own = ORIGINAL_CAMERAS if original else CAMERAS
-    known = {camera.name: camera for camera in (*own, OVERVIEW)}
+    drawing = drawing_of(world.structure)
+    if drawing.overview is None:
+        return ModelPixels(world, cameras, size)
+    original = world.conventions.published_observation
+    own = drawing.original_cameras if original else drawing.cameras
+    known = {camera.name: camera for camera in (*own, drawing.overview)}
     if isinstance(cameras, str) or (cameras is not None and not len(cameras)):
         raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
-    found = [_camera(camera, known) for camera in (own if cameras is None else cameras)]
-    return _sized(found, size)
+    asked = [camera.name for camera in own] if cameras is None else cameras
+    names = {camera.name for camera in own}
+    follows = tuple(not original and isinstance(c, str) and c in names for c in asked)
+    return Pixels(world, _sized([_camera(camera, known) for camera in asked], size), follows)
 
 
 def _sized(found: Sequence[Camera], size: Size | None) -> tuple[Camera, ...]:
@@ -146,18 +153,6 @@ class Pixels:
             else camera
             for camera, follows in zip(self._cameras, self._followed, strict=True)
         )
-
-
-def followed(cameras: Sequence[str | Camera] | None, *, original: bool) -> tuple[bool, ...]:
-    """Tell which cameras are those of the robot, asked for by name: they are nodes of the graph.
-
-    Args:
-        cameras: As in ``chosen``.
-        original: Whether they are as the predecessor realises them, and fixed.
-    """
-    own = [camera.name for camera in CAMERAS]
-    asked = own if cameras is None else cameras
-    return tuple(not original and isinstance(c, str) and c in own for c in asked)
 
 
 @final

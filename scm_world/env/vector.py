@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers, Value
-from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.env.bounds import WIDE
 from scm_world.env.keypoints import KEYPOINTS, Keypoints
 from scm_world.geometry.clipping import scale_rows
 from scm_world.tasks import TIME
 from scm_world.variables import Normal
+from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import World
 from scm_world.world.declaration import Declaration
 from scm_world.world.mechanisms import places

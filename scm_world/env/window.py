@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, final
 
 from scm_world.errors import EngineError
-from scm_world.scene import Scene
+from scm_world.models import Scene
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.viewer import Viewer

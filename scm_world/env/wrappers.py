@@ -10,13 +10,11 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from scm_world.entities import ACTIONS
 from scm_world.env.delta import PREFIX, TIPS
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.vector import box
 from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.graph import flatten
-from scm_world.scene.trifinger import RAISED
 from scm_world.variables import Shift
 from scm_world.world.start import whole_number
 
@@ -64,7 +62,7 @@ class DeltaAction(gymnasium.ActionWrapper[Any, Actions, Actions], RecordConstruc
         super().__init__(env)
         inner = _unwrapped(env, "DeltaAction")
         if inner.action_mode.startswith(PREFIX):
-            raise UnknownOption("action_mode", inner.action_mode, ACTIONS)
+            raise UnknownOption("action_mode", inner.action_mode, inner.world.task.action_modes)
         self._delta = inner.relative()
         self.action_space = self._delta.space()
 
@@ -139,7 +137,7 @@ class ObjectSelector(
         if not isinstance(inner.observation_space, gymnasium.spaces.Box):
             allowed = ("a vector: without goal_env and context='privileged'",)
             raise UnknownOption("observation for ObjectSelector", "a dictionary", allowed)
-        self._held: Any = inner.as_action(np.array(RAISED))
+        self._held: Any = inner.as_action(np.array(inner.world.task.raised))
         self._first = inner.layout[TIPS].stop
         self._spaces: dict[int, gymnasium.spaces.MultiDiscrete] = {}
         self._blocks()
@@ -169,7 +167,8 @@ class ObjectSelector(
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode with the robot raised."""
         asked = dict(options or {})
-        asked["do"] = {"joint_positions": RAISED, **flatten(asked.get("do") or {})}
+        raised = {"joint_positions": self._inner.world.task.raised}
+        asked["do"] = raised | flatten(asked.get("do") or {})
         observation, info = self.env.reset(seed=seed, options=asked)
         return observation[self._first :], {**info, "refused": ""}
 

@@ -202,3 +202,6 @@ class Model:
         for name, where in self.layout.slices.items():
             if name in there:
                 state.vector[where] = before.state.vector[there[name]]
+
+    def realization(self, backend: str) -> None:
+        """Return None: every backend realises a model in its own way."""

@@ -52,6 +52,15 @@ class Structure(Protocol):
     def carried(self, state: State, before: Scene) -> None:
         """Copy the states that another structure has too, from a scene of it into a state."""
 
+    def realization(self, backend: str) -> Any:
+        """Return a custom realisation, or None where the backend's own one applies.
+
+        Args:
+            backend: ``"mujoco"``: a class derived from ``backends.mujoco.realization.Realization``;
+                ``"bullet"``: one derived from ``backends.bullet.client.Client``; ``"fake"``: see
+                ``backends.fake``; ``"renderer"``: a ``backends.renderer.drawing.Drawing``.
+        """
+
 
 @final
 @dataclass(frozen=True)
@@ -115,6 +124,28 @@ class Scene:
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
+TOLERANCE = 1e-3
+"""How deep two bodies may lie in one another after an intervention [m]."""
+
+
+@final
+@dataclass(frozen=True)
+class Overlap:
+    """Two bodies in one place.
+
+    Attributes:
+        bodies: Their names: those that can be moved first.
+        depth: How deep they lie in one another [m]; see ``scm_world.geometry.penetration``.
+    """
+
+    bodies: tuple[str, str]
+    depth: float
+
+    def __str__(self) -> str:
+        first, second = self.bodies
+        return f"{first!r} lies {1e3 * self.depth:.3g} mm deep in {second!r}"
+
+
 @final
 @dataclass(frozen=True)
 class Difference:
@@ -140,7 +171,8 @@ def diff(now: Scene, then: Scene) -> Difference:
     Goals are not compared: no engine knows them. Neither are states that cannot be set.
 
     Example:
-        >>> from scm_world.scene import Structure, default_scene, diff
+        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
+        >>> from scm_world.models import diff
         >>> scene = default_scene(Structure(blocks=("tool_block",)))
         >>> heavy = {**scene.parameters, ("tool_block", "mass"): np.array(0.05)}
         >>> diff(scene, scene.with_(parameters=heavy)).parameters

@@ -20,7 +20,7 @@ import networkx as nx
 from scm_world._types import ArrayLike
 from scm_world.backends.base import Contact
 from scm_world.errors import UnknownOption
-from scm_world.queries.local_truth import FINGERS, Pair, listening, movers, rehearse
+from scm_world.queries.local_truth import Pair, listening, movers, rehearse
 from scm_world.world import World
 
 GRAPH_FORMAT = "scm_world/local_graphs/1"
@@ -35,9 +35,9 @@ Policy = Callable[[World], ArrayLike] | Sequence[ArrayLike]
 # --- the rule -----------------------------------------------------------------------------------
 
 
-def body_of(name: str) -> str:
-    """Say to which body a link belongs: the links of a finger are one body."""
-    return next((finger for finger in FINGERS if name.startswith(f"{finger}_link_")), name)
+def body_of(name: str, bodies: Iterable[str]) -> str:
+    """Say to which body a link belongs: ``"x_link_1"`` is a part of ``"x"``."""
+    return next((body for body in bodies if name.startswith(f"{body}_link_")), name)
 
 
 def islands(bodies: Iterable[str], contacts: Iterable[Contact]) -> list[set[str]]:
@@ -45,7 +45,7 @@ def islands(bodies: Iterable[str], contacts: Iterable[Contact]) -> list[set[str]
     graph = nx.Graph()
     graph.add_nodes_from(bodies)
     for contact in contacts:
-        first, second = map(body_of, contact.bodies)
+        first, second = (body_of(name, graph) for name in contact.bodies)
         if first in graph and second in graph:
             graph.add_edge(first, second)
     return list(nx.connected_components(graph))
@@ -73,7 +73,11 @@ def predicted(bodies: Sequence[str], steps: Touching) -> tuple[Pair, ...]:
 
 def _held(bodies: Sequence[str], steps: Touching) -> tuple[Pair, ...]:
     """List what stands still, with each body that it touches."""
-    pairs = {tuple(map(body_of, contact.bodies)) for step in steps for contact in step}
+    pairs = {
+        tuple(body_of(name, bodies) for name in contact.bodies)
+        for step in steps
+        for contact in step
+    }
     fixed = {(a, b) if b in bodies else (b, a) for a, b in pairs if (a in bodies) != (b in bodies)}
     return tuple(sorted(fixed))
 

@@ -6,7 +6,7 @@ everything else is kept. Whatever other body then ends elsewhere, or faster, is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, final
@@ -16,16 +16,13 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Contact
 from scm_world.errors import UnknownOption
-from scm_world.scene import ControlMode, ParameterKey, PhysicalState, Scene, trifinger
-from scm_world.tasks import TriFingerTask
+from scm_world.models import ControlMode, Scene, State
+from scm_world.tasks.composition import Mover
 from scm_world.variables import Noise
 from scm_world.world import World
 
 Pair = tuple[str, str]
 """Two bodies; of an edge first the cause, then the effect."""
-
-FINGERS = tuple(f"robot_finger_{finger}" for finger in trifinger.FINGERS)
-"""The fingers as bodies. Their bases are fixed, so they do not act on one another."""
 
 THRESHOLD = 1e-10  # [m], [rad], [m/s] or [rad/s] an effect must exceed it; the floor is 0.0
 OFFSET = 1e-5  # [m] or [rad] by which a state is changed: small, so that what touches stays
@@ -35,12 +32,12 @@ DIRECTIONS = 2  # each with both signs
 
 
 def has_local_graphs(world: World) -> bool:
-    """Tell whether a world is one of fingers and blocks, between which local graphs are."""
-    return isinstance(world.task, TriFingerTask)
+    """Tell whether a world has bodies between which local graphs are."""
+    return bool(world.composition.movers())
 
 
 def movers(world: World) -> tuple[str, ...]:
-    """Name the bodies that can move: the fingers, then the blocks.
+    """Name the bodies that can move: of the robot's tasks the fingers, then the blocks.
 
     Raises:
         UnknownOption: It is a world of something else.
@@ -48,7 +45,7 @@ def movers(world: World) -> tuple[str, ...]:
     if not has_local_graphs(world):
         allowed = ("a world of the block-building robot",)
         raise UnknownOption("world of local graphs", world.task.name, allowed)
-    return (*FINGERS, *world.composition.blocks)
+    return tuple(mover.name for mover in world.composition.movers())
 
 
 @final
@@ -66,7 +63,7 @@ class Rehearsal:
     mode: ControlMode
     command: Floats
     contacts: tuple[tuple[Contact, ...], ...]
-    after: PhysicalState
+    after: State
 
 
 @final
@@ -155,13 +152,15 @@ def paired_truth(world: World, action: ArrayLike) -> LocalTruth:
     heard, scene, before = rehearse(world, action), world.scene(), world.snapshot()
     listener: Any = Listener(world.backend)
 
-    def after(start: Scene, engine: Any = world.backend) -> PhysicalState:
+    def after(start: Scene, engine: Any = world.backend) -> State:
         world.backend.build(start)
         engine.step(heard.mode, heard.command, len(heard.contacts))
-        found: PhysicalState = world.backend.state()
+        found: State = world.backend.state()
         return found
 
-    bodies, effects, rollouts = movers(world), dict[Pair, float](), 2
+    movers(world)  # or an error
+    bodies = world.composition.movers()
+    effects, rollouts = dict[Pair, float](), 2
     try:
         factual = after(scene, listener)
         floor = max(_changes(bodies, factual, after(scene)).values())
@@ -169,8 +168,8 @@ def paired_truth(world: World, action: ArrayLike) -> LocalTruth:
             for other in variations(scene, cause):
                 rollouts += 1
                 for effect, size in _changes(bodies, factual, after(other)).items():
-                    if effect != cause:
-                        pair = (cause, effect)
+                    if effect != cause.name:
+                        pair = (cause.name, effect)
                         effects[pair] = max(size, effects.get(pair, 0.0))
     finally:
         world.restore(before)
@@ -178,51 +177,35 @@ def paired_truth(world: World, action: ArrayLike) -> LocalTruth:
     return LocalTruth(edges, effects, floor, rollouts, tuple(listener.contacts))
 
 
-def variations(scene: Scene, body: str) -> Iterator[Scene]:
+def variations(scene: Scene, body: Mover) -> Iterator[Scene]:
     """Change the state of one body in some directions, then each of its parameters."""
     for direction in range(DIRECTIONS):
         for sign in (1.0, -1.0):
-            yield scene.with_(
-                state=_moved(scene.state, scene.structure.blocks, body, direction, sign)
-            )
-    for keys in _parameters(scene, body):
+            yield scene.with_(state=_moved(scene.state, body, direction, sign))
+    for keys in body.parameters:
         for sign in (1.0, -1.0):
             factor = 1.0 + sign * SHARE
             changed = {key: scene.parameters[key] * factor for key in keys}
             yield scene.with_(parameters={**scene.parameters, **changed})
 
 
-def _moved(
-    state: PhysicalState, blocks: tuple[str, ...], body: str, direction: int, sign: float
-) -> PhysicalState:
+def _moved(state: State, body: Mover, direction: int, sign: float) -> State:
     """Change every number of the state of one body, in a direction that is always the same."""
-    moved = state.copy()
-    unit = 2.0 * Noise(0).uniforms(body, n=13, step=direction)[0] - 1.0
+    moved: State = state.copy()
+    unit = 2.0 * Noise(0).uniforms(body.name, n=13, step=direction)[0] - 1.0
     unit = sign * (unit + np.copysign(0.2, unit))  # no number is left out
-    if body in FINGERS:
-        own = slice(3 * FINGERS.index(body), 3 * FINGERS.index(body) + 3)
-        moved.joint_positions[own] += OFFSET * unit[:3]
-        moved.joint_velocities[own] += PUSH * unit[3:6]
-        return moved
-    row = moved.blocks[blocks.index(body)]
-    row[:7] += OFFSET * unit[:7]
-    row[3:7] /= np.linalg.norm(row[3:7])
-    row[7:] += PUSH * unit[7:]
+    positions, velocities = moved.vector[body.positions], moved.vector[body.velocities]
+    positions += OFFSET * unit[: len(positions)]
+    if body.rotation is not None:
+        moved.vector[body.rotation] /= np.linalg.norm(moved.vector[body.rotation])
+    velocities += PUSH * unit[len(positions) :][: len(velocities)]
     return moved
 
 
-def _parameters(scene: Scene, body: str) -> tuple[tuple[ParameterKey, ...], ...]:
-    """List the parameters of one body that physics knows, those that are changed together."""
-    if body in FINGERS:
-        finger = trifinger.FINGERS[FINGERS.index(body)]
-        return (tuple((trifinger.link_name(finger, link), "mass") for link in (1, 2, 3)),)
-    return (((body, "mass"),), ((body, "friction"),))
-
-
-def _changes(bodies: tuple[str, ...], one: PhysicalState, other: PhysicalState) -> dict[str, float]:
+def _changes(bodies: Sequence[Mover], one: State, other: State) -> dict[str, float]:
     """Say how far the state of each body is from another one, the largest of its numbers."""
     apart = np.abs(one.vector - other.vector)
-    gaps = PhysicalState(one.n_blocks, apart)
-    joints = np.maximum(gaps.joint_positions, gaps.joint_velocities).reshape(3, 3).max(axis=1)
-    sizes = [*joints.tolist(), *gaps.blocks.max(axis=1).tolist()]
-    return dict(zip(bodies, sizes, strict=True))
+    return {
+        body.name: float(max(apart[body.positions].max(), apart[body.velocities].max()))
+        for body in bodies
+    }

@@ -14,9 +14,9 @@ import numpy as np
 
 from scm_world._types import Floats, Integers, Value
 from scm_world.queries.courses import Course
-from scm_world.queries.policies import Blind
 from scm_world.queries.traces import ALL, Trace, intervene, note_parameters, write
 from scm_world.queries.units import Unit
+from scm_world.tasks.policies import Blind
 from scm_world.world import World
 from scm_world.world.batch import Batch, Table
 from scm_world.world.commands import clipped

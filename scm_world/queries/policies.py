@@ -2,49 +2,24 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.queries.grasping import Grasp
 from scm_world.queries.planning import CrossEntropy
 from scm_world.queries.ranges import action_range
-from scm_world.scene import trifinger
-from scm_world.scene.kinematics import forward, inverse
-from scm_world.tasks import Task, TriFingerTask
+from scm_world.tasks import TASKS, Task
+from scm_world.tasks.policies import Blind, kept_rows
 from scm_world.world import World
 from scm_world.world.start import whole_number
 
 Policy = Callable[[World], Any]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
-
-
-class Blind(ABC):
-    """A policy that does not look at what happens: all its actions are known beforehand."""
-
-    @abstractmethod
-    def ahead(self, world: World, first: int, count: int) -> Floats:
-        """Give the actions of some control steps.
-
-        Args:
-            world: As it is now. A policy asked for the first time may look at it.
-            first: The first control step.
-            count: How many.
-
-        Returns:
-            Shape (count, n_actions).
-        """
-
-    def __call__(self, world: World) -> Floats:
-        """Give the action of the present step."""
-        action: Floats = self.ahead(world, world.index, 1)[0]
-        return action
 
 
 @final
@@ -109,69 +84,17 @@ class Sequence(Blind):
             raise ActionError(
                 f"actions have shape ({n},) or (steps, {n}), got {self.actions.shape}", self.actions
             )
-        return _kept(self.actions, first, count)
+        return kept_rows(self.actions, first, count)
 
 
-def _kept(actions: Floats, first: int, count: int) -> Floats:
-    """Take rows of actions; after the last one it is kept."""
-    found: Floats = actions[np.minimum(np.arange(first, first + count), len(actions) - 1)]
-    return found
-
-
-INWARD = ((0.33, 0.12, 0.0), (1.0, 0.02, 0.0))
-ACROSS = ((0.25, 0.12, 0.0), (1.0, -0.11, 0.0))
-"""Where a sweep is after shares of its way: distance from the middle, and above its level [m]."""
-
-
-@final
-class Sweep(Blind):
-    """The fingertips sweep over the floor to its middle, and stay there.
-
-    What lies in their way is pushed. It depends on nothing but the control step, so that it adds
-    no cause and no noise to what happens.
-
-    Args:
-        across: Whether one of them goes through the middle to the other side, so that what it
-            pushes comes to the wall, while the others stay where they are.
-        steps: How many control steps the way takes.
-        level: Height of the fingertips as they sweep [m].
-    """
-
-    def __init__(self, *, across: bool = False, steps: int = 14, level: float = 0.035) -> None:
-        self.steps = whole_number("steps", steps, least=1)
-        rest, height = np.array(trifinger.REST), trifinger.NOMINAL_HEIGHT
-        tips = forward(rest, height).reshape(3, 3)
-        far, high = float(np.hypot(*tips[0, :2])), float(tips[0, 2])
-        stations = ACROSS if across else INWARD
-        when, radius, lift = np.array([(0.0, far, high - level), *stations]).T
-        share = np.arange(1, steps + 1) / steps
-        way = np.empty((steps, 3, 3))
-        way[..., :2] = np.interp(share, when, radius)[:, None, None] * tips[:, :2] / far
-        way[..., 2] = level + np.interp(share, when, lift)[:, None]
-        if across:
-            way[:, 1:] = tips[1:]
-        self._way = way.reshape(steps, 9)
-        self._joints = np.array([inverse(t, height, rest).joint_positions for t in self._way])
-
-    def ahead(self, world: World, first: int, count: int) -> Floats:
-        """Give the actions of some control steps."""
-        if world.action_mode == "joint_torques":
-            raise ActionError("a sweep needs positions as actions, not", world.action_mode)
-        return _kept(self._way if "effector" in world.action_mode else self._joints, first, count)
-
+ANY: Mapping[str, Callable[[], Policy]] = {"random": Random, "mpc": cache(CrossEntropy)}
+"""Policies that any system can have."""
 
 NAMED: Mapping[str, Callable[[], Policy]] = {
-    "random": Random,
-    "sweep": cache(Sweep),
-    "across": cache(partial(Sweep, across=True)),
-    "grasp": Grasp,
-    "hold": partial(Grasp, holds=True),
-    "mpc": cache(CrossEntropy),
+    **ANY,
+    **{name: made for task in TASKS.values() for name, made in task.policies.items()},
 }
-"""Policies that have a name."""
-
-ANY = ("random", "mpc")
-"""Those of them that any system can have; the others move the fingers of the robot."""
+"""Policies that have a name, those of the tasks of this package included."""
 
 
 def as_policy(given: Any, task: Task | None = None) -> Policy:
@@ -190,9 +113,9 @@ def as_policy(given: Any, task: Task | None = None) -> Policy:
     if given is None:
         return _Idle()
     if isinstance(given, str):
-        known = [*NAMED] if task is None or isinstance(task, TriFingerTask) else [*ANY]
+        known = [*NAMED] if task is None else [*ANY, *task.policies]
         if given in known:
-            return NAMED[given]()
+            return (NAMED if task is None else {**ANY, **task.policies})[given]()
         raise ActionError(f"a policy is a function, actions, None, or one of {known}", given)
     return given if callable(given) else Sequence(given)
 

@@ -7,22 +7,23 @@ from typing import Any, TypeVar
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.tasks.base import Task, Timing
-from scm_world.tasks.building import Building
 from scm_world.tasks.conventions import CONVENTIONS, Conventions, conventions
-from scm_world.tasks.creative_stacked_blocks import CreativeStackedBlocks
-from scm_world.tasks.general import General
 from scm_world.tasks.model import ModelTask, model_task
-from scm_world.tasks.observed import HEAD, TIME, Observed
-from scm_world.tasks.pick_and_place import PickAndPlace
-from scm_world.tasks.picking import Picking
-from scm_world.tasks.pushing import Pushing
-from scm_world.tasks.reaching import Reaching
+from scm_world.tasks.observed import TIME, Observed
 from scm_world.tasks.rewards import Common, term
-from scm_world.tasks.stacked_blocks import StackedBlocks
-from scm_world.tasks.stacking2 import Stacking2
 from scm_world.tasks.step import StepTask
-from scm_world.tasks.towers import Towers
-from scm_world.tasks.trifinger import TriFingerTask
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.creative_stacked_blocks import CreativeStackedBlocks
+from scm_world.tasks.trifinger.general import General
+from scm_world.tasks.trifinger.observed import HEAD
+from scm_world.tasks.trifinger.pick_and_place import PickAndPlace
+from scm_world.tasks.trifinger.picking import Picking
+from scm_world.tasks.trifinger.pushing import Pushing
+from scm_world.tasks.trifinger.reaching import Reaching
+from scm_world.tasks.trifinger.stacked_blocks import StackedBlocks
+from scm_world.tasks.trifinger.stacking2 import Stacking2
+from scm_world.tasks.trifinger.towers import Towers
 
 TASKS: dict[str, type[Task]] = {
     task.name: task

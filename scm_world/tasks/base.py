@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self, final
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
-from scm_world.entities import Composition
 from scm_world.errors import UnknownOption
+from scm_world.tasks.composition import Composition
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.experiments import Scenario
 from scm_world.tasks.observed import Observed
@@ -61,6 +61,11 @@ class Task(ABC):
         terms: Reward terms that were asked for.
         decided_by: The shared variables that decide what there is.
         goal_causes: The variables that a new goal is drawn for.
+        head: What a structured observation begins with, after the time that is left.
+        saturates: Whether observed states and goals are clipped to the bounds they declare.
+        rest: Joint positions at the start of an episode, where the task has a robot.
+        raised: Joint positions in which the robot is out of the way.
+        policies: Scripted policies of its own, by name.
         plan: What there is, as ``arrange`` has it; None where that is always the same.
         absent: Entities that an intervention took away.
         checks_functions: Whether what functions of users give is checked when a world begins.
@@ -83,6 +88,11 @@ class Task(ABC):
     terms: tuple[Measured, ...] = ()
     decided_by: ClassVar[tuple[str, ...]] = ()
     goal_causes: ClassVar[tuple[str, ...]] = ()
+    head: ClassVar[tuple[Observed, ...]] = ()
+    saturates: ClassVar[bool] = False
+    rest: ClassVar[tuple[float, ...]] = ()
+    raised: ClassVar[tuple[float, ...]] = ()
+    policies: ClassVar[Mapping[str, Callable[[], Any]]] = {}
     plan: Hashable = None
     checks_functions: ClassVar[bool] = False
     absent: frozenset[str] = frozenset()
@@ -127,6 +137,31 @@ class Task(ABC):
     def observed(self) -> Iterable[Observed]:
         """List what is observed, in order."""
         return ()
+
+    def tools(self) -> tuple[str, ...]:
+        """Name the boxes that should be moved."""
+        return ()
+
+    def targets(self) -> dict[str, str]:
+        """Name the goals, each with the box that its solution puts there."""
+        return {}
+
+    def measured(self, *, every_step: bool = False) -> tuple[str, ...] | None:
+        """Name what experiments measure by default; None for all states, reward and success.
+
+        Args:
+            every_step: Whether it is measured at every instant.
+        """
+        return None
+
+    def closeness(self) -> tuple[tuple[str, ...], Callable[..., Any]] | None:
+        """Return what planners maximise by default; None for the distance to the goal.
+
+        Returns:
+            Names of variables, and a function of their values, shapes (..., *shape), that gives
+            numbers of shape (...). It can be pickled.
+        """
+        return None
 
     def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Name the variables that say what is achieved, and those that say what is desired."""

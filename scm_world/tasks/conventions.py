@@ -9,8 +9,8 @@ from typing import final
 import numpy as np
 
 from scm_world.errors import UnknownOption
+from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.variables import Box, Integers, Space, Variable
-from scm_world.variables import catalogue as numbers
 
 
 @final

@@ -13,11 +13,11 @@ from numba import njit
 
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
-from scm_world.entities import Clock, Composition
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry import chains
 from scm_world.models import Model, ParameterKey, Readout, Row
 from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.composition import Clock, Composition
 from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import (

@@ -10,11 +10,11 @@ import numpy as np
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
-from scm_world.entities import Clock, Commands, Composition
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.models import ParameterKey
 from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.composition import Clock, Commands, Composition
 from scm_world.tasks.model import REWARD, TERMINATED, _numbers, beginning, declared
 from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import SUCCESS

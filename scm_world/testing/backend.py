@@ -21,9 +21,9 @@ from scm_world._types import Floats
 from scm_world.backends.base import Backend
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode, Difference, Parameters, Scene
-from scm_world.scene import trifinger
-from scm_world.scene.scene import Structure, controller_spec, default_scene
-from scm_world.scene.state import PhysicalState
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import Structure, controller_spec, default_scene
 from scm_world.testing.effects import EffectConformance
 from scm_world.testing.parameters import ParameterConformance
 from scm_world.testing.scenes import (
@@ -106,7 +106,7 @@ class BackendConformance(
             turns: list[list[Floats]] = [[], []]
             generator = np.random.default_rng(SEED)
             for _ in range(20):
-                command = np.array(trifinger.REST) + generator.uniform(-0.3, 0.3, 9)
+                command = np.array(hardware.REST) + generator.uniform(-0.3, 0.3, 9)
                 for backend, rows in zip((first, second), turns, strict=True):
                     backend.step(ControlMode.JOINT_POSITIONS, command, SUBSTEPS)
                     rows.append(backend.state().vector)
@@ -133,7 +133,7 @@ class BackendConformance(
         saturated = 0
         for _ in range(100):
             state = backend.state()
-            state.joint_positions[:] = trifinger.REST + generator.uniform(-0.5, 0.5, 9)
+            state.joint_positions[:] = hardware.REST + generator.uniform(-0.5, 0.5, 9)
             state.joint_velocities[:] = generator.normal(size=9, scale=3.0)
             state.positions[:, 2] = 2.0 + np.arange(state.n_blocks)
             command = state.joint_positions + generator.uniform(-0.1, 0.1, 9)
@@ -154,7 +154,7 @@ class BackendConformance(
                 assert backend.contacts() == ()
                 return
             for _ in range(40):
-                backend.step(ControlMode.JOINT_POSITIONS, np.array(trifinger.REST), SUBSTEPS)
+                backend.step(ControlMode.JOINT_POSITIONS, np.array(hardware.REST), SUBSTEPS)
             contacts = backend.contacts()
         assert {frozenset(contact.bodies) for contact in contacts} == {
             frozenset(("floor", "block"))
@@ -169,10 +169,10 @@ class BackendConformance(
     def test_contacts_name_bodies(self, backend: Backend, scene: Scene) -> None:
         """Contacts name blocks, links, obstacles, floor and stage; normals have length one."""
         structure = scene.structure
-        known = {*structure.blocks, *trifinger.LINK_NAMES, *structure.obstacles, "floor", "stage"}
+        known = {*structure.blocks, *hardware.LINK_NAMES, *structure.obstacles, "floor", "stage"}
         seen: set[str] = set()
         for _ in range(300):
-            backend.step(ControlMode.JOINT_POSITIONS, np.array(trifinger.REST), 1)
+            backend.step(ControlMode.JOINT_POSITIONS, np.array(hardware.REST), 1)
             for contact in backend.contacts():
                 seen |= set(contact.bodies)
                 assert np.linalg.norm(contact.normal) == pytest.approx(1.0)

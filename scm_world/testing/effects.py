@@ -11,9 +11,9 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Backend
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 from scm_world.models.scene import ControlMode, ParameterKey, Scene
-from scm_world.scene import trifinger
-from scm_world.scene.kinematics import forward, inverse
-from scm_world.scene.scene import Structure, default_scene
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.kinematics import forward, inverse
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 from scm_world.testing.scenes import STONE, named, same
 from scm_world.testing.suite import Suite
 
@@ -34,7 +34,7 @@ class EffectConformance(Suite):
         return scene.with_(parameters={**scene.parameters, **values})
 
     def watched(
-        self, backend: Backend, scene: Scene, seconds: float, command: ArrayLike = trifinger.REST
+        self, backend: Backend, scene: Scene, seconds: float, command: ArrayLike = hardware.REST
     ) -> Floats:
         """Hold a command and record the state after each physics step, shape (n, 27 + 13 n)."""
         backend.build(scene)
@@ -74,9 +74,9 @@ class EffectConformance(Suite):
         """Fingers that reach for something below a plate stay on the plate."""
         if not backend.capabilities.physics:
             return
-        height = trifinger.NOMINAL_HEIGHT
-        tips = forward(np.array(trifinger.REST), height).reshape(3, 3)
-        low = inverse((tips - [0.0, 0.0, 0.05]).ravel(), height, np.array(trifinger.REST))
+        height = hardware.NOMINAL_HEIGHT
+        tips = forward(np.array(hardware.REST), height).reshape(3, 3)
+        low = inverse((tips - [0.0, 0.0, 0.05]).ravel(), height, np.array(hardware.REST))
         top = float(tips[:, 2].min()) - 0.02
         plate = named("plate", {"size": [0.4, 0.4, 0.01], "position": [0.0, 0.0, top - 0.005]})
         lowest = []
@@ -84,7 +84,7 @@ class EffectConformance(Suite):
             scene = self.arranged(Structure((), self.preset, obstacles), values)
             joints = self.watched(backend, scene, 0.6, low.joint_positions)[-1, :9]
             lowest.append(forward(joints, height).reshape(3, 3)[:, 2].min())
-        radius = trifinger.COLLISION["tip"].radius
+        radius = hardware.COLLISION["tip"].radius
         assert lowest[0] < top
         assert lowest[1] > top + radius - 3e-3
 
@@ -158,7 +158,7 @@ class EffectConformance(Suite):
             scene.state.joint_velocities[:] = 1.0
             backend.build(scene)
             backend.step(ControlMode.JOINT_TORQUES, np.zeros(9), round(0.1 / self.preset.timestep))
-            moved.append(np.abs(backend.state().joint_positions - trifinger.REST).sum())
+            moved.append(np.abs(backend.state().joint_positions - hardware.REST).sum())
         assert moved[1] < 0.97 * moved[0]
         assert moved[2] < 0.9 * moved[1]
 
@@ -171,7 +171,7 @@ class EffectConformance(Suite):
         reach = np.tile([-1.0, 0.5, 0.9], 3)
         commands = {
             ControlMode.JOINT_TORQUES: reach,
-            ControlMode.JOINT_POSITIONS: trifinger.REST + reach,
+            ControlMode.JOINT_POSITIONS: hardware.REST + reach,
         }
         for mode, command in commands.items():
             backend.build(scene)

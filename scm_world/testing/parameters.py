@@ -6,9 +6,9 @@ import numpy as np
 
 from scm_world.backends.base import Backend
 from scm_world.models.scene import Difference, Scene
-from scm_world.scene import trifinger
-from scm_world.scene.scene import Structure, parameter_keys
-from scm_world.scene.state import PhysicalState
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import Structure, parameter_keys
 from scm_world.testing.scenes import (
     STONE,
     apart_scene,
@@ -191,13 +191,13 @@ class ParameterConformance(Suite):
     def test_inertia_follows_mass_and_size(self, backend: Backend) -> None:
         """A block is a solid body, and the inertia of a link scales with its mass."""
         mass, size = np.array(0.04), np.array([0.03, 0.05, 0.08])
-        link = trifinger.link_name("120", 2)
+        link = hardware.link_name("120", 2)
         changes = {("near", "mass"): mass, ("near", "size"): size, (link, "mass"): np.array(0.3)}
         backend.apply(Difference(parameters={**changes, ("stone", "mass"): mass}))
         squares = size**2
         expected = mass / 12.0 * (squares.sum() - squares)
         np.testing.assert_allclose(backend.inertia("near"), expected, rtol=1e-9)
-        per_mass = np.array(trifinger.INERTIAL[2].per_mass)
+        per_mass = np.array(hardware.INERTIAL[2].per_mass)
         np.testing.assert_allclose(backend.inertia(link), 0.3 * per_mass, rtol=1e-6)
         moments = mass * np.array(STONE.moments)
         np.testing.assert_allclose(backend.inertia("stone"), moments, rtol=1e-9)

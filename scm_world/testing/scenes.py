@@ -14,10 +14,10 @@ from scm_world.backends.base import Backend
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
 from scm_world.models.scene import ControlMode, ParameterKey, Parameters, Scene
-from scm_world.scene import trifinger
-from scm_world.scene.presets import FAST, PRECISE, Preset
-from scm_world.scene.scene import CONTROLLER, Structure, default_scene
-from scm_world.scene.state import PhysicalState
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.presets import FAST, PRECISE, Preset
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import CONTROLLER, Structure, default_scene
 
 SUBSTEPS = 10
 MODES = (ControlMode.JOINT_POSITIONS, ControlMode.JOINT_TORQUES)
@@ -99,7 +99,7 @@ def play(
         The state after each control step, shape (steps, 27 + 13 n).
     """
     generator = np.random.default_rng(seed)
-    center = np.array(trifinger.REST) if mode is ControlMode.JOINT_POSITIONS else np.zeros(9)
+    center = np.array(hardware.REST) if mode is ControlMode.JOINT_POSITIONS else np.zeros(9)
     state = backend.state()
     states = np.empty((steps, state.vector.size))
     for row in states:

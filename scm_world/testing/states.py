@@ -12,7 +12,7 @@ import pytest
 from scm_world.backends.base import Backend, EngineSnapshot
 from scm_world.errors import SnapshotMismatch
 from scm_world.models.scene import ControlMode, Difference, Scene
-from scm_world.scene.scene import Structure, default_scene, parameter_keys
+from scm_world.tasks.trifinger.structure import Structure, default_scene, parameter_keys
 from scm_world.testing.scenes import (
     another,
     changed_states,

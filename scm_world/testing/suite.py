@@ -12,7 +12,7 @@ import pytest
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, EngineSnapshot
 from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene
-from scm_world.scene.presets import FAST, Preset
+from scm_world.tasks.trifinger.presets import FAST, Preset
 from scm_world.testing.scenes import LONG, busy_scene, other_value, play
 
 

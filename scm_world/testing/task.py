@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 
 from scm_world._types import Floats, Value
-from scm_world.entities import SENSOR_NOISE
 from scm_world.errors import Infeasible
 from scm_world.graph import from_json, to_json
-from scm_world.scene import Scene
+from scm_world.models import Scene
 from scm_world.tasks import Timing
 from scm_world.testing.dynamics import SEED, WorldConformance
 from scm_world.testing.values import command, moved, quantities
 from scm_world.variables import Draw, Noise, Variable
 from scm_world.variables.kinds import SpaceName
+from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import World, WorldSnapshot
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")

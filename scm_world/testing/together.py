@@ -14,8 +14,8 @@ from scm_world._types import Floats
 from scm_world.backends.base import Backend, EngineBatch, EngineSnapshot
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode, Difference, Scene
-from scm_world.scene.state import BLOCK_SIZE, PhysicalState
-from scm_world.scene.trifinger import REST
+from scm_world.tasks.trifinger.hardware import REST
+from scm_world.tasks.trifinger.state import BLOCK_SIZE, PhysicalState
 from scm_world.testing.scenes import SUBSTEPS, other_value
 from scm_world.testing.suite import Suite
 

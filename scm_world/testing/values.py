@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from scm_world._types import Floats, Value
-from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import Infeasible, OutOfBounds, SeveralProblems
-from scm_world.scene import trifinger
+from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Box, Categories, Integers, Rotations
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world import Audit, World
 
 
@@ -72,6 +72,6 @@ def command(world: World, generator: np.random.Generator) -> Floats:
         case 0:
             return np.asarray(np.where(generator.random(9) < 0.5, low, high))
         case 1 if world.action_mode == "joint_positions":
-            return np.asarray(np.array(trifinger.REST) + generator.uniform(-0.8, 0.8, 9))
+            return np.asarray(np.array(hardware.REST) + generator.uniform(-0.8, 0.8, 9))
         case _:
             return np.asarray(generator.uniform(low, high))

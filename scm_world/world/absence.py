@@ -6,8 +6,8 @@ from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
-from scm_world.entities import Entity
 from scm_world.errors import InterventionError, UnknownVariable
+from scm_world.tasks.composition import Entity
 from scm_world.variables import Null
 
 

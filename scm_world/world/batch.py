@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
-from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import UnknownOption
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.work.threads import cores
 from scm_world.world.declaration import Declaration
 from scm_world.world.start import whole_number

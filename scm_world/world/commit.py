@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scm_world._types import Floats, Value
-from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, Infeasible, InterventionError
 from scm_world.graph import flatten
 from scm_world.models import Difference, State
-from scm_world.scene.feasibility import TOLERANCE, Overlap, buried_goals
+from scm_world.models.scene import TOLERANCE, Overlap
 from scm_world.variables import Draw, Hard
 from scm_world.variables.checks import coerce
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.compare import same
@@ -146,7 +146,7 @@ def _buried(proposal: Proposal, request: Mapping[str, Any]) -> list[Overlap]:
     targets = [target for name in draws for target in declaration.model.targets(name)]
     moved = {*targets, *declaration.static_order(targets)}
     scene = declaration.describe(proposal.static, proposal.state)
-    return list(buried_goals(scene, {name.partition(".")[0] for name in moved}))
+    return list(declaration.composition.buried(scene, {n.partition(".")[0] for n in moved}))
 
 
 def refuse_overlaps(

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from scm_world._types import Floats, Value, Values
-from scm_world.entities import Composition
 from scm_world.errors import NotReset
 from scm_world.graph import SCM
 from scm_world.models import ParameterKey, Scene, State
 from scm_world.tasks import Conventions, Task
+from scm_world.tasks.composition import Composition
 from scm_world.world.declaration import Declaration, Options
 from scm_world.world.family import Family
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import InterventionError, NotFinite, OutOfBounds, WrongShape
 from scm_world.graph import Moment
 from scm_world.variables import (
@@ -25,6 +24,7 @@ from scm_world.variables import (
     whole_of,
 )
 from scm_world.variables.checks import check_bounds, check_space
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compare import same
 from scm_world.world.following import followed, refuse_continuous, what_follows

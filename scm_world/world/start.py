@@ -12,7 +12,7 @@ from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import Moment
 from scm_world.models import Model, State
-from scm_world.scene.feasibility import TOLERANCE
+from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Measured, Subset
 from scm_world.variables.checks import check_bounds, check_subset

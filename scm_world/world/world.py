@@ -11,13 +11,13 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
 from scm_world.models import Scene, State
-from scm_world.scene.camera import Camera
+from scm_world.models.camera import Camera
 from scm_world.tasks import Task
 from scm_world.variables import Noise
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit
 from scm_world.world.commands import clipped

@@ -18,16 +18,10 @@ from scm_world._types import Floats
 from scm_world.backends.base import Backend
 from scm_world.backends.bullet import BulletBackend
 from scm_world.errors import EngineFailure, SnapshotMismatch
-from scm_world.scene import (
-    ControlMode,
-    Difference,
-    Scene,
-    Structure,
-    default_scene,
-    parameter_keys,
-    trifinger,
-)
-from scm_world.scene.kinematics import inverse
+from scm_world.models import ControlMode, Difference, Scene
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.kinematics import inverse
+from scm_world.tasks.trifinger.structure import Structure, default_scene, parameter_keys
 from scm_world.testing.backend import busy_scene, changed_states, other_value, play
 
 pytestmark = pytest.mark.skipif(
@@ -97,7 +91,7 @@ def reach(radius: float, z: float) -> Floats:
     """Find joint positions that bring all tips to a circle [m]."""
     angles = np.deg2rad([110.0, -10.0, -130.0])  # where the fingers hang
     points = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(3, z)], axis=1)
-    return inverse(points.ravel(), trifinger.NOMINAL_HEIGHT, trifinger.REST).joint_positions
+    return inverse(points.ravel(), hardware.NOMINAL_HEIGHT, hardware.REST).joint_positions
 
 
 TOUCHES = {

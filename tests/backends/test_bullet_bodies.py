@@ -16,17 +16,11 @@ from scm_world.backends.bullet import BulletBackend
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull, box_hull
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
+from scm_world.models import ControlMode, Difference, Scene
 from scm_world.models.scene import ParameterKey
-from scm_world.scene import (
-    ControlMode,
-    Difference,
-    PhysicalState,
-    Scene,
-    Structure,
-    default_scene,
-    parameter_keys,
-    trifinger,
-)
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import Structure, default_scene, parameter_keys
 from scm_world.testing.scenes import busy_scene, named, octahedron, other_value, play
 
 pytestmark = pytest.mark.skipif(
@@ -48,7 +42,7 @@ def backend() -> Iterator[BulletBackend]:
 
 def rest(backend: Backend, substeps: int) -> None:
     """Hold the rest pose."""
-    backend.step(ControlMode.JOINT_POSITIONS, np.array(trifinger.REST), substeps)
+    backend.step(ControlMode.JOINT_POSITIONS, np.array(hardware.REST), substeps)
 
 
 def fresh(scene: Scene, after: Callable[[Backend], Floats]) -> Floats:

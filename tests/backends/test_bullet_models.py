@@ -28,7 +28,7 @@ from scm_world.backends.bullet.model.friction import shares, usual_friction
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models import ControlMode, Difference, Model, Parameter, Scene
-from scm_world.scene import Structure, default_scene
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 from scm_world.testing.backend import busy_scene
 from scm_world.testing.backend import play as play_robot
 

@@ -12,23 +12,18 @@ import numpy as np
 import pytest
 
 from scm_world.backends.bullet import BulletBackend
-from scm_world.backends.bullet.trifinger import arena
-from scm_world.backends.bullet.trifinger.description import PARTS, link_index
-from scm_world.backends.bullet.trifinger.law import compile_law
-from scm_world.backends.bullet.trifinger.passive import MASSES, inverse_dynamics, mass_matrix
 from scm_world.errors import EngineFailure, MissingEngine
 from scm_world.geometry.rotations import rotation_matrix
-from scm_world.scene import (
-    ControllerSpec,
-    ControlMode,
-    Difference,
-    PhysicalState,
-    Structure,
-    default_scene,
-    trifinger,
-)
-from scm_world.scene.kinematics import link_frames
-from scm_world.scene.scene import SPINNING_FRICTION
+from scm_world.models import ControlMode, Difference
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.bullet import arena
+from scm_world.tasks.trifinger.bullet.description import PARTS, link_index
+from scm_world.tasks.trifinger.bullet.law import compile_law
+from scm_world.tasks.trifinger.bullet.passive import MASSES, inverse_dynamics, mass_matrix
+from scm_world.tasks.trifinger.controller import ControllerSpec
+from scm_world.tasks.trifinger.kinematics import link_frames
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import SPINNING_FRICTION, Structure, default_scene
 from scm_world.testing.backend import busy_scene
 
 pytestmark = pytest.mark.skipif(
@@ -74,7 +69,7 @@ def test_links_are_where_kinematics_has_them(backend: BulletBackend) -> None:
     scene.state.joint_positions[:] = np.random.default_rng(0).uniform(-1, 1, 9)
     backend.build(scene)
     engine, client, body = robot(backend)
-    positions, _ = link_frames(scene.state.joint_positions, trifinger.NOMINAL_HEIGHT)
+    positions, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
     per_finger = positions.reshape(3, -1, 3)
     for finger in range(3):
         for link in range(per_finger.shape[1]):
@@ -96,12 +91,12 @@ def test_every_link_has_one_shape_and_its_inertia(backend: BulletBackend) -> Non
             assert len(shapes) == (1 if link else 0)
             info = engine.getDynamicsInfo(body, index, physicsClientId=client)
             if link == 4:
-                np.testing.assert_allclose(info[2], trifinger.TIP_INERTIA, rtol=1e-12)
+                np.testing.assert_allclose(info[2], hardware.TIP_INERTIA, rtol=1e-12)
                 continue
-            inertial = trifinger.INERTIAL[link]
+            inertial = hardware.INERTIAL[link]
             np.testing.assert_allclose(info[3], inertial.center, atol=1e-12)
             np.testing.assert_allclose(info[4], inertial.orientation, atol=1e-12)
-            expected = trifinger.LINK_MASS[link] * np.array(inertial.per_mass)
+            expected = hardware.LINK_MASS[link] * np.array(inertial.per_mass)
             np.testing.assert_allclose(info[2], expected, rtol=1e-12)
 
 
@@ -127,7 +122,7 @@ def test_nothing_slows_a_flying_block(backend: BulletBackend) -> None:
     scene.state.angular_velocities[0] = [0.4, 0.0, 0.0]
     backend.build(scene)
     backend.apply(Difference(parameters={("world", "gravity"): np.zeros(3)}))
-    backend.step(POSITIONS, np.array(trifinger.REST), 100)
+    backend.step(POSITIONS, np.array(hardware.REST), 100)
     after = backend.state()
     np.testing.assert_array_equal(after.linear_velocities, scene.state.linear_velocities)
     np.testing.assert_allclose(after.angular_velocities, scene.state.angular_velocities, atol=1e-14)
@@ -162,7 +157,7 @@ def test_the_dynamics_of_a_finger_are_the_engines(backend: BulletBackend) -> Non
     """Mass matrix and bias in closed form equal those that the engine computes."""
     backend.build(default_scene(Structure()))
     engine, client, body = robot(backend)
-    generator, weights = np.random.default_rng(0), np.array(trifinger.LINK_MASS[1:])
+    generator, weights = np.random.default_rng(0), np.array(hardware.LINK_MASS[1:])
     for _ in range(10):
         angles, speeds = generator.uniform(-1, 1, 9), generator.normal(size=9, scale=5.0)
         matrix = engine.calculateMassMatrix(body, angles.tolist(), physicsClientId=client)
@@ -200,7 +195,7 @@ def test_a_damped_step_is_implicit(backend: BulletBackend) -> None:
     for finger in range(3):
         own = slice(3 * finger, 3 * finger + 3)
         angles, speeds = before.joint_positions[own], before.joint_velocities[own]
-        yaw = trifinger.WORLD_YAW + trifinger.FINGER_YAW[finger]
+        yaw = hardware.WORLD_YAW + hardware.FINGER_YAW[finger]
         pull = rotation_matrix([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]).T @ gravity
         bias = inverse_dynamics(angles, speeds, np.zeros(3), tuple(pull), masses[own])
         inertia = mass_matrix(angles, masses[own]) + h * damping * np.eye(3)

@@ -10,14 +10,16 @@ import pytest
 from scm_world.backends import BACKENDS, EngineSnapshot, make_backend
 from scm_world.backends.mujoco import MujocoBackend
 from scm_world.backends.mujoco.installation import judge
-from scm_world.backends.mujoco.trifinger.model import compiled
 from scm_world.errors import MissingEngine, MixedInstallation, SnapshotMismatch, UnknownOption
 from scm_world.geometry.hulls import hull_of
-from scm_world.scene import ControlMode, Difference, Structure, default_scene, trifinger
-from scm_world.scene.kinematics import forward
+from scm_world.models import ControlMode, Difference
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.kinematics import forward
+from scm_world.tasks.trifinger.mujoco.model import compiled
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 from scm_world.testing.backend import busy_scene, other_value, play
 
-REST = np.array(trifinger.REST)
+REST = np.array(hardware.REST)
 
 
 @pytest.fixture
@@ -191,18 +193,18 @@ def test_fingertips_are_where_kinematics_says(backend: MujocoBackend) -> None:
     for height in (0.3, 0.37):
         backend.apply(Difference(parameters={("robot", "height"): np.array(height)}))
         state = backend.state()
-        state.joint_positions[:] = generator.uniform(trifinger.JOINT_LOW, trifinger.JOINT_HIGH)
+        state.joint_positions[:] = generator.uniform(hardware.JOINT_LOW, hardware.JOINT_HIGH)
         backend.apply(Difference(state=state))
         data = backend.realization.data
         mujoco.mj_kinematics(backend.realization.model, data)
-        tips = [data.body(f"robot_finger_{f}_tip").xpos for f in trifinger.FINGERS]
+        tips = [data.body(f"robot_finger_{f}_tip").xpos for f in hardware.FINGERS]
         expected = forward(state.joint_positions, height)
         np.testing.assert_allclose(np.ravel(tips), np.ravel(expected), rtol=0, atol=1e-12)
 
 
 def test_nothing_intersects_in_the_published_poses() -> None:
     """Neither the rest pose nor the raised pose makes fingers touch."""
-    for pose in (trifinger.REST, trifinger.RAISED):
+    for pose in (hardware.REST, hardware.RAISED):
         scene = default_scene(Structure())
         scene.state.joint_positions[:] = pose
         backend = MujocoBackend()

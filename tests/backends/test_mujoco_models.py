@@ -27,7 +27,7 @@ from scm_world.models import (
     Parameters,
     Scene,
 )
-from scm_world.scene import Structure, default_scene
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 Floats = NDArray[np.float64]
 SUBSTEPS = 3

@@ -22,9 +22,12 @@ from scm_world.backends.renderer import (
     write_png,
 )
 from scm_world.errors import UnknownOption
-from scm_world.scene import Goal, ParameterKey, Scene, Structure, default_scene, trifinger
-from scm_world.scene.camera import CAMERAS, OVERVIEW, Camera
-from scm_world.scene.kinematics import forward, link_frames
+from scm_world.models import Goal, ParameterKey, Scene
+from scm_world.models.camera import Camera
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
+from scm_world.tasks.trifinger.kinematics import forward, link_frames
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 """Below the robot's hub, looking down."""
@@ -104,23 +107,23 @@ def test_turned_block_is_turned_in_the_picture(scene: Scene) -> None:
 
 def test_fingertips_appear_where_kinematics_puts_them(scene: Scene) -> None:
     """Seen from a side, the pixel of every tip shows the lower link of its finger."""
-    tips = forward(scene.state.joint_positions, trifinger.NOMINAL_HEIGHT).reshape(3, 3)
-    for finger, tip in zip(trifinger.FINGERS, tips, strict=True):
+    tips = forward(scene.state.joint_positions, hardware.NOMINAL_HEIGHT).reshape(3, 3)
+    for finger, tip in zip(hardware.FINGERS, tips, strict=True):
         outward = np.array([tip[0], tip[1], 0.0]) / np.hypot(tip[0], tip[1])
         eye = tip + 0.3 * outward + [0.0, 0.0, 0.02]
         camera = Camera("side", tuple(eye.tolist()), tuple(tip.tolist()))
         image = render(scene, camera)
         owner = image.segmentation[pixel(image, camera, tip)]
-        assert image.names[owner] == trifinger.link_name(finger, 3)
+        assert image.names[owner] == hardware.link_name(finger, 3)
 
 
 def test_capsules_follow_their_links(scene: Scene) -> None:
     """The middle of every link's capsule, seen from above the robot, shows a link nearby."""
-    positions, _ = link_frames(scene.state.joint_positions, trifinger.NOMINAL_HEIGHT)
+    positions, _ = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
     knees = positions[3::5]
     camera = replace(TOP, eye=(0.0, 0.0, 1.5), field_of_view=30.0, width=300, height=300)
     image = render(scene, camera)
-    for finger, knee in zip(trifinger.FINGERS, knees, strict=True):
+    for finger, knee in zip(hardware.FINGERS, knees, strict=True):
         name = image.names[image.segmentation[pixel(image, camera, knee)]]
         assert name.startswith(f"robot_finger_{finger}")
 
@@ -136,7 +139,7 @@ def test_higher_robot_is_drawn_higher(scene: Scene) -> None:
     assert top_row(high) < top_row(low) - 10
 
 
-COLORED = ["floor", "stage", "tool_block", *trifinger.LINK_NAMES]
+COLORED = ["floor", "stage", "tool_block", *hardware.LINK_NAMES]
 
 
 @pytest.mark.parametrize("body", COLORED)
@@ -277,7 +280,7 @@ def test_segmentation_names(scene: Scene) -> None:
 
     assert image.names == body_names(scene.structure)
     assert {"floor", "stage", "robot", "tool_block"} <= shown
-    assert {trifinger.link_name(finger, 3) for finger in trifinger.FINGERS} <= shown
+    assert {hardware.link_name(finger, 3) for finger in hardware.FINGERS} <= shown
 
 
 def test_unknown_body_is_refused(scene: Scene) -> None:
@@ -336,8 +339,8 @@ SNIPPET = """
 import hashlib
 from dataclasses import replace
 from scm_world.backends.renderer import render
-from scm_world.scene import Structure, default_scene
-from scm_world.scene.camera import OVERVIEW
+from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.cameras import OVERVIEW
 image = render(default_scene(Structure(blocks=("tool_block",))), OVERVIEW)
 print(hashlib.sha256(image.rgb.tobytes() + image.depth.tobytes()).hexdigest())
 """

@@ -12,9 +12,12 @@ from scm_world.backends.renderer import body_names, render
 from scm_world.backends.renderer.bodies import MOUNT
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.geometry.hulls import Hull, box_hull, hull_of
-from scm_world.scene import Goal, Light, Scene, Structure, default_scene, trifinger
-from scm_world.scene.camera import CAMERAS, OVERVIEW, Camera
-from scm_world.scene.kinematics import link_frames
+from scm_world.models import Goal, Light, Scene
+from scm_world.models.camera import Camera
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
+from scm_world.tasks.trifinger.kinematics import link_frames
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 SMALL = replace(OVERVIEW, width=160, height=120)
@@ -62,7 +65,7 @@ def test_obstacles_are_numbered_behind_the_blocks() -> None:
     image = render(scene, TOP)
     column, row, _ = TOP.project([0.08, 0.0, 0.06])
 
-    expected = ("floor", "stage", "robot", *trifinger.LINK_NAMES, "tool_block", "barrier")
+    expected = ("floor", "stage", "robot", *hardware.LINK_NAMES, "tool_block", "barrier")
     assert body_names(scene.structure) == image.names == expected
     assert image.names[image.segmentation[int(row), int(column)]] == "barrier"
     assert image.shows("tool_block").any()
@@ -256,19 +259,19 @@ def test_fingers_cover_the_pixels_whose_rays_pass_them(camera: Camera) -> None:
     camera = replace(camera, width=80, height=60)
     scene = default_scene(Structure())
     image = render(scene, camera)
-    frames = link_frames(scene.state.joint_positions, trifinger.NOMINAL_HEIGHT)
+    frames = link_frames(scene.state.joint_positions, hardware.NOMINAL_HEIGHT)
     step = 2.0 * np.tan(np.radians(camera.field_of_view) / 2.0) / 60
     v, u = np.mgrid[:60, :80]
     seen = np.stack([(u - 39.5) * step, (29.5 - v) * step, np.full(u.shape, -1.0)], axis=-1)
     rays = (seen / np.linalg.norm(seen, axis=-1, keepdims=True)).reshape(-1, 3) @ camera.axes()
     expected = np.zeros(60 * 80, dtype=bool)
-    capsules = (MOUNT, *trifinger.COLLISION.values()) * 3
+    capsules = (MOUNT, *hardware.COLLISION.values()) * 3
     for position, turn, capsule in zip(*frames, capsules, strict=True):
         along = np.linspace(capsule.start, capsule.end, 80)
         points = along @ rotation_matrix(turn).T + position - camera.eye
         squared = (points**2).sum(axis=1) - (rays @ points.T) ** 2
         expected |= (squared < capsule.radius**2).any(axis=1)
-    robot = sum(image.shows(name) for name in trifinger.LINK_NAMES).astype(bool)
+    robot = sum(image.shows(name) for name in hardware.LINK_NAMES).astype(bool)
     unlike = (robot != expected.reshape(60, 80)) & ~image.shows("robot")
 
     assert robot.sum() > 200

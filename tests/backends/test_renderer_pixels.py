@@ -22,9 +22,11 @@ from scm_world.backends.renderer import (
     resized,
 )
 from scm_world.geometry.hulls import box_hull
-from scm_world.scene import Goal, Light, PhysicalState, Scene, Structure, default_scene
-from scm_world.scene.camera import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
-from scm_world.scene.trifinger import JOINT_LOW
+from scm_world.models import Goal, Light, Scene
+from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
+from scm_world.tasks.trifinger.hardware import JOINT_LOW
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 STRUCTURE = Structure(
     blocks=("tool_block", "stone"),
@@ -263,8 +265,8 @@ def test_scene_is_left_alone(scene: Scene) -> None:
 SNIPPET = """
 import hashlib
 from scm_world.backends.renderer import pixels
-from scm_world.scene import Structure, default_scene
-from scm_world.scene.camera import CAMERAS
+from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.cameras import CAMERAS
 print(hashlib.sha256(pixels(default_scene(Structure(("a", "b"))), CAMERAS).tobytes()).hexdigest())
 """
 

@@ -18,9 +18,9 @@ from scm_world.backends.renderer.shapes import (
 )
 from scm_world.geometry import rotation_matrix
 from scm_world.geometry.hulls import box_hull
+from scm_world.models.camera import Camera
 from scm_world.models.scene import Goal, Light
 from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, corners, mesh_of
-from scm_world.scene.camera import Camera
 
 LIGHT = Light()
 CAMERA = Camera("test", (0.7, -1.1, 0.9), (0.0, 0.0, 0.0), width=160, height=120)

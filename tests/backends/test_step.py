@@ -27,7 +27,7 @@ from scm_world.errors import (
 )
 from scm_world.models.scene import ControlMode, Difference
 from scm_world.models.state import State
-from scm_world.scene.scene import Structure, default_scene
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 CONTROLS = ControlMode.CONTROLS
 DT = 0.05

@@ -10,12 +10,12 @@ import pytest
 from given import BACKENDS, ENGINES, begin
 
 from scm_world.errors import Infeasible, SeveralProblems, UnknownVariable
-from scm_world.scene import trifinger
 from scm_world.tasks import TASKS, General, PickAndPlace, Picking, Pushing, StackedBlocks
+from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Box, Draw
 from scm_world.world import World
 
-REST = np.array(trifinger.REST)
+REST = np.array(hardware.REST)
 TIPS = "end_effector_positions"
 
 

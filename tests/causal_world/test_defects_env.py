@@ -18,7 +18,7 @@ from typer.main import get_command
 from scm_world.backends.renderer import goal_pixels
 from scm_world.cli.app import app
 from scm_world.env import MovingAverageAction, ScmWorldEnv
-from scm_world.scene import trifinger
+from scm_world.tasks.trifinger import hardware
 
 TIME = "time_left_for_task"
 TIPS = "end_effector_positions"
@@ -62,7 +62,7 @@ def test_d06_contacts_are_told_for_every_finger(backend: str) -> None:
     for _ in range(25):
         info = env.step(target)[-1]
     forces = {frozenset(touch["bodies"]): float(touch["force"]) for touch in info["contacts"]}
-    for finger in trifinger.FINGERS:
+    for finger in hardware.FINGERS:
         force = forces[frozenset({"floor", f"robot_finger_{finger}_link_3"})]
         assert 5.0 < force < 9.0  # [N], from 0.36 N m at a leg that is bent
     env.close()

@@ -36,7 +36,8 @@ from scm_world.curricula import (
 )
 from scm_world.env.wrappers import DeltaAction, ObjectSelector
 from scm_world.errors import Infeasible, OutOfSpace, UnknownOption, UnreadableFile
-from scm_world.scene.feasibility import TOLERANCE, overlaps
+from scm_world.models.scene import TOLERANCE
+from scm_world.tasks.trifinger.feasibility import overlaps
 
 MASS, POSITION = "tool_block.mass", "tool_block.cartesian_position"
 

@@ -20,7 +20,8 @@ from scm_world.curricula import (
 from scm_world.curricula.published import ALWAYS
 from scm_world.env import IDS
 from scm_world.errors import UnknownOption
-from scm_world.scene.feasibility import TOLERANCE, overlaps
+from scm_world.models.scene import TOLERANCE
+from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.variables.checks import check_space
 from scm_world.world import World
 

@@ -23,8 +23,9 @@ from scm_world.discovery.learners.nulls import learn_null, null_edges, null_effe
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.queries import At, Episode, World
 from scm_world.queries.local import LocalEpisode, LocalGraph
-from scm_world.queries.local_truth import FINGERS
+from scm_world.tasks.trifinger.hardware import FINGERS as NAMES
 
+FINGERS = tuple(f"robot_finger_{name}" for name in NAMES)
 NEEDS_BULLET = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
 )

@@ -83,7 +83,7 @@ class Tampered:
 
 def tampered_world(monkeypatch: pytest.MonkeyPatch, tamper: Tampered) -> World:
     """Build a pushing world that declares something false about its physics."""
-    from scm_world.entities import BlockWorld
+    from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 
     honest = BlockWorld.variables
     monkeypatch.setattr(BlockWorld, "variables", lambda self: tuple(tamper(honest(self))))

@@ -83,7 +83,7 @@ def test_what_decides_the_structure_is_held_like_any_other() -> None:
 
 def test_a_false_edge_into_a_mechanism_is_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cause that a mechanism ignores is listed as missed, whatever it is set to."""
-    from scm_world.entities import BlockWorld
+    from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 
     honest = BlockWorld.variables
     extra = Parent("floor_friction", 0)

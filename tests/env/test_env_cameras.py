@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world.env import ScmWorldEnv
-from scm_world.scene.camera import CAMERAS
+from scm_world.tasks.trifinger.cameras import CAMERAS
 
 
 def test_pictures_follow_the_variables_of_the_cameras() -> None:

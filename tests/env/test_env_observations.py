@@ -13,7 +13,7 @@ from scm_world.env.bounds import WIDE, bounds
 from scm_world.env.keypoints import corners
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.graph import SCM
-from scm_world.scene.camera import CAMERAS
+from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.variables import Box, Derived, Exogenous, Linear
 from scm_world.variables.spaces import Affine, Switch
 

@@ -10,7 +10,7 @@ from envs import REACHING, make
 
 from scm_world.env import ObjectSelector
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.scene.trifinger import RAISED
+from scm_world.tasks.trifinger.hardware import RAISED
 
 POSITION, TURN = "tool_block.cartesian_position", "tool_block.euler_orientation"
 

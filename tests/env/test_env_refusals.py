@@ -20,8 +20,9 @@ from scm_world.errors import (
     UnknownOption,
     UnknownVariable,
 )
-from scm_world.scene.camera import OVERVIEW, Camera
+from scm_world.models.camera import Camera
 from scm_world.tasks.rewards import term
+from scm_world.tasks.trifinger.cameras import OVERVIEW
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from envs import BACKENDS, REACHING, make
 
 from scm_world.env.window import Window
 from scm_world.errors import EngineError
-from scm_world.scene.camera import CAMERAS
+from scm_world.tasks.trifinger.cameras import CAMERAS
 
 
 @pytest.fixture

@@ -10,8 +10,9 @@ from envs import PUSHING, REACHING, make
 from scm_world import Draw
 from scm_world.env.start import asked
 from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
-from scm_world.scene.feasibility import TOLERANCE, overlaps
+from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing
+from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.world import World
 from scm_world.world.requests import merged
 

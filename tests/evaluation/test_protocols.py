@@ -20,8 +20,8 @@ from scm_world.evaluation.arena import Arena, Row, _drawn
 from scm_world.evaluation.benchmark import REACHING as REACHING_ROW
 from scm_world.evaluation.benchmark import ROLES, ROWS
 from scm_world.evaluation.policies import as_player
-from scm_world.scene.feasibility import overlaps
 from scm_world.tasks import TASKS
+from scm_world.tasks.trifinger.feasibility import overlaps
 
 TWELVE = [f"P{k}" for k in range(12)]
 CONVENTIONS = ("causal_world", "scm_world")

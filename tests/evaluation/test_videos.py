@@ -18,7 +18,7 @@ from scm_world.evaluation.outputs.videos import captioned, choose
 from scm_world.evaluation.pipeline import Bench, played
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, prepare
-from scm_world.scene.camera import OVERVIEW
+from scm_world.tasks.trifinger.cameras import OVERVIEW
 
 SMALL = replace(OVERVIEW, width=321, height=120)
 STEPS = 7

@@ -34,8 +34,9 @@ from scm_world.backends.renderer import (
 )
 from scm_world.errors import EngineError, ModelError, UnknownOption
 from scm_world.models import Goal, Model, Scene
-from scm_world.scene import Structure, default_scene
-from scm_world.scene.camera import CAMERAS, OVERVIEW, Camera
+from scm_world.models.camera import Camera
+from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 XML = """
 <mujoco model="everything">

@@ -8,17 +8,11 @@ import pytest
 from numpy.typing import ArrayLike
 
 from scm_world.backends import Backend, make_backend
-from scm_world.scene import (
-    FAST,
-    PRECISE,
-    ControlMode,
-    Difference,
-    PhysicalState,
-    Preset,
-    Structure,
-    default_scene,
-    trifinger,
-)
+from scm_world.models import ControlMode, Difference
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.presets import FAST, PRECISE, Preset
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 ENGINES = [
     name
@@ -40,7 +34,7 @@ class Lab:
         parameters: Mapping[tuple[str, str], ArrayLike],
         *,
         velocities: ArrayLike = 0.0,
-        joints: ArrayLike = trifinger.REST,
+        joints: ArrayLike = hardware.REST,
         height: float = 1.5,
     ) -> None:
         """Build a scene with blocks ``block_0``, ``block_1``, … at positions (n, 3) [m]."""

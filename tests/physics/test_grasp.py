@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scm_world.scene import ControlMode, trifinger
-from scm_world.scene.kinematics import forward, inverse
+from scm_world.models import ControlMode
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.kinematics import forward, inverse
 
-TIP_RADIUS = trifinger.COLLISION["tip"].radius
-HEIGHT = trifinger.NOMINAL_HEIGHT
+TIP_RADIUS = hardware.COLLISION["tip"].radius
+HEIGHT = hardware.NOMINAL_HEIGHT
 PERIOD = 0.02  # [s] between two commands
 
 
@@ -34,7 +35,7 @@ def lift(size: float) -> Iterator[tuple[float, NDArray[np.float64], NDArray[np.f
 @pytest.mark.parametrize(("size", "mass", "friction"), [(0.065, 0.02, 0.8), (0.055, 0.04, 0.9)])
 def test_lift(lab, size: float, mass: float, friction: float) -> None:
     """A squeezed block goes up by 0.1 m and slips by less than 0.5 mm/s while it is held."""
-    joints = inverse(around(size, (0.03,) * 3, 0.12), HEIGHT, trifinger.REST).joint_positions
+    joints = inverse(around(size, (0.03,) * 3, 0.12), HEIGHT, hardware.REST).joint_positions
     parameters = {
         ("block_0", "size"): [size] * 3,
         ("block_0", "mass"): mass,
@@ -57,6 +58,6 @@ def test_lift(lab, size: float, mass: float, friction: float) -> None:
             offsets.append(state.positions[0] - tips.mean(axis=0))
     assert state.positions[0, 2] - size / 2 == pytest.approx(0.1, abs=0.01)
     touching = {body for contact in lab.backend.contacts() for body in contact.bodies}
-    assert touching == {"block_0", *(trifinger.link_name(f, 3) for f in trifinger.FINGERS)}
+    assert touching == {"block_0", *(hardware.link_name(f, 3) for f in hardware.FINGERS)}
     slip = np.linalg.norm(offsets[-1] - offsets[-26]) / (25 * PERIOD)
     assert slip < 5e-4

@@ -11,13 +11,13 @@ import pytest
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.geometry import from_rotation_vector
 from scm_world.queries import World
-from scm_world.queries.grasping import Grasp, Pace
-from scm_world.queries.grasping.bodies import Body, body_of, smallest, turns
-from scm_world.queries.grasping.grips import grips
-from scm_world.queries.grasping.hand import Hand
 from scm_world.queries.policies import as_policy
-from scm_world.scene import trifinger
 from scm_world.tasks import Picking
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.grasping import Grasp, Pace
+from scm_world.tasks.trifinger.grasping.bodies import Body, body_of, smallest, turns
+from scm_world.tasks.trifinger.grasping.grips import grips
+from scm_world.tasks.trifinger.grasping.hand import Hand
 
 MODE = "end_effector_positions"
 ENGINES = [
@@ -156,7 +156,7 @@ def test_fingertips_come_where_they_are_told() -> None:
     """With what carries them, and nothing to press, they hang within 0.3 mm."""
     world = world_of("picking", "mujoco", "joint_positions")
     hand = Hand(world.evaluate(()), world.control_period)
-    joints = np.array(trifinger.REST) + 0.1
+    joints = np.array(hardware.REST) + 0.1
     tips = hand.tips(joints)
     for _ in range(60):
         world.step(hand.command(tips, np.zeros((3, 3)), world["joint_positions"]))
@@ -166,7 +166,7 @@ def test_fingertips_come_where_they_are_told() -> None:
 def test_strength_ends_where_a_joint_does_all_it_can() -> None:
     """Forces of that strength need the largest torque at one joint, and more at none."""
     hand = Hand(world_of("picking", "fake").evaluate(()), 0.04)
-    joints, forces = np.array(trifinger.REST), np.eye(3)
+    joints, forces = np.array(hardware.REST), np.eye(3)
     strength = hand.strength(joints, forces)
     torques = hand.carrying(joints) + strength * hand.pressing(joints, forces)
     assert np.abs(torques).max() == pytest.approx(0.97 * 0.36)

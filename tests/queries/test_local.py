@@ -26,17 +26,19 @@ from scm_world.queries.local import (
     paired_truth,
 )
 from scm_world.queries.local_graphs import islands, reached
-from scm_world.queries.local_truth import FINGERS, Listener, listening
-from scm_world.scene import trifinger
-from scm_world.scene.kinematics import inverse
+from scm_world.queries.local_truth import Listener, listening
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.hardware import FINGERS as NAMES
+from scm_world.tasks.trifinger.kinematics import inverse
 from scm_world.world import World
 
+FINGERS = tuple(f"robot_finger_{name}" for name in NAMES)
 NEEDS_BULLET = pytest.mark.skipif(
     importlib.util.find_spec("pybullet") is None, reason="needs pybullet"
 )
 ENGINES = ["mujoco", pytest.param("bullet", marks=NEEDS_BULLET)]
 FINGER, ONE, TWO = FINGERS[0], "tool_block_1", "tool_block_2"
-TIP = trifinger.COLLISION["tip"].radius  # [m]
+TIP = hardware.COLLISION["tip"].radius  # [m]
 HALF = 0.0325  # [m] of a block's edge
 
 _WORLDS: dict[str, World] = {}
@@ -59,7 +61,7 @@ def place(world: World, tip: np.ndarray, one: list[float], two: list[float]) -> 
     """
     tips = world["end_effector_positions"].reshape(3, 3).copy()
     tips[0] = tip
-    joints = inverse(tips.ravel(), float(world["robot_height"]), np.array(trifinger.REST))
+    joints = inverse(tips.ravel(), float(world["robot_height"]), np.array(hardware.REST))
     world.do(
         {
             "joint_positions": joints.joint_positions,

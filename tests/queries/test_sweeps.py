@@ -13,9 +13,10 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
 from scm_world.queries import World, nature_graph
-from scm_world.queries.policies import NAMED, Sweep, as_policy
-from scm_world.scene import trifinger
-from scm_world.scene.kinematics import forward
+from scm_world.queries.policies import NAMED, as_policy
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.kinematics import forward
+from scm_world.tasks.trifinger.policies import Sweep
 from scm_world.variables import Box, Draw, Exogenous, Measured, Mechanism, Parent
 
 MODES = ("joint_positions", "end_effector_positions")
@@ -41,7 +42,7 @@ def tips(policy: str, mode: str, **do: Any) -> Floats:
     world = World("pushing", backend="mujoco", action_mode=mode)
     beside = {PLACE: [0.0, 0.13, 0.0325], **do}
     episode = world.rollout(policy, steps=24, do=beside, record=["joint_positions"])
-    return forward(episode["joint_positions"][-1], trifinger.NOMINAL_HEIGHT).reshape(3, 3)
+    return forward(episode["joint_positions"][-1], hardware.NOMINAL_HEIGHT).reshape(3, 3)
 
 
 # --- sweeps ---------------------------------------------------------------------------------------
@@ -51,7 +52,7 @@ def test_a_sweep_is_told_in_joints_or_in_fingertips() -> None:
     """Both action modes mean the same places; the end of the way across is hardly in reach."""
     for policy, near in (("sweep", 1e-4), ("across", 0.006)):
         joints, places = (way(policy, mode) for mode in MODES)
-        reached = np.array([forward(one, trifinger.NOMINAL_HEIGHT).ravel() for one in joints])
+        reached = np.array([forward(one, hardware.NOMINAL_HEIGHT).ravel() for one in joints])
         np.testing.assert_allclose(reached, places, atol=near)
 
 
@@ -68,7 +69,7 @@ def test_a_sweep_goes_to_the_middle() -> None:
 def test_one_finger_goes_across() -> None:
     """The first fingertip ends on the other side, and the others stay where they are."""
     places = way("across", MODES[1]).reshape(-1, 3, 3)
-    rest = forward(np.array(trifinger.REST), trifinger.NOMINAL_HEIGHT).reshape(3, 3)
+    rest = forward(np.array(hardware.REST), hardware.NOMINAL_HEIGHT).reshape(3, 3)
     start = rest[0, :2] / np.hypot(*rest[0, :2])
     np.testing.assert_allclose(places[-1, 0, :2] @ start, -0.11, atol=1e-9)
     np.testing.assert_allclose(places[:, 1:], np.broadcast_to(rest[1:], (20, 2, 3)))

@@ -16,12 +16,12 @@ from scm_world.cli import app
 from scm_world.cli.tasks import build
 from scm_world.cli.verification import SMALL
 from scm_world.discovery.coverage import draw_verification
-from scm_world.entities import BlockWorld
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.agreement import Agreement, Sign
 from scm_world.queries.verification import Verification
 from scm_world.queries.verify import verify, verify_engines
 from scm_world.tasks import TASKS
+from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 from scm_world.variables import Parent
 from scm_world.variables.kinds import Variable
 from scm_world.world import World

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from scm_world._types import Floats
-from scm_world.scene.feasibility import overlaps
 from scm_world.tasks import General
-from scm_world.tasks.piles import MOST, pile
+from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.piles import MOST, pile
 from scm_world.variables import Draw
 from scm_world.world import World
 

@@ -20,8 +20,8 @@ from published import (
 
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
-from scm_world.scene import trifinger
 from scm_world.tasks import PickAndPlace
+from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Draw
 from scm_world.world import World
 
@@ -113,7 +113,7 @@ def test_the_side_decides_where_both_are() -> None:
 @pytest.mark.parametrize("space", ["A", "B"])
 def test_the_wall_is_always_between_block_and_goal(space: Any) -> None:
     """Wherever block and goal are drawn from, and in whichever coordinates."""
-    world, sides, drawn = crossing(joint_positions=trifinger.RAISED), set(), 0
+    world, sides, drawn = crossing(joint_positions=hardware.RAISED), set(), 0
     for _ in range(30):
         goal = world.task.sample_goal(space)
         world.reset(do=goal)

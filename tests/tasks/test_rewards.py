@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from scm_world.errors import UnknownOption
-from scm_world.scene import trifinger
-from scm_world.scene.kinematics import forward
-from scm_world.tasks import CONVENTIONS, Pushing, Reaching, conventions, kernels, make_task
+from scm_world.tasks import CONVENTIONS, Pushing, Reaching, conventions, make_task
+from scm_world.tasks.trifinger import hardware, kernels
+from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.variables import Shift
 from scm_world.world import World
 
-REST = np.array(trifinger.REST)
+REST = np.array(hardware.REST)
 TIPS = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.2, 0.3, 0.4, 0.0])
 
 
@@ -22,7 +22,7 @@ def pushing(convention: str = "scm_world", **options: Any) -> World:
     """Give a pushing world without physics, with the fingers out of the way."""
     world = World(Pushing(**options), backend="fake", conventions=convention)
     world.reset(seed=0)
-    world.do({"joint_positions": trifinger.RAISED})
+    world.do({"joint_positions": hardware.RAISED})
     return world
 
 
@@ -116,8 +116,8 @@ def test_pushing_rewards_what_one_step_changed() -> None:
     world = pushing()
     position = np.array([0.0, -0.05, 0.0325])
     world.do({"tool_block": {"cartesian_position": position, "linear_velocity": [0.0, 0.2, 0.0]}})
-    tips = forward(np.array(trifinger.RAISED), 0.34).reshape(3, 3)
-    world.step(trifinger.RAISED)
+    tips = forward(np.array(hardware.RAISED), 0.34).reshape(3, 3)
+    world.step(hardware.RAISED)
     moved = position + np.array([0.0, 0.2 * 0.04, 0.0])
     values = world.values()
     before, after = (np.linalg.norm(tips - p) for p in (position, moved))
@@ -131,9 +131,9 @@ def test_pushing_rewards_what_one_step_changed() -> None:
 def test_turning_the_goal_away_is_no_reward() -> None:
     """A goal that do moves changes what is left to do, not what was earned."""
     world = pushing()
-    world.step(trifinger.RAISED)
+    world.step(hardware.RAISED)
     world.do({"goal_block.polar": [0.1, 0.0], "goal_block.euler_orientation": [0.0, 0.0, 1.0]})
-    world.step(trifinger.RAISED)
+    world.step(hardware.RAISED)
     assert world["reward"] == pytest.approx(world["fractional_success"], abs=1e-9)
 
 
@@ -181,7 +181,7 @@ def test_reaching_rewards_tips_that_come_nearer() -> None:
 )
 def test_reaching_succeeds_within_a_centimeter(error: float, fraction: float, success: int) -> None:
     """The fraction falls from one at a centimeter to zero at three."""
-    from scm_world.tasks.reaching import FAR, REACHED, nearness, within
+    from scm_world.tasks.trifinger.reaching import FAR, REACHED, nearness, within
 
     measured = np.array(error)
     found = nearness(measured, reached=np.array(REACHED), far=np.array(FAR))
@@ -203,7 +203,7 @@ def test_weights_can_be_chosen() -> None:
     world = pushing(weights={"reward.orientation": 0.0, "fractional_success": 3.0})
     assert "reward.orientation" not in world.model.parents("reward")
     place(world, (0.0, 0.0, 0.0))
-    world.step(trifinger.RAISED)
+    world.step(hardware.RAISED)
     assert world["reward.orientation"] == 0.0
     assert world["reward"] == pytest.approx(3.0 + 750.0 * world["reward.tips_to_block"])
 

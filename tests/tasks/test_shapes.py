@@ -15,8 +15,8 @@ from scm_world.geometry import (
     rotation_matrix,
 )
 from scm_world.geometry.hulls import Hull, box_hull, hull_of
-from scm_world.scene import trifinger
 from scm_world.tasks import PickAndPlace, Picking, Pushing
+from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Draw
 from scm_world.world import World
 
@@ -120,13 +120,13 @@ def test_a_shape_has_no_size_to_set() -> None:
 @pytest.mark.parametrize("backend", ["mujoco", "bullet"])
 def test_a_wedge_that_was_drawn_on_its_side_stays_there(backend: str) -> None:
     """It begins the way its points were given, rests, and can be where the goal is."""
-    world = world_of(Pushing, backend, shape=wedge(), joint_positions=trifinger.RAISED)
+    world = world_of(Pushing, backend, shape=wedge(), joint_positions=hardware.RAISED)
     start = world["tool_block.orientation"]
     for _ in range(25):
-        world.step(trifinger.RAISED)
+        world.step(hardware.RAISED)
     np.testing.assert_allclose(world["tool_block.orientation"], start, atol=5e-3)
     world.do(world.task.solution(world.values()))
     for _ in range(25):
-        world.step(trifinger.RAISED)
+        world.step(hardware.RAISED)
     assert float(world["fractional_success"]) > 0.95
     world.close()

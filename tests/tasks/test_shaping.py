@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 import scm_world  # noqa: F401 # registers the environments
 from scm_world.errors import UnknownOption
 from scm_world.geometry import from_rotation_vector, rotation_matrix
-from scm_world.tasks import TASKS, shaping
+from scm_world.tasks import TASKS
+from scm_world.tasks.trifinger import shaping
 
 SIZE = np.array([0.065, 0.05, 0.08])
 GOAL = np.array([0.05, -0.02, 0.0325])

@@ -9,8 +9,8 @@ import pytest
 
 from scm_world.errors import Infeasible, InterventionError, ModelError, UnknownOption
 from scm_world.geometry import rotation_matrix
-from scm_world.scene.feasibility import buried_goals
 from scm_world.tasks import TASKS, term
+from scm_world.tasks.trifinger.feasibility import buried_goals
 from scm_world.variables import Box, Draw, Function, Measured
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import World

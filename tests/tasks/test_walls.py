@@ -7,10 +7,10 @@ import pytest
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.scene.feasibility import overlaps
 from scm_world.tasks import CreativeStackedBlocks, StackedBlocks
-from scm_world.tasks.layouts import MAX_LEVELS, SHAPE, layout
-from scm_world.tasks.walls import Walls
+from scm_world.tasks.trifinger.feasibility import overlaps
+from scm_world.tasks.trifinger.layouts import MAX_LEVELS, SHAPE, layout
+from scm_world.tasks.trifinger.walls import Walls
 from scm_world.variables import Draw
 from scm_world.world import World
 

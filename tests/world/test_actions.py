@@ -16,8 +16,8 @@ from scm_world.errors import (
     UnknownVariable,
     WrongType,
 )
-from scm_world.scene.kinematics import forward
 from scm_world.tasks import Pushing
+from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.variables import Box, Draw, Hard, Scale, Shift
 from scm_world.world import World
 

@@ -30,7 +30,7 @@ from scm_world.errors import (
     WrongShape,
     WrongType,
 )
-from scm_world.scene import diff
+from scm_world.models import diff
 from scm_world.variables import Draw, Normal, Scale, Shift
 from scm_world.world.commit import difference
 from scm_world.world.proposal import propose

@@ -12,7 +12,8 @@ from worlds import actions, play, same
 from scm_world._types import Floats
 from scm_world.backends.fake import FakeBackend
 from scm_world.errors import EngineError, EngineFailure
-from scm_world.scene import ControlMode, Difference, ParameterKey, Parameters, PhysicalState
+from scm_world.models import ControlMode, Difference, ParameterKey, Parameters
+from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.world import World
 
 

@@ -20,7 +20,6 @@ from worlds import (
     shared,
 )
 
-from scm_world.entities.base import lowest_point
 from scm_world.errors import (
     Infeasible,
     OutOfBounds,
@@ -28,7 +27,8 @@ from scm_world.errors import (
 )
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.rotations import from_rotation_vector
-from scm_world.scene import trifinger
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.variables import Affine, Box, Draw, Scale, Shift
 from scm_world.world import World
 
@@ -181,7 +181,7 @@ def test_a_draw_lies_in_its_space(space: Any) -> None:
     world.reset(seed=1)
     for episode in range(20):
         world.reset(seed=episode)
-        world.do({"joint_positions": trifinger.RAISED})
+        world.do({"joint_positions": hardware.RAISED})
         try:
             world.do({"tool_block.cylindrical_position": Draw(space)}, space=space)
         except Infeasible:  # a finger is in the way

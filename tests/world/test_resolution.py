@@ -17,7 +17,6 @@ from worlds import NEEDS_BULLET, REST, actions
 from scm_world import discover
 from scm_world.curricula.targets import GROUPS, matching, settable
 from scm_world.discovery.problems import TaskView, problem
-from scm_world.entities import RESOLUTIONS
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ConflictingTargets,
@@ -26,8 +25,9 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.queries import World
-from scm_world.scene import trifinger
 from scm_world.tasks import TASKS, make_task
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.entities.robot import RESOLUTIONS
 from scm_world.variables import Box, Draw, Mechanism, Natural, Parent, Scale, Shift
 from scm_world.world.batch import Batch
 
@@ -110,7 +110,7 @@ def test_the_parts_are_those_of_the_whole() -> None:
         world.reset(seed=0, do={"joint_positions": REST + 0.01 * np.arange(9.0)})
         world.step(REST)
     finger, joint = worlds.values()
-    for index, name in enumerate(trifinger.FINGERS):
+    for index, name in enumerate(hardware.FINGERS):
         three = slice(3 * index, 3 * index + 3)
         one = f"finger_{name}_joint_2"
         for vector, single in (("positions", "position"), ("velocities", "velocity")):
@@ -316,7 +316,7 @@ def test_fingers_that_do_not_touch_leave_each_other_alone(backend: str, mode: st
         world.do({name: Shift(0.01)})
         world.step(action)
         after = world.values()
-        for finger in trifinger.FINGERS:
+        for finger in hardware.FINGERS:
             moved = not np.array_equal(
                 after[f"finger_{finger}.joint_velocities"],
                 rest[f"finger_{finger}.joint_velocities"],
@@ -331,7 +331,7 @@ def test_the_graph_says_so(resolution: str) -> None:
     fingers = {
         name: finger
         for name in world.model
-        for finger in trifinger.FINGERS
+        for finger in hardware.FINGERS
         if f"finger_{finger}" in name
     }
     across = [

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.scene import trifinger
+from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Categories, Draw, Integers, Scale, Shift
 from scm_world.world import World
 
@@ -29,7 +29,7 @@ PUSHING = [
 ]
 PHYSICS = [p for p in PUSHING if p.id != "fake"]
 
-REST = np.array(trifinger.REST)
+REST = np.array(hardware.REST)
 
 _WORLDS: dict[tuple[str, str], World] = {}
 

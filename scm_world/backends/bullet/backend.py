@@ -17,9 +17,8 @@ from scm_world.backends.bullet.engine import load, version
 from scm_world.backends.bullet.history import History, Record, SavedState, relive
 from scm_world.backends.bullet.model.client import ModelClient
 from scm_world.backends.bullet.model.support import supports
-from scm_world.backends.bullet.trifinger.client import TriFingerClient
 from scm_world.backends.bullet.values import Instant, Values
-from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
+from scm_world.errors import EngineFailure, ModelError, SnapshotMismatch, UnknownOption
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
@@ -37,7 +36,7 @@ LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper
 
 @final
 class BulletBackend(Backend):
-    """Bullet, through pybullet: the TriFinger, and what it can honour of a ``Model``.
+    """Bullet, through pybullet: what it can honour of a ``Model``, and custom realisations.
 
     The engine cannot set a state exactly, because contact caches survive. So a state is set by
     bringing about a *canonical* world, which is a function of parameters and state alone. It is
@@ -83,7 +82,11 @@ class BulletBackend(Backend):
     @staticmethod
     def _kind(structure: Structure) -> type[Client]:
         """Give the class of the clients that realise a structure."""
-        return ModelClient if isinstance(structure, Model) else TriFingerClient
+        kind: type[Client] = structure.realization("bullet") or ModelClient
+        if kind is ModelClient and not isinstance(structure, Model):
+            name = type(structure).__name__
+            raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
+        return kind
 
     def _lived(self) -> History:
         if self._history is None:
@@ -234,8 +237,6 @@ class BulletBackend(Backend):
 
     def inertia(self, body: str) -> Floats:
         """Read the principal moments of inertia of a body, shape (3,) [kg m²].
-
-        The TriFinger's fingertip is a link of its own in this engine, and no part of link 3.
 
         Raises:
             UnknownOption: There is no such body.

@@ -20,8 +20,7 @@ from scm_world.backends.mujoco.articulated import Articulated
 from scm_world.backends.mujoco.batch import MujocoBatch, Seat
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import Realization
-from scm_world.backends.mujoco.trifinger.realization import TriFinger
-from scm_world.errors import EngineFailure, SnapshotMismatch
+from scm_world.errors import EngineFailure, ModelError, SnapshotMismatch
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
@@ -58,9 +57,15 @@ class Payload:
 
 
 def realize(structure: Any, parameters: Parameters) -> Realization:
-    """Compile a structure, and write all parameters."""
-    fresh: Realization
-    fresh = Articulated(structure) if isinstance(structure, Model) else TriFinger(structure)
+    """Compile a structure, and write all parameters.
+
+    Raises:
+        ModelError: It is nothing that MuJoCo can realise.
+    """
+    kind = structure.realization("mujoco") or Articulated
+    if kind is Articulated and not isinstance(structure, Model):
+        raise ModelError([f"MuJoCo cannot realise a {type(structure).__name__}; it takes models"])
+    fresh: Realization = kind(structure)
     fresh.edit(parameters)
     return fresh
 

@@ -19,9 +19,9 @@ from scm_world._types import Floats
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.backends.mujoco.reading import body_names
 from scm_world.geometry import rotation_matrix
+from scm_world.models.camera import Camera
 from scm_world.models.scene import Goal, Scene
 from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, mesh_of
-from scm_world.scene.camera import Camera
 
 MOST_SHAPES = 10_000
 MOST_STAGES = 4  # models that are kept compiled, in each thread

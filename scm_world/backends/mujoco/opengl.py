@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.backends.mujoco.drawing import Drawing, draw_goals, drawn
+from scm_world.models.camera import Camera
 from scm_world.models.scene import Light, Scene
-from scm_world.scene.camera import Camera
 
 LIBRARIES = ("egl", "osmesa")
 """What OpenGL can draw with where there is no screen."""

@@ -1,7 +1,7 @@
 """A structure as MuJoCo realizes it: one class for each kind of structure.
 
-``Realization`` holds a compiled model with its parameters and its state. ``articulated`` has the
-one of any ``Model``, ``trifinger.realization`` that of the TriFinger.
+``Realization`` holds a compiled model with its parameters and its state. ``articulated`` has
+the one of any ``Model``; a structure can bring its own (``Structure.realization``).
 """
 
 from __future__ import annotations

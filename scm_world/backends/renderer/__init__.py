@@ -1,6 +1,7 @@
 """A software renderer: the same picture for every engine, without a screen and without OpenGL."""
 
-from scm_world.backends.renderer.bodies import FLOOR, NOTHING, STAGE, body_names
+from scm_world.backends.renderer.bodies import NOTHING
+from scm_world.backends.renderer.drawing import Drawing, body_names, drawing_of
 from scm_world.backends.renderer.picture import (
     RENDERERS,
     RenderedImage,
@@ -24,17 +25,17 @@ from scm_world.backends.renderer.pixels import (
 )
 
 __all__ = [
-    "FLOOR",
     "NOTHING",
     "ORIGINAL",
     "PLAIN",
     "RENDERERS",
-    "STAGE",
     "Convention",
+    "Drawing",
     "RenderedImage",
     "automatic_camera",
     "body_names",
     "depth_and_segmentation",
+    "drawing_of",
     "following_camera",
     "goal_pixels",
     "now_pixels",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import final
@@ -10,36 +10,15 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.backends.renderer.arena import (
-    lamp,
-    paint_arena,
-    palette,
-    shadow_map,
-    trace_arena,
-)
-from scm_world.backends.renderer.bodies import (
-    Bodies,
-    body_names,
-    goal_bodies,
-    model_camera,
-    model_shapes,
-    solid_bodies,
-)
-from scm_world.backends.renderer.kernels import Canvas, draw
-from scm_world.backends.renderer.shapes import (
-    AUTOMATIC,
-    GOAL_OPACITY,
-    SKY,
-    draw_shapes,
-    following,
-    framing,
-    goal_shapes,
-)
-from scm_world.backends.renderer.views import camera_view
+from scm_world.backends.renderer.bodies import model_camera, model_shapes
+from scm_world.backends.renderer.drawing import drawing_of
+from scm_world.backends.renderer.shapes import AUTOMATIC, SKY, following, framing
 from scm_world.errors import EngineError, UnknownOption
+from scm_world.models.camera import Camera
+from scm_world.models.model import Model
 from scm_world.models.scene import Scene
-from scm_world.scene.camera import CAMERAS, OVERVIEW, Camera
-from scm_world.scene.scene import Structure
+
+USUAL_SIZE = 480, 640  # [pixels] height and width of a picture for people
 
 RENDERERS = ("software", "mujoco")
 
@@ -55,8 +34,7 @@ class RenderedImage:
         segmentation: Which body a pixel shows, shape (h, w): an index into ``names``, or -1 where
             there is nothing. Goals are no bodies: they color pixels, but have neither depth nor
             number.
-        names: Of the bodies; of the TriFinger ``"floor"``, ``"stage"``, ``"robot"`` (its hub), the
-            links, the blocks and the obstacles.
+        names: Of the bodies.
     """
 
     rgb: NDArray[np.uint8]
@@ -79,8 +57,7 @@ class RenderedImage:
 def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
     """Take a picture of a scene with the software renderer; ``picture`` can do with less.
 
-    The wall of the ring is seen from within only, so that a camera outside looks through it. A
-    camera inside a body sees its inside. Light comes from one direction, that of the scene;
+    A camera inside a body sees its inside. Light comes from one direction, that of the scene;
     shadows fall on floors only.
 
     Args:
@@ -95,8 +72,8 @@ def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
         ModelError: The structure says nothing about shapes.
 
     Example:
-        >>> from scm_world.scene import Structure, default_scene
-        >>> from scm_world.scene.camera import OVERVIEW
+        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
+        >>> from scm_world.tasks.trifinger.cameras import OVERVIEW
         >>> picture = render(default_scene(Structure(blocks=("tool_block",))), OVERVIEW)
         >>> picture.rgb.shape, bool(picture.shows("tool_block").any())
         ((480, 640, 3), True)
@@ -110,11 +87,13 @@ def render_views(
     """Take pictures of a scene with several cameras; see ``render``."""
     if samples < 1:
         raise ValueError(f"samples: expected a positive number, got {samples}")
-    draw_once, names = _painter(scene)
+    drawing = drawing_of(scene.structure)
+    content, names = drawing.content(scene, shadows=True), drawing.names(scene.structure)
     pictures = []
     for camera in cameras:
-        canvas = draw_once(camera, 1)
-        rgb = canvas.rgb if samples == 1 else draw_once(camera, samples).rgb
+        canvas = drawing.draw(scene, content, camera)
+        fine = canvas if samples == 1 else drawing.draw(scene, content, camera, samples=samples)
+        rgb = fine.rgb
         shown = _average(np.ascontiguousarray(rgb.transpose(1, 2, 0)), samples)
         pictures.append(RenderedImage(shown, canvas.depth, canvas.owners, names))
     return tuple(pictures)
@@ -150,13 +129,13 @@ def picture(
         ValueError: ``samples`` is not positive, or the camera has no optical axis.
 
     Example:
-        >>> from scm_world.scene import Structure, default_scene
+        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
         >>> picture(default_scene(Structure()), size=(60, 80)).shape
         (60, 80, 3)
     """
     if samples < 1:
         raise ValueError(f"samples: expected a positive number, got {samples}")
-    modeled = not isinstance(scene.structure, Structure)
+    modeled = isinstance(scene.structure, Model)
     known = RENDERERS if modeled else RENDERERS[:1]
     if renderer not in (None, *known):
         raise UnknownOption("renderer", renderer, known)
@@ -187,7 +166,7 @@ def scene_camera(
 
     Args:
         scene: What is to be seen.
-        camera: Any camera, or the name of one: of the TriFinger ``"overview"``, ``"60"``,
+        camera: Any camera, or the name of one: of the robot's tasks ``"overview"``, ``"60"``,
             ``"120"`` or ``"300"``; of a model one that its file names, where it stands now, or
             ``"automatic"``: see ``automatic_camera``. If not given, ``"overview"`` or
             ``"automatic"``.
@@ -198,14 +177,15 @@ def scene_camera(
         UnknownOption: There is no such camera.
         ModelError: The structure says nothing about shapes.
     """
-    height, width = size or (OVERVIEW.height, OVERVIEW.width)
+    height, width = size or USUAL_SIZE
     if isinstance(camera, Camera):
         return camera if size is None else replace(camera, height=height, width=width)
-    if isinstance(scene.structure, Structure):
-        known = {one.name: one for one in (OVERVIEW, *CAMERAS)}
+    drawing = drawing_of(scene.structure)
+    if drawing.overview is not None:
+        known = {one.name: one for one in (drawing.overview, *drawing.cameras)}
         if camera not in (None, *known):
             raise UnknownOption("camera", camera, known)
-        return replace(known[camera or OVERVIEW.name], height=height, width=width)
+        return replace(known[camera or drawing.overview.name], height=height, width=width)
     if camera in (None, AUTOMATIC):
         return automatic_camera(scene, size=(height, width))
     return model_camera(scene, str(camera), (height, width))
@@ -248,33 +228,6 @@ def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:
     from matplotlib.image import imsave
 
     imsave(path, rgb, format="png")
-
-
-def _painter(scene: Scene) -> tuple[Callable[[Camera, int], Canvas], tuple[str, ...]]:
-    """Give what draws a scene for a camera and a number of samples, and the names of bodies."""
-    if not isinstance(scene.structure, Structure):
-        shapes, names = model_shapes(scene)
-        shapes += goal_shapes(scene.goals)
-        return lambda camera, n: draw_shapes(shapes, camera, scene.light, samples=n), names
-    bodies = solid_bodies(scene)
-    shadow = shadow_map(bodies, scene.light)
-
-    def draw_once(camera: Camera, samples: int) -> Canvas:
-        view, canvas = camera_view(camera, samples), trace_arena(camera, samples)
-        rgb = paint_arena(canvas, view, scene.light, palette(scene), shadow)
-        canvas = canvas._replace(rgb=rgb)
-        draw_scene(scene, bodies, camera, samples, canvas)
-        return canvas
-
-    return draw_once, body_names(scene.structure)
-
-
-def draw_scene(scene: Scene, bodies: Bodies, camera: Camera, samples: int, canvas: Canvas) -> None:
-    """Draw the bodies, and then the goals, over the arena."""
-    view, light = camera_view(camera, samples), lamp(scene.light)
-    draw(bodies, view, light, 1.0, canvas)
-    if scene.goals:
-        draw(goal_bodies(scene.goals, camera.eye), view, light, GOAL_OPACITY, canvas)
 
 
 def _average(fine: NDArray[np.uint8], samples: int) -> NDArray[np.uint8]:

@@ -9,25 +9,11 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.backends.renderer.arena import (
-    NO_COLORS,
-    NO_OWNERS,
-    empty_arena,
-    lamp,
-    lit_arena,
-    palette,
-)
-from scm_world.backends.renderer.bodies import Bodies, model_shapes, solid_bodies
-from scm_world.backends.renderer.kernels import Canvas, Colors, draw
-from scm_world.backends.renderer.picture import draw_scene
-from scm_world.backends.renderer.shapes import draw_shapes, goal_shapes
-from scm_world.backends.renderer.views import camera_view
+from scm_world.backends.renderer.drawing import drawing_of
+from scm_world.backends.renderer.kernels import Colors
+from scm_world.models.camera import Camera
+from scm_world.models.model import Model
 from scm_world.models.scene import Scene
-from scm_world.models.shapes import Shape
-from scm_world.scene.camera import Camera
-from scm_world.scene.scene import Structure
-from scm_world.scene.state import PhysicalState
-from scm_world.scene.trifinger import JOINT_LOW
 
 
 @final
@@ -79,15 +65,16 @@ def now_pixels(
         ValueError: ``out`` has another shape or another dtype.
 
     Example:
-        >>> from scm_world.scene import Structure, default_scene
-        >>> from scm_world.scene.camera import CAMERAS
+        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
+        >>> from scm_world.tasks.trifinger.cameras import CAMERAS
         >>> out = np.empty((3, 3, 128, 128), dtype=np.uint8)
         >>> now_pixels(default_scene(Structure(blocks=("tool_block",))), CAMERAS, out)
         >>> out[0, :, 127, 64].tolist()  # the floor
         [74, 65, 60]
     """
     scene = scene.with_(goals=())
-    _draw_all(scene, _content(scene), cameras, out, convention)
+    content = drawing_of(scene.structure).content(scene, shadows=False)
+    _draw_all(scene, content, cameras, out, convention)
 
 
 def goal_pixels(
@@ -95,9 +82,8 @@ def goal_pixels(
 ) -> None:
     """Draw what cameras should see: the goals as silhouettes in the arena, without blocks.
 
-    The robot is parked at the lower limits of its joints. So the pictures depend on goals,
-    colors, light, obstacles and the height of the robot only: they can be kept as long as those
-    stay. Of a model they show nothing that moves.
+    They show nothing that moves, so they can be kept until an intervention; in the tasks of the
+    robot it is parked at the lower limits of its joints.
 
     Args:
         scene: Whose goals to show; the state does not matter.
@@ -111,11 +97,11 @@ def goal_pixels(
     Source:
         CausalWorld 1.2, ``envs/causalworld.py``: its goal world.
     """
-    if isinstance(scene.structure, Structure):
-        scene = _parked(scene, obstacles=convention.goal_obstacles)
-    content = _content(scene)
-    if not isinstance(content, Bodies):
-        content = [shape for shape in content if not shape.moves]
+    drawing = drawing_of(scene.structure)
+    scene = drawing.background(scene, obstacles=convention.goal_obstacles)
+    content = drawing.content(scene, shadows=False)
+    if isinstance(scene.structure, Model):
+        content = [shape for shape in content[0] if not shape.moves], False
     _draw_all(scene, content, cameras, out, convention)
 
 
@@ -144,8 +130,8 @@ def pixels(
         ValueError: There are no cameras, or their sizes differ.
 
     Example:
-        >>> from scm_world.scene import Structure, default_scene
-        >>> from scm_world.scene.camera import CAMERAS
+        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
+        >>> from scm_world.tasks.trifinger.cameras import CAMERAS
         >>> pixels(default_scene(Structure()), CAMERAS, size=(64, 96)).shape
         (6, 3, 64, 96)
     """
@@ -179,17 +165,12 @@ def depth_and_segmentation(
     """
     if len({(camera.height, camera.width) for camera in cameras}) != 1:
         raise ValueError("cameras: there must be at least one, and all with pictures of one size")
-    content, light = _content(scene.with_(goals=())), lamp(scene.light)
-    shape = len(cameras), cameras[0].height, cameras[0].width
-    depths, owners = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int32)
-    for i, camera in enumerate(cameras):
-        if not isinstance(content, Bodies):
-            drawn = draw_shapes(content, camera, scene.light, shadows=False, colors=False)
-            depths[i], owners[i] = drawn.depth, drawn.owners
-            continue
-        empty = empty_arena(camera)
-        depths[i], owners[i] = empty.depth, empty.owners
-        draw(content, camera_view(camera, 1), light, 1.0, Canvas(depths[i], owners[i], NO_COLORS))
+    scene, drawing = scene.with_(goals=()), drawing_of(scene.structure)
+    content = drawing.content(scene, shadows=False)
+    drawn = [drawing.draw(scene, content, camera, colors=False) for camera in cameras]
+    depths, owners = (
+        np.stack([getattr(one, name) for one in drawn]) for name in ("depth", "owners")
+    )
     return _rows(depths, convention), _rows(owners, convention)
 
 
@@ -198,29 +179,9 @@ def _rows(stack: NDArray[Any], convention: Convention) -> NDArray[Any]:
     return np.ascontiguousarray(stack[:, ::-1]) if convention.flipped else stack
 
 
-def _parked(scene: Scene, *, obstacles: bool) -> Scene:
-    """Take away the blocks, and the obstacles unless they are wanted, and park the robot."""
-    state = PhysicalState(0)
-    state.joint_positions[:] = JOINT_LOW
-    structure = replace(
-        scene.structure,
-        blocks=(),
-        hulls=(),
-        obstacles=scene.structure.obstacles if obstacles else (),
-    )
-    return scene.with_(structure=structure, state=state)
-
-
-def _content(scene: Scene) -> Bodies | list[Shape]:
-    """List what a scene shows: the TriFinger's bodies, or the shapes and goals of a model."""
-    if isinstance(scene.structure, Structure):
-        return solid_bodies(scene)
-    return model_shapes(scene)[0] + goal_shapes(scene.goals)
-
-
 def _draw_all(
     scene: Scene,
-    content: Bodies | list[Shape],
+    content: Any,
     cameras: Sequence[Camera],
     out: Colors,
     convention: Convention,
@@ -231,20 +192,8 @@ def _draw_all(
     for shape in {convention.shape(camera) for camera in cameras} or {(0, 0, 0)}:
         if out.shape != (len(cameras), *shape):
             raise ValueError(f"out: expected shape {(len(cameras), *shape)}, got {out.shape}")
-    direct = out.flags.c_contiguous and not (convention.flipped or convention.channels_last)
+    drawing = drawing_of(scene.structure)
     for picture, camera in zip(out, cameras, strict=True):
-        rgb = picture if direct else np.empty((3, camera.height, camera.width), dtype=np.uint8)
-        _draw_one(scene, content, camera, rgb)
-        if not direct:
-            rows = rgb[:, ::-1] if convention.flipped else rgb
-            picture[:] = rows.transpose(1, 2, 0) if convention.channels_last else rows
-
-
-def _draw_one(scene: Scene, content: Bodies | list[Shape], camera: Camera, rgb: Colors) -> None:
-    """Draw a scene into a picture of shape (3, h, w)."""
-    if not isinstance(content, Bodies):
-        rgb[:] = draw_shapes(content, camera, scene.light, shadows=False).rgb
-        return
-    rgb[:] = lit_arena(camera, scene.light, palette(scene))
-    depth = empty_arena(camera).depth.copy()
-    draw_scene(scene, content, camera, 1, Canvas(depth, NO_OWNERS, rgb))
+        rgb = drawing.draw(scene, content, camera).rgb
+        rows = rgb[:, ::-1] if convention.flipped else rgb
+        picture[:] = rows.transpose(1, 2, 0) if convention.channels_last else rows

@@ -9,14 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.renderer.arena import (
-    LOWEST,
-    NO_COLORS,
-    NO_OWNERS,
-    NO_SHADOW,
-    lamp,
-    shadow_map,
-)
 from scm_world.backends.renderer.bodies import (
     BOX,
     CAPSULE,
@@ -26,12 +18,20 @@ from scm_world.backends.renderer.bodies import (
     Bodies,
 )
 from scm_world.backends.renderer.kernels import Canvas, View, draw
+from scm_world.backends.renderer.light import (
+    LOWEST,
+    NO_COLORS,
+    NO_OWNERS,
+    NO_SHADOW,
+    lamp,
+    shadow_map,
+)
 from scm_world.backends.renderer.meshes import Ground, Triangles, draw_ground, draw_mesh
 from scm_world.backends.renderer.views import camera_view
 from scm_world.geometry import rotation_matrix
+from scm_world.models.camera import Camera
 from scm_world.models.scene import Goal, Light
 from scm_world.models.shapes import Kind, Mesh, Shape, corners, mesh_of
-from scm_world.scene.camera import Camera
 
 SOLIDS = {
     "box": BOX,
@@ -192,8 +192,8 @@ def _shadow(plane: Shape, others: Sequence[Shape], light: Light) -> tuple[Floats
         _table(moved),
         replace(light, direction=tuple(towards.tolist())),
         [_triangles(shape, shape.mesh) for shape in moved if shape.mesh is not None],
-        half,
-        SHADOW_TEXELS,
+        half=half,
+        n=SHADOW_TEXELS,
     )
     return map_, np.array([*middle, half])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.renderer.kernels import View
-from scm_world.scene.camera import Camera
+from scm_world.models.camera import Camera
 
 
 @lru_cache(maxsize=64)

@@ -13,24 +13,18 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, columns_of
 from scm_world.discovery.data.sensors import Sensors
-from scm_world.entities import ACTUATOR_NOISE
-from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode
 from scm_world.queries.outcomes import Outcome, column
-from scm_world.tasks import Building, TriFingerTask
 from scm_world.tasks.model import REWARD
-from scm_world.tasks.rewards import FRACTION, SUCCESS
+from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Exogenous, Variable
-from scm_world.variables.catalogue import PRESET
+from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
 from scm_world.world import World
 
 NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRESET)
 """What looks, or disturbs the measurement, but moves nothing; patterns of names."""
-
-MEASURES = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
-"""States of a block, in the order in which they are listed."""
 
 
 def default_causes(world: World) -> tuple[str, ...]:
@@ -46,7 +40,7 @@ def default_causes(world: World) -> tuple[str, ...]:
         >>> "tool_block.mass" in found, "tool_block.color" in found, "floor_color" in found
         (True, True, False)
     """
-    colors = {f"{block}.color" for block in _tools(world)}
+    colors = {f"{block}.color" for block in world.declaration.task.tools()}
     structure = set(world.family.head)
     return tuple(
         variable.name
@@ -71,18 +65,10 @@ def default_outcomes(world: World, *, every_step: bool = False) -> tuple[Outcome
         every_step: Whether it is measured at every instant; then the joints are listed, too, since
             the robot is what moves the blocks.
     """
-    if not isinstance(world.task, TriFingerTask):
-        counted = (name for name in (REWARD, SUCCESS) if name in world.model)
-        return tuple(map(Outcome, (*world.declaration.slices, *counted)))
-    joints = ("joint_positions", "joint_velocities") if every_step else ()
-    states = [f"{block}.{measure}" for block in _tools(world) for measure in MEASURES]
-    names = (*joints, *states, FRACTION)
+    names = world.declaration.task.measured(every_step=every_step)
+    if names is None:
+        names = (*world.declaration.slices, REWARD, SUCCESS)
     return tuple(Outcome(name) for name in names if name in world.model)
-
-
-def _tools(world: World) -> tuple[str, ...]:
-    task = world.declaration.task
-    return tuple(task.tools()) if isinstance(task, Building) else ()
 
 
 def _is_like(name: str, patterns: Iterable[str]) -> bool:

@@ -8,13 +8,13 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.env.bounds import WIDE, bounds, spread
 from scm_world.env.observer import published
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
 from scm_world.queries.outcomes import Outcome
 from scm_world.variables import Noise, Normal
+from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import World
 
 STREAM = "sensor of"

@@ -18,7 +18,7 @@ from scm_world.errors import ModelError
 from scm_world.queries import Episode, World
 from scm_world.queries.courses import Course
 from scm_world.queries.local_graphs import LocalEpisode, LocalGraph, local_graph
-from scm_world.queries.local_truth import FINGERS, Pair, movers, paired_truth
+from scm_world.queries.local_truth import Pair, movers, paired_truth
 from scm_world.queries.traces import Trace, begin
 from scm_world.world import World as Simulated
 from scm_world.world.start import whole_number
@@ -69,11 +69,18 @@ def _happening(
 
 
 def bodies_of(*episodes: Episode) -> tuple[str, ...]:
-    """Name the fingers, and all blocks and obstacles that there ever are."""
+    """Name what cannot be taken away, then all blocks and obstacles that there ever are."""
     there = [d.composition for one in episodes for _, d in one.trace.declarations]
+    fixed = (mover.name for made in there for mover in made.movers() if not mover.removable)
     blocks = (name for made in there for name in made.blocks)
     obstacles = (name for made in there for name in made.obstacles)
-    return tuple(dict.fromkeys((*FINGERS, *blocks, *obstacles)))
+    return tuple(dict.fromkeys((*fixed, *blocks, *obstacles)))
+
+
+def fixtures(*episodes: Episode) -> set[str]:
+    """Name the bodies that move and cannot be taken away: the fingers of the robot."""
+    there = (d.composition for one in episodes for _, d in one.trace.declarations)
+    return {mover.name for made in there for mover in made.movers() if not mover.removable}
 
 
 # --- local graphs, summed up --------------------------------------------------------------------

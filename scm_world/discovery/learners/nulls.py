@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -20,16 +20,14 @@ from scm_world.discovery.learners.bodies import (
     Given,
     affordable,
     bodies_of,
+    fixtures,
     lived,
     matrix_of,
 )
 from scm_world.discovery.learners.found import Found
 from scm_world.errors import ModelError
 from scm_world.queries import Episode, Plan, World
-from scm_world.queries.local_truth import FINGERS, Pair
-from scm_world.scene import PhysicalState, trifinger
-from scm_world.scene.kinematics import forward
-from scm_world.scene.state import BLOCK_SIZE
+from scm_world.queries.local_truth import Pair
 from scm_world.variables import Draw, Hard, Null
 from scm_world.world.declaration import Declaration
 
@@ -139,7 +137,7 @@ def null_effects(episode: Episode, *, threshold: float = THRESHOLD) -> NullRepor
         ModelError: There is no block and no obstacle.
     """
     bodies = bodies_of(episode)
-    causes = tuple(body for body in bodies if body not in FINGERS)
+    causes = tuple(body for body in bodies if body not in fixtures(episode))
     if not causes:
         task = episode.stage.task.name
         raise ModelError(
@@ -190,25 +188,33 @@ def _declaration_at(episode: Episode, step: int) -> Declaration:
     return next(one for start, one in declared if start <= step)
 
 
-def _apart(mine: Floats, its: Floats) -> tuple[float, float]:
+def _apart(mine: _Body, its: _Body) -> tuple[float, float]:
     """Say how far two states of a body are apart: the largest of all numbers, and the place."""
-    gap = np.abs(mine - its)
-    if len(mine) == BLOCK_SIZE and gap[3:7].max() > 1.0:  # q and -q are one orientation
-        gap[3:7] = np.abs(mine[3:7] + its[3:7])
-    return float(gap.max()), float(np.linalg.norm(mine[:3] - its[:3]))
+    gap = np.abs(mine.numbers - its.numbers)
+    if mine.turn is not None and gap[mine.turn].max() > 1.0:  # q and -q are one orientation
+        gap[mine.turn] = np.abs(mine.numbers[mine.turn] + its.numbers[mine.turn])
+    place = float(np.linalg.norm(mine.place - its.place))
+    return max(float(gap.max()), float(np.abs(mine.place - its.place).max())), place
 
 
-def _bodies_at(episode: Episode, step: int) -> dict[str, Floats]:
-    """Give the state of each body at an instant; the first three numbers are its place [m]."""
-    declaration = _declaration_at(episode, step)
-    state = PhysicalState(len(declaration.composition.blocks), episode.trace.vectors[step])
-    tips = forward(state.joint_positions, trifinger.NOMINAL_HEIGHT)
-    of_robot = (tips, state.joint_positions, state.joint_velocities)
-    fingers = np.hstack([numbers.reshape(len(FINGERS), 3) for numbers in of_robot])
-    return {
-        **dict(zip(FINGERS, fingers, strict=True)),
-        **dict(zip(declaration.composition.blocks, state.blocks, strict=True)),
-    }
+class _Body(NamedTuple):
+    """The state of a body at an instant: all numbers, where its quaternion is, and its place."""
+
+    numbers: Floats
+    turn: slice | None
+    place: Floats
+
+
+def _bodies_at(episode: Episode, step: int) -> dict[str, _Body]:
+    """Give the state of each body at an instant."""
+    vector = episode.trace.vectors[step]
+    found = {}
+    for mover in _declaration_at(episode, step).composition.movers():
+        numbers = np.concatenate([vector[mover.positions], vector[mover.velocities]])
+        turn, start = mover.rotation, mover.positions.start
+        within = None if turn is None else slice(turn.start - start, turn.stop - start)
+        found[mover.name] = _Body(numbers, within, mover.place(vector))
+    return found
 
 
 def null_edges(given: Given, *, threshold: float = THRESHOLD, **setting: Any) -> Found:
@@ -272,7 +278,7 @@ def learn_null(
     """
     if isinstance(given, World):
         first = lived(given, policy=None, do=settings.get("do"), seed=seed, steps=1)
-        worlds = 2 + len(set(bodies_of(*first)) - set(FINGERS))
+        worlds = 2 + len(set(bodies_of(*first)) - fixtures(*first))
         count = affordable(budget, steps, worlds)
         settings |= {"seed": seed, "steps": steps, "episodes": count}
     return null_edges(given, **settings)

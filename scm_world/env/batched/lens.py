@@ -7,11 +7,11 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.entities import CONTROL_INDEX
 from scm_world.env.batched.inside import Inside
 from scm_world.env.batched.sheet import FLAGS, FRACTION, GOALS, TERMS, Sheet
 from scm_world.env.environment import REWARD, TERMINATED, ScmWorldEnv
 from scm_world.tasks.rewards import SUCCESS
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.batch import Table
 from scm_world.world.mechanisms import places
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.entities.stage import SENSOR_NOISE
 from scm_world.env.batched.commands import Commands
 from scm_world.env.batched.crew import located
 from scm_world.env.batched.inside import Inside
@@ -21,6 +20,7 @@ from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import REWARD, ScmWorldEnv
 from scm_world.errors import ScmWorldError
 from scm_world.tasks.rewards import one_number
+from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 from scm_world.world.batch import Batch, Table

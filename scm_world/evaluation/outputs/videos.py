@@ -22,10 +22,10 @@ from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.results import DRAWN, KEYS, Evaluation
 from scm_world.evaluation.setups import Setup
 from scm_world.graph.exchange.libraries import load
+from scm_world.models.camera import Camera
 from scm_world.output.durable import write_durably
 from scm_world.output.locations import Location, located
 from scm_world.queries.progress import Progress
-from scm_world.scene.camera import OVERVIEW, Camera
 
 WHICH = ("best", "median", "worst")
 FASTEST = 25.0  # frames per second
@@ -43,7 +43,7 @@ def record_videos(
     engine: str | None = None,
     metric: str | None = None,
     which: Sequence[str] = WHICH,
-    camera: Camera = OVERVIEW,
+    camera: Camera | None = None,
     progress: Progress | None = None,
 ) -> list[Location]:
     """Record the best, the median and the worst episode of an agent on an engine.
@@ -61,7 +61,7 @@ def record_videos(
         engine: Where; need not be named if there is only one.
         metric: By which episodes are chosen; one of ``METRICS``.
         which: Of best, median and worst.
-        camera: Where from.
+        camera: Where from; if None, that of pictures for people.
         progress: Told how many control steps are played.
 
     Returns:
@@ -141,7 +141,7 @@ def _film(
     evaluation: Evaluation,
     place: int,
     opened: Callable[..., Any],
-    camera: Camera,
+    camera: Camera | None,
     texts: tuple[Sequence[str], str],
     tell: Callable[[int], None],
 ) -> None:
@@ -150,7 +150,7 @@ def _film(
     Raises:
         SnapshotMismatch: Something else happened, or it is none of the bench.
     """
-    from scm_world.backends.renderer import render
+    from scm_world.backends.renderer import render, scene_camera
 
     row = {name: evaluation.columns[name][place].item() for name in (*KEYS, "hash")}
     shard = bench.setup.shard_of(row)
@@ -161,9 +161,9 @@ def _film(
         step, period = env.world.index, env.world.control_period
         every = math.ceil(round(1.0 / (FASTEST * period), 9))
         if step % every == 0:
-            frame = captioned(
-                render(env.world.scene(), camera).rgb, texts, f"{step * period:.2f} s"
-            )
+            scene = env.world.scene()
+            shown = render(scene, camera or scene_camera(scene)).rgb
+            frame = captioned(shown, texts, f"{step * period:.2f} s")
             if video is None:
                 video = opened(frame.shape[1::-1], 1.0 / (every * period), "libx264")
             video.write_frame(frame)

@@ -29,8 +29,8 @@ from scm_world.evaluation.zoo.shelf import PREFIX as ZOO
 from scm_world.evaluation.zoo.shelf import path_of
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
-from scm_world.queries.policies import NAMED, Policy, Random, Sweep
-from scm_world.queries.policies import Sequence as Given
+from scm_world.queries.policies import NAMED, Policy
+from scm_world.tasks.policies import Blind
 from scm_world.variables import Function
 from scm_world.world import World
 
@@ -172,7 +172,7 @@ def _of_callable(policy: Any, about: About) -> Player:
         inside = policy.policy
         make = inside if isinstance(inside, type) else partial(itself, inside)
         return ByWorld(make, {**about, "sees": "world"})
-    if policy is still or isinstance(policy, Random | Sweep | Given):
+    if policy is still or isinstance(policy, Blind):
         return ByWorld(partial(itself, policy), {**about, "sees": "world"})
     if isinstance(policy, type):
         return _of_callable(policy(), about)

@@ -33,10 +33,9 @@ from scm_world.evaluation.policies.cards import KEY, PolicyAbout
 from scm_world.evaluation.policies.mlp import Layer, Weights
 from scm_world.output.durable import write_durably
 from scm_world.output.locations import Location, located
-from scm_world.tasks import TriFingerTask, tasks
+from scm_world.tasks import tasks
 
 LARGEST = 2**28  # [bytes] of a file: more is no policy, and might be a trap
-JOINTS = len(TriFingerTask.rest)
 VALUE = "value."
 LOG_STD = "log_std"
 
@@ -65,8 +64,8 @@ class NetworkPolicy:
         if not self.layers:
             raise ModelError(["there is no tensor 'layers.0.weight'"])
         kind = tasks().get(self.about.task)
-        is_robot = kind is not None and issubclass(kind, TriFingerTask)
-        problems = [*_misfits("layers", self.layers, None, JOINTS if is_robot else None)]
+        joints = len(kind.rest) if kind is not None else 0
+        problems = [*_misfits("layers", self.layers, None, joints or None)]
         if self.value and self.layers[0].weight.ndim == 2:
             problems += _misfits(f"{VALUE}layers", self.value, self.n_observed, 1)
         shape = self.layers[-1].bias.shape

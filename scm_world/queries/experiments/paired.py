@@ -18,7 +18,6 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.entities import CONTROL_INDEX
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import (
     EdgeKey,
@@ -30,6 +29,7 @@ from scm_world.queries.experiments.effects import (
 from scm_world.queries.experiments.mechanisms import see_mechanisms
 from scm_world.queries.experiments.probes import Probe
 from scm_world.variables import Box, Categories, Integers, Measured, Noise, Rotations, Variable
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world import World
 
 STEPS = (0.05, -0.05, 0.02, -0.02, 0.005, -0.005, 0.001, -0.001)

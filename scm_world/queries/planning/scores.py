@@ -11,17 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.geometry.rotations import rotation_matrix
 from scm_world.tasks import Task
-from scm_world.tasks.building import Building
-
-TIPS = "end_effector_positions"
-
-NEAR = 0.1
-"""What a meter between fingertips and block counts beside one between block and goal."""
-
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-"""Of a cube with edges of length one, shape (8, 3)."""
 
 
 @final
@@ -132,42 +122,10 @@ def nearness(task: Task) -> Score:
         raise UnknownOption(f"objective of {task.name!r}, without goals and reward", None, allowed)
     if not have:
         return as_score("reward")
-    if not isinstance(task, Building):
-        return Score((*have, *want), partial(_apart, len(have)))
-    return Score((TIPS, *have, *want), _boxes_apart)
+    custom = task.closeness()
+    return Score((*have, *want), partial(_apart, len(have))) if custom is None else Score(*custom)
 
 
 def _apart(count: int, *values: Floats) -> Floats:
     have, want = (np.concatenate(part, axis=-1) for part in (values[:count], values[count:]))
     return -np.asarray(np.linalg.norm(have - want, axis=-1))
-
-
-def _boxes_apart(tips: Floats, *values: Floats) -> Floats:
-    """Compute minus the distances of boxes, given as size, position and quaternion each."""
-    half = len(values) // 2
-    total = np.zeros(tips.shape[:-1])
-    fingers = tips.reshape(*tips.shape[:-1], 3, 3)
-    for first in range(0, half, 3):
-        box, goal = (values[at : at + 3] for at in (first, half + first))
-        gaps = np.linalg.norm(corners(*box) - corners(*goal), axis=-1)
-        reach = np.linalg.norm(fingers - box[1][..., None, :], axis=-1)
-        total += gaps.mean(axis=-1) + NEAR * reach.mean(axis=-1)
-    return -total / (half // 3)
-
-
-def corners(size: Floats, position: Floats, orientation: Floats) -> Floats:
-    """Give the corners of boxes.
-
-    Args:
-        size: Edges, shape (..., 3) [m].
-        position: Of the centers, shape (..., 3) [m].
-        orientation: Quaternions, shape (..., 4).
-
-    Returns:
-        Shape (..., 8, 3) [m].
-    """
-    body = CORNERS * size[..., None, :]
-    found: Floats = position[..., None, :] + body @ np.swapaxes(
-        rotation_matrix(orientation), -1, -2
-    )
-    return found

@@ -1,0 +1,153 @@
+"""Cameras: where pictures are taken from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scm_world._types import Floats
+
+Vector = tuple[float, float, float]
+
+
+@final
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with square pixels.
+
+    Attributes:
+        name: What the camera is called.
+        eye: Where it stands [m], z from the table top.
+        target: A point on its optical axis [m].
+        up: A direction that points up in the picture.
+        field_of_view: Vertical opening angle [deg].
+        width: Of the picture [pixels].
+        height: Of the picture [pixels].
+        near: Nothing nearer than this is seen [m], along the optical axis.
+        far: Nothing farther than this is seen [m], along the optical axis.
+    """
+
+    name: str
+    eye: Vector
+    target: Vector
+    up: Vector = (0.0, 0.0, 1.0)
+    field_of_view: float = 52.0
+    width: int = 128
+    height: int = 128
+    near: float = 0.001
+    far: float = 100.0
+
+    def axes(self) -> Floats:
+        """Compute the directions right, up and back of the camera in the world.
+
+        Returns:
+            A rotation from the world to the camera, shape (3, 3): one direction per row.
+
+        Raises:
+            ValueError: The camera has no optical axis, or ``up`` is parallel to it.
+        """
+        back = np.subtract(self.eye, self.target)
+        right = np.cross(self.up, back)
+        axes = np.stack([right, np.cross(back, right), back])  # (3, 3)
+        lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+        if not (lengths > 0.0).all():
+            raise ValueError(
+                f"camera {self.name!r}: up {self.up} must not be parallel to the optical axis "
+                f"from {self.eye} to {self.target}"
+            )
+        unit: Floats = axes / lengths
+        return unit
+
+    def view_matrix(self) -> Floats:
+        """Map homogeneous world points to the camera (x right, y up, z back), shape (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.axes()
+        matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(self.eye)
+        return matrix
+
+    def projection_matrix(self) -> Floats:
+        """Map the camera's homogeneous points to clip space as OpenGL defines it, shape (4, 4)."""
+        focal = 1.0 / math.tan(math.radians(self.field_of_view) / 2.0)
+        depth = self.near - self.far
+        matrix = np.zeros((4, 4))
+        matrix[0, 0] = focal * self.height / self.width
+        matrix[1, 1] = focal
+        matrix[2, 2] = (self.far + self.near) / depth
+        matrix[2, 3] = 2.0 * self.far * self.near / depth
+        matrix[3, 2] = -1.0
+        return matrix
+
+    def project(self, points: ArrayLike) -> Floats:
+        """Find where points appear in the picture.
+
+        Args:
+            points: In the world, shape (..., 3) [m].
+
+        Returns:
+            Column, row and depth, shape (..., 3) [pixels, pixels, m]. The pixel is
+            ``(floor(row), floor(column))``, row 0 at the top. What has no positive depth lies
+            behind the camera and is not seen.
+
+        Example:
+            >>> camera = Camera("top", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+            >>> camera.project([0.0, 0.0, 0.25]).tolist()
+            [64.0, 64.0, 0.75]
+        """
+        seen = (np.asarray(points, dtype=np.float64) - self.eye) @ self.axes().T  # (..., 3)
+        focal = self.height / (2.0 * math.tan(math.radians(self.field_of_view) / 2.0))
+        depth = -seen[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column = self.width / 2.0 + focal * seen[..., 0] / depth
+            row = self.height / 2.0 - focal * seen[..., 1] / depth
+        return np.stack([column, row, depth], axis=-1)
+
+
+def camera_from(
+    name: str,
+    position: ArrayLike,
+    orientation: ArrayLike,
+    field_of_view: float = 52.0,
+    width: int = 128,
+    height: int = 128,
+) -> Camera:
+    """Make a camera from plain numbers.
+
+    The first axis of the camera points to the right of the picture, the second one down and the
+    third one forward.
+
+    Args:
+        name: What the camera is called.
+        position: Where it stands, z from the table top, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w) of any length, shape (4,).
+        field_of_view: Vertical opening angle [deg].
+        width: Of the picture [pixels].
+        height: Of the picture [pixels].
+
+    Raises:
+        ValueError: The quaternion is zero or not finite, or a shape is wrong.
+
+    Example:
+        >>> down = camera_from("top", [0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
+        >>> down.target, down.up
+        ((0.0, 0.0, 0.0), (-0.0, 1.0, -0.0))
+    """
+    x, y, z = np.asarray(position, dtype=np.float64).tolist()
+    down, forward = down_and_forward(orientation)
+    target = (x + forward[0], y + forward[1], z + forward[2])
+    up = (-down[0], -down[1], -down[2])
+    return Camera(name, (x, y, z), target, up, float(field_of_view), int(width), int(height))
+
+
+def down_and_forward(orientation: ArrayLike) -> tuple[Vector, Vector]:
+    """Read the second and the third axis of a camera from its quaternion."""
+    length = float(np.linalg.norm(orientation))
+    if not (length > 0.0 and math.isfinite(length)):
+        raise ValueError(f"orientation: expected a quaternion of some length, got {orientation!r}")
+    x, y, z, w = np.divide(orientation, length).tolist()
+    down = (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
+    forward = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
+    return down, forward

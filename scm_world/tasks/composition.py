@@ -1,0 +1,316 @@
+"""What the variables of a task mean to a backend."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Container, Iterable, Mapping
+from dataclasses import dataclass
+from typing import final
+
+from numba import njit
+
+from scm_world._types import Floats, Value, Values
+from scm_world.geometry.hulls import Hull
+from scm_world.geometry.scalars import scalar
+from scm_world.graph import Moment
+from scm_world.models import (
+    ControlMode,
+    Goal,
+    Light,
+    ParameterKey,
+    Scene,
+    Structure,
+)
+from scm_world.models.camera import Camera
+from scm_world.models.scene import Overlap
+from scm_world.variables import Box, Function, Integers, Measured, Parent, Space, Variable
+from scm_world.variables.reserved import CONTROL_INDEX
+
+Numbers = float | tuple[float, ...]
+
+
+@final
+@dataclass(frozen=True)
+class State:
+    """A quantity that physics moves.
+
+    Attributes:
+        name: ``"<entity>.<quantity>"``.
+        unit: SI unit.
+        shape: Of one value.
+        bounds: What is possible.
+        default: At the start of an episode.
+        doc: One sentence.
+        always: Causes that act at every control step; all other physical quantities of the
+            world act while there is contact.
+        on_set: Parameters and states that move it when they are set.
+        start: Its value at the start, a function of ``on_set``.
+        carry: Its value after one of ``on_set`` was set: a function of the present value, of
+            ``on_set`` before and of ``on_set`` after.
+        restart: Those of ``on_set`` that, when set, put it where it would be at the start.
+        settable: False for what the engine reports only.
+        a: Space A.
+        b: Space B.
+    """
+
+    name: str
+    unit: str
+    shape: tuple[int, ...]
+    bounds: Space
+    default: Numbers
+    doc: str
+    always: tuple[str, ...]
+    on_set: tuple[str, ...] = ()
+    start: Function | None = None
+    carry: Function | None = None
+    restart: tuple[str, ...] = ()
+    settable: bool = True
+    a: Space | None = None
+    b: Space | None = None
+
+    def declare(self, inputs: Iterable[Parent]) -> Measured:
+        """Write the declaration.
+
+        Args:
+            inputs: All quantities of the world that physics knows, as causes that act where
+                there is contact.
+        """
+        always = tuple(Parent(name, 1) for name in self.always)
+        contact = tuple(parent for parent in inputs if parent.name not in self.always)
+        on_set = tuple(Parent(name, 0, "set") for name in self.on_set)
+        return Measured(
+            name=self.name,
+            unit=self.unit,
+            shape=self.shape,
+            bounds=self.bounds,
+            a=self.a,
+            b=self.b,
+            default=self.default,
+            doc=self.doc,
+            parents=always + contact + on_set,
+            start=self.start,
+            carry=self.carry,
+            restart=self.restart,
+            settable_state=self.settable,
+        )
+
+
+class Entity(ABC):  # every hook has a sensible empty default
+    """Something in the world: it declares its variables and says what they mean physically.
+
+    Attributes:
+        name: Prefix of its variables.
+    """
+
+    name: str
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare everything but the states."""
+        return ()
+
+    def states(self) -> Iterable[State]:
+        """Declare what physics moves."""
+        return ()
+
+    def inputs(self) -> Iterable[str]:
+        """Name the variables of this entity that physics depends on."""
+        return ()
+
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        return {}
+
+    def slices(self, block: int) -> Mapping[str, slice]:
+        """Say where its states stand in the vector of ``PhysicalState``.
+
+        Args:
+            block: Index of this entity among the movable blocks.
+        """
+        return {}
+
+    @property
+    def is_block(self) -> bool:
+        """Whether it is a movable block."""
+        return False
+
+    @property
+    def is_obstacle(self) -> bool:
+        """Whether it is a box that nothing moves."""
+        return False
+
+    @property
+    def hull(self) -> Hull | None:
+        """The shape of a block that is no box."""
+        return None
+
+    def goal(self, values: Values) -> Goal | None:
+        """Describe the goal that this entity is, if it is one."""
+        return None
+
+    def light(self, values: Values) -> Light | None:
+        """Describe the light that this entity is, if it is one."""
+        return None
+
+    def cameras(self, values: Values) -> tuple[Camera, ...]:
+        """Describe the cameras that this entity is."""
+        return ()
+
+    def commands(self) -> Commands | None:
+        """Give what turns actions into commands, if this entity does."""
+        return None
+
+
+class Commands(ABC):
+    """What turns an action into what the engine is told, where they are not the same."""
+
+    @abstractmethod
+    def applies(self, values: Values) -> bool:
+        """Tell whether it is needed, given the values of everything that physics does not move."""
+
+    @abstractmethod
+    def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
+        """Give the command of one control step.
+
+        Args:
+            action: All action variables, shape (n_actions,).
+            values: Of everything that physics does not move.
+            vector: The state.
+            moment: Where in the noise this control step draws.
+
+        Returns:
+            Shape (n_commands,). It holds until the next call.
+        """
+
+
+@final
+@dataclass(frozen=True)
+class Mover:
+    """A body of local graphs.
+
+    Attributes:
+        name: Of the body.
+        positions: Where its position stands in the state vector.
+        velocities: Where its velocity stands.
+        rotation: Where its quaternion stands, which is a part of the position; None without one.
+        parameters: Its physical parameters, those that are changed together.
+        removable: Whether it can be taken away.
+        place: Its place, shape (3,) [m], a function of the state vector.
+    """
+
+    name: str
+    positions: slice
+    velocities: slice
+    rotation: slice | None
+    parameters: tuple[tuple[ParameterKey, ...], ...]
+    removable: bool
+    place: Callable[[Floats], Floats]
+
+
+class Composition(ABC):
+    """What the variables of a world mean to an engine: where causal and physical column meet.
+
+    Attributes:
+        entities: In the order of the observation.
+        blocks: Names of the movable blocks.
+        obstacles: Names of the obstacles.
+        hulls: The blocks that are no boxes.
+        solid: Whether ``overlaps`` tells which bodies are in one place.
+        mode: What a command means.
+        commands: What turns an action into a command; None where they are the same.
+    """
+
+    entities: tuple[Entity, ...] = ()
+    blocks: tuple[str, ...] = ()
+    obstacles: tuple[str, ...] = ()
+    hulls: tuple[tuple[str, Hull], ...] = ()
+    solid: bool = False
+    mode: ControlMode = ControlMode.CONTROLS
+    commands: Commands | None = None
+
+    @abstractmethod
+    def structure(self, values: Values) -> Structure:
+        """Say what the engine has to compile; equal values give the same object."""
+
+    @abstractmethod
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+
+    @abstractmethod
+    def slices(self) -> Mapping[str, slice]:
+        """Say where each state stands in the state vector."""
+
+    def timestep(self, values: Values) -> float:
+        """Give the physics step [s]."""
+        return float(self.structure(values).timestep)
+
+    def overlaps(self, scene: Scene, tolerance: float) -> tuple[Overlap, ...]:
+        """List the bodies that lie deeper in one another than a tolerance [m]."""
+        return ()
+
+    def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
+        """List goals, of some, that lie in something that never moves: nothing can fill them."""
+        return ()
+
+    def movers(self) -> tuple[Mover, ...]:
+        """List the bodies between which local graphs are; none if it has no such bodies."""
+        return ()
+
+    def goals(self, values: Values) -> tuple[Goal, ...]:
+        """Describe all goals."""
+        return ()
+
+    def light(self, values: Values) -> Light:
+        """Describe the light of pictures."""
+        return Light()
+
+    def cameras(self, values: Values) -> tuple[Camera, ...]:
+        """Describe the cameras whose places are variables."""
+        return tuple(camera for entity in self.entities for camera in entity.cameras(values))
+
+
+@njit(cache=True)
+def remaining(control_index: Value, steps: float, seconds_per_step: float) -> float:
+    """Compute the time left [s], never below zero."""
+    return max(steps - scalar(control_index), 0.0) * seconds_per_step
+
+
+@final
+class Clock(Entity):
+    """How many control steps of the episode are over.
+
+    Args:
+        steps: Length of an episode in control steps.
+        seconds_per_step: Control period [s].
+    """
+
+    name = "clock"
+
+    def __init__(self, steps: int, seconds_per_step: float) -> None:
+        self._steps = steps
+        self._seconds_per_step = seconds_per_step
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare the counter and the time that is left."""
+        yield Measured(
+            name=CONTROL_INDEX,
+            dtype="integer",
+            bounds=Integers(0, 10**9),
+            parents=(Parent(CONTROL_INDEX, 1),),
+            settable_state=True,
+            default=0,
+            doc="Control steps since the start of the episode.",
+        )
+        yield Measured(
+            name="time_left_for_task",
+            unit="s",
+            bounds=Box(0.0, self._steps * self._seconds_per_step),
+            parents=(CONTROL_INDEX,),
+            mechanism=Function(
+                remaining,
+                constants={
+                    "steps": float(self._steps),
+                    "seconds_per_step": self._seconds_per_step,
+                },
+            ),
+            doc="Time until the episode is cut off.",
+        )

@@ -1,0 +1,1 @@
+"""The TriFinger: its hardware, arena, blocks and goals, and nine goal families."""

@@ -1,0 +1,180 @@
+"""What the goal families of the block-building robot have in common."""
+
+from __future__ import annotations
+
+import inspect
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar, Unpack
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.errors import UnknownOption
+from scm_world.models import ControlMode
+from scm_world.tasks.arguments import numbers_of
+from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.composition import Clock, Composition, Entity
+from scm_world.tasks.experiments import Scenario
+from scm_world.tasks.rewards import FRACTION, Common, further_terms, resolve
+from scm_world.tasks.trifinger import hardware, shaping
+from scm_world.tasks.trifinger.controller import TIMESTEP
+from scm_world.tasks.trifinger.entities.block_world import BlockWorld
+from scm_world.tasks.trifinger.entities.pictures import LightAndCameras
+from scm_world.tasks.trifinger.entities.robot import ACTIONS, RESOLUTIONS, Robot
+from scm_world.tasks.trifinger.entities.stage import Stage
+from scm_world.tasks.trifinger.observed import HEAD
+from scm_world.tasks.trifinger.presets import PRESETS
+from scm_world.tasks.trifinger.scenarios import scenarios
+from scm_world.variables import Linear, Measured, Variable
+
+REWARD = "reward"
+
+MEASURES = ("cartesian_position", "orientation", "linear_velocity", "angular_velocity")
+"""States of a block, in the order in which they are listed."""
+
+
+def _scripted(name: str) -> Any:
+    """Make a scripted policy; they are imported when the first one is used."""
+    from scm_world.tasks.trifinger.policies import SCRIPTED
+
+    return SCRIPTED[name]()
+
+
+class TriFingerTask(Task):
+    """A goal family of the robot.
+
+    Attributes:
+        default_weights: Weight of every dense reward term, in order, and of
+            ``fractional_success``.
+        paper_weights: Where the published training runs differ.
+        head = HEAD
+    saturates = True
+    raised = hardware.RAISED
+    policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
+        name: partial(_scripted, name) for name in ("sweep", "across", "grasp", "hold")
+    }
+    ready_terms: Further reward terms, by name in the option ``terms``.
+        start: Where the robot begins, shape (9,) [rad].
+    """
+
+    action_modes = tuple(ACTIONS)
+    presets = tuple(PRESETS)
+    resolutions = RESOLUTIONS
+    time_unit = TIMESTEP
+    frame_skip = 10
+
+    default_weights: ClassVar[Mapping[str, float]]
+    paper_weights: ClassVar[Mapping[str, float]] = {}
+    head = HEAD
+    saturates = True
+    raised = hardware.RAISED
+    policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
+        name: partial(_scripted, name) for name in ("sweep", "across", "grasp", "hold")
+    }
+    ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    rest: ClassVar[tuple[float, ...]] = hardware.REST
+
+    def __init__(self, **common: Unpack[Common]) -> None:
+        unknown = sorted(common.keys() - Common.__annotations__.keys())
+        if unknown:
+            raise UnknownOption(f"option of {self.name}", unknown[0], self.arguments())
+        self.terms = further_terms(common.get("terms", ()), self.default_weights, self.ready_terms)
+        self.weights = resolve(self.default_weights, self.paper_weights, common, self.terms)
+        given = common.get("joint_positions")
+        joints = numbers_of(self.rest if given is None else given)
+        if joints is None or joints.shape != (hardware.N_JOINTS,):
+            raise UnknownOption("joint_positions", given, ("nine angles [rad]",))
+        self.start = tuple(joints.tolist())
+
+    @classmethod
+    def arguments(cls) -> tuple[str, ...]:
+        """Name the arguments of the constructor, those of this family first."""
+        own = [vars(kind)["__init__"] for kind in cls.__mro__ if "__init__" in vars(kind)]
+        given = [p for init in own[:-1] for p in inspect.signature(init).parameters.values()]
+        names = [parameter.name for parameter in given if parameter.kind is parameter.KEYWORD_ONLY]
+        return tuple(dict.fromkeys((*names, *Common.__annotations__)))
+
+    @abstractmethod
+    def entities(self) -> Iterable[Entity]:
+        """List what stands in the world besides the robot and the stage."""
+
+    @abstractmethod
+    def readouts(self) -> Iterable[Variable]:
+        """Declare reward terms, fractional success and success."""
+
+    def idle(self, world: Any) -> Floats:
+        """Keep the robot where it is told to be: joints, fingertips, or no torque, shape (9,)."""
+        if world.action_mode == "joint_torques":
+            return super().idle(world)
+        name = "end_effector_positions" if "effector" in world.action_mode else "joint_positions"
+        return np.array(world[name])
+
+    def measured(self, *, every_step: bool = False) -> tuple[str, ...]:
+        """Name the states of blocks, and success; at every instant also those of the joints."""
+        joints = ("joint_positions", "joint_velocities") if every_step else ()
+        return (
+            *joints,
+            *(f"{tool}.{what}" for tool in self.tools() for what in MEASURES),
+            FRACTION,
+        )
+
+    def scenarios(self, world: Any) -> Sequence[Scenario]:
+        """List where fingers and blocks touch, and where blocks come and go."""
+        return scenarios(world)
+
+    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+        """Leave out what is absent, and what is computed from something that is not there.
+
+        An entity of which something cannot be computed any more goes as well, such as the places
+        of a pile of which a block is missing. The reward sums up the terms that are left.
+        """
+        torques = timing.action_mode == "joint_torques"
+        mode = ControlMode.JOINT_TORQUES if torques else ControlMode.JOINT_POSITIONS
+        entities: tuple[Entity, ...] = (
+            Robot(timing.action_mode, self.start, timing.resolution),
+            Stage(timing.preset),
+            LightAndCameras(),
+            Clock(timing.steps, timing.control_period),
+            *self.entities(),
+        )
+        there = tuple(entity for entity in entities if entity.name not in self.absent)
+        while True:
+            made = BlockWorld(there, tuple(self.shared()), self.decided_by, mode)
+            variables: list[Variable] = [*made.variables(), *self.readouts()]
+            if not self.absent:
+                return made, variables
+            variables = _computable(variables)
+            names = {variable.name for variable in variables}
+            whole = tuple(e for e in there if all(v.name in names for v in e.variables()))
+            if len(whole) == len(there):
+                return made, variables
+            there = whole
+
+
+def _computable(variables: list[Variable]) -> list[Variable]:
+    while True:
+        names = {variable.name for variable in variables}
+        kept = [_kept(variable, names) for variable in variables]
+        left = [variable for variable in kept if variable is not None]
+        if len(left) == len(variables):
+            return left
+        variables = left
+
+
+def _kept(variable: Variable, names: set[str]) -> Variable | None:
+    parents = variable.all_parents
+    there = [index for index, parent in enumerate(parents) if parent.name in names]
+    if len(there) == len(parents):
+        return variable
+    mechanism: Any = getattr(variable, "mechanism", None)
+    if variable.name == REWARD and isinstance(variable, Measured) and isinstance(mechanism, Linear):
+        weights = tuple(mechanism.weights[index] for index in there)
+        return variable.model_copy(
+            update={
+                "parents": tuple(parents[index] for index in there),
+                "mechanism": mechanism.model_copy(update={"weights": weights}),
+            }
+        )
+    return None

@@ -1,0 +1,72 @@
+"""The cameras of the robot, and one for people."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.models.camera import Camera, Vector, camera_from, down_and_forward
+from scm_world.tasks.trifinger.hardware import TABLE_OFFSET
+
+
+def _above_table(eye: Vector) -> Vector:
+    return eye[0], eye[1], eye[2] - TABLE_OFFSET
+
+
+def _original(name: str, eye: Vector, orientation: tuple[float, float, float, float]) -> Camera:
+    """Make a camera as CausalWorld does, whose mistakes are those of ``ORIGINAL_CAMERAS``."""
+    down, forward = down_and_forward(orientation)
+    return Camera(name, _above_table(eye), _above_table(forward), down)
+
+
+_PUBLISHED: tuple[tuple[str, Vector, tuple[float, float, float, float]], ...] = (
+    ("60", (0.2496, 0.2458, 0.58), (0.3760, 0.8690, -0.2918, -0.1354)),
+    ("120", (0.0047, -0.2834, 0.58), (0.9655, -0.0098, -0.0065, -0.2603)),
+    ("300", (-0.2470, 0.2513, 0.50), (-0.3633, 0.8686, -0.3141, 0.1220)),
+)
+
+
+def published_poses() -> dict[str, tuple[Floats, Floats]]:
+    """Give the poses of ``CAMERAS`` as ``camera_from`` takes them.
+
+    Returns:
+        By name: the position, z from the table top, shape (3,) [m], and the unit quaternion
+        (x, y, z, w), shape (4,).
+
+    Example:
+        >>> position, orientation = published_poses()["60"]
+        >>> camera_from("60", position, orientation) == CAMERAS[0]
+        True
+    """
+    return {
+        name: (np.array(_above_table(eye)), np.divide(turn, np.linalg.norm(turn)))
+        for name, eye, turn in _PUBLISHED
+    }
+
+
+CAMERAS = tuple(camera_from(name, *pose) for name, pose in published_poses().items())
+"""The three cameras of the real robot, upright and looking along their optical axes.
+
+Source:
+    CausalWorld 1.2, ``envs/robot/camera.py``: positions, orientations, 52°, 128 x 128.
+"""
+
+ORIGINAL_CAMERAS = tuple(_original(*row) for row in _PUBLISHED)
+"""The same cameras as CausalWorld 1.2 realises them.
+
+It takes the direction of the optical axis for a point to look at, so that its views are off by
+1.6° to 2.7°, and holds the camera upside down. It then flips the rows of the picture, which
+makes it upright and mirrored: ``picture[::-1]``.
+"""
+
+OVERVIEW = Camera(
+    name="overview",
+    eye=(0.3, -0.68, 0.72),
+    target=(0.0, 0.0, 0.1),
+    field_of_view=39.0,
+    width=640,
+    height=480,
+    near=0.01,
+    far=10.0,
+)
+"""For people: the whole arena from the front and above, between fingers 120 and 300."""

@@ -1,0 +1,1 @@
+"""What the variables of the TriFinger tasks are: robot, stage, blocks, obstacles, goals."""

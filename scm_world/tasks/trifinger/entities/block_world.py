@@ -1,0 +1,167 @@
+"""The robot, blocks, obstacles and goals together."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass, field
+from functools import partial
+from typing import final
+
+from scm_world._types import Floats, Values
+from scm_world.geometry.hulls import Hull
+from scm_world.models import ControlMode, Goal, Light, ParameterKey, Scene
+from scm_world.models.scene import Overlap
+from scm_world.tasks.composition import Commands, Composition, Entity, Mover
+from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps
+from scm_world.tasks.trifinger.hardware import FINGERS, N_JOINTS, NOMINAL_HEIGHT, link_name
+from scm_world.tasks.trifinger.kinematics import forward
+from scm_world.tasks.trifinger.presets import PRESET_NAMES, preset
+from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
+from scm_world.tasks.trifinger.structure import Structure
+from scm_world.variables import Parent, Variable
+from scm_world.variables.reserved import PRESET
+
+
+def _tip(index: int, vector: Floats) -> Floats:
+    """Return the tip of a finger at the nominal height of the robot, shape (3,) [m]."""
+    return forward(vector[:N_JOINTS], NOMINAL_HEIGHT)[3 * index : 3 * index + 3]
+
+
+def _center(at: int, vector: Floats) -> Floats:
+    """Return the center of a block, shape (3,) [m]."""
+    return vector[at : at + 3]
+
+
+def block_slice(block: int, start: int, stop: int) -> slice:
+    """Give the place of some numbers of a block in the state vector."""
+    offset = ROBOT_SIZE + BLOCK_SIZE * block
+    return slice(offset + start, offset + stop)
+
+
+@final
+@dataclass(frozen=True)
+class BlockWorld(Composition):
+    """The robot, blocks, obstacles, goals and what they stand in.
+
+    Attributes:
+        entities: In the order of the observation.
+        shared: Variables that belong to no single entity.
+        deciding: Variables that decide which entities there are. A body that comes or goes acts
+            on the others by contact, so they do.
+        mode: What a command means.
+    """
+
+    entities: tuple[Entity, ...]
+    shared: tuple[Variable, ...] = ()
+    deciding: tuple[str, ...] = ()
+    mode: ControlMode = ControlMode.JOINT_POSITIONS
+    solid: bool = field(init=False, default=True)
+    blocks: tuple[str, ...] = field(init=False)
+    obstacles: tuple[str, ...] = field(init=False)
+    hulls: tuple[tuple[str, Hull], ...] = field(init=False)
+    commands: Commands | None = field(init=False)
+    _structures: dict[str, Structure] = field(init=False, default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        blocks = [entity for entity in self.entities if entity.is_block]
+        commands = (entity.commands() for entity in self.entities)
+        found = {
+            "blocks": tuple(entity.name for entity in blocks),
+            "obstacles": tuple(entity.name for entity in self.entities if entity.is_obstacle),
+            "hulls": tuple((e.name, e.hull) for e in blocks if e.hull is not None),
+            "commands": next((one for one in commands if one is not None), None),
+        }
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
+
+    def structure(self, values: Values) -> Structure:
+        """Say which bodies the engine has to build, and how finely it cuts time."""
+        name = PRESET_NAMES[int(values[PRESET])]
+        if name not in self._structures:
+            made = Structure(self.blocks, preset(name), self.obstacles, self.hulls)
+            self._structures[name] = made
+        return self._structures[name]
+
+    def overlaps(self, scene: Scene, tolerance: float) -> tuple[Overlap, ...]:
+        """List the bodies that lie deeper in one another than a tolerance [m]."""
+        return overlaps(scene, tolerance=tolerance)
+
+    def variables(self) -> tuple[Variable, ...]:
+        """Declare every variable, with the states coupled to all physical quantities."""
+        names = [name for entity in self.entities for name in entity.inputs()]
+        inputs = tuple(Parent(name, 1, "contact") for name in (*names, *self.deciding))
+        declared: list[Variable] = list(self.shared)
+        for entity in self.entities:
+            declared.extend(entity.variables())
+            declared.extend(state.declare(inputs) for state in entity.states())
+        return tuple(declared)
+
+    def parameters(self) -> dict[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        return {k: v for entity in self.entities for k, v in entity.parameters().items()}
+
+    def slices(self) -> dict[str, slice]:
+        """Say where each state stands in the state vector."""
+        found: dict[str, slice] = {}
+        for entity in self.entities:
+            block = self.blocks.index(entity.name) if entity.is_block else -1
+            found.update(entity.slices(block))
+        return found
+
+    def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
+        """List goals that lie in an obstacle."""
+        return buried_goals(scene, names)
+
+    def movers(self) -> tuple[Mover, ...]:
+        """List the fingers, then the blocks. The bases of fingers are fixed."""
+        found = []
+        for index, finger in enumerate(FINGERS):
+            own = slice(3 * index, 3 * index + 3)
+            found.append(
+                Mover(
+                    f"robot_finger_{finger}",
+                    own,
+                    slice(N_JOINTS + own.start, N_JOINTS + own.stop),
+                    None,
+                    (tuple((link_name(finger, link), "mass") for link in (1, 2, 3)),),
+                    False,
+                    partial(_tip, index),
+                )
+            )
+        for index, block in enumerate(self.blocks):
+            at = ROBOT_SIZE + BLOCK_SIZE * index
+            found.append(
+                Mover(
+                    block,
+                    slice(at, at + 7),
+                    slice(at + 7, at + BLOCK_SIZE),
+                    slice(at + 3, at + 7),
+                    (((block, "mass"),), ((block, "friction"),)),
+                    True,
+                    partial(_center, at),
+                )
+            )
+        return tuple(found)
+
+    def goals(self, values: Values) -> tuple[Goal, ...]:
+        """Describe all goals."""
+        goals = (entity.goal(values) for entity in self.entities)
+        return tuple(goal for goal in goals if goal is not None)
+
+    def light(self, values: Values) -> Light:
+        """Describe the light of pictures."""
+        lights = (entity.light(values) for entity in self.entities)
+        return next((light for light in lights if light is not None), Light())
+
+
+def lowest_point(size: Floats, orientation: Floats) -> float:
+    """Compute how far a box reaches below its center [m].
+
+    Args:
+        size: Edge lengths, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w).
+    """
+    x, y, z, w = orientation.tolist()
+    length, width, height = size.tolist()
+    row = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+    return 0.5 * float(abs(row[0]) * length + abs(row[1]) * width + abs(row[2]) * height)

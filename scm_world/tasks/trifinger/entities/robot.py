@@ -1,0 +1,467 @@
+"""The robot, as variables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+from numba import njit
+
+from scm_world._types import Floats, Value, Values
+from scm_world.geometry.scalars import scalar
+from scm_world.graph import Moment
+from scm_world.models import ParameterKey
+from scm_world.tasks.composition import Commands, Entity, State
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.controller import ControllerSpec
+from scm_world.tasks.trifinger.entities.blocks import color
+from scm_world.tasks.trifinger.hardware import FINGERS, N_JOINTS
+from scm_world.tasks.trifinger.kinematics import forward_kernel, inverse_kernel, tip_kernel
+from scm_world.variables import (
+    Action,
+    Box,
+    Exogenous,
+    Function,
+    Measured,
+    Normal,
+    Variable,
+    bundle,
+    part_of,
+)
+from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET
+
+END_EFFECTORS = Box((-0.5, -0.5, 0.0) * 3, (0.5, 0.5, 0.5) * 3)  # [m] what an action may ask for
+
+ACTIONS = {
+    "joint_positions": ("rad", Box(hardware.JOINT_LOW, hardware.JOINT_HIGH)),
+    "joint_torques": ("N m", Box(-0.36, 0.36)),
+    "end_effector_positions": ("m", END_EFFECTORS),
+}
+"""Unit and range of each way to command the robot."""
+
+
+_SPEC = ControllerSpec()
+
+CONTROLLER = (
+    (
+        "position_gains",
+        "N m/rad",
+        numbers.POSITION_GAIN_BOUNDS,
+        (numbers.POSITION_GAINS_A, numbers.POSITION_GAINS_B),
+        _SPEC.kp,
+        "Proportional gain of the three joints of a finger.",
+    ),
+    (
+        "velocity_gains",
+        "N m s/rad",
+        numbers.DAMPING_BOUNDS,
+        (numbers.VELOCITY_GAINS_A, numbers.VELOCITY_GAINS_B),
+        _SPEC.kd,
+        "Derivative gain of the three joints of a finger.",
+    ),
+    (
+        "safety_damping",
+        "N m s/rad",
+        numbers.DAMPING_BOUNDS,
+        (numbers.SAFETY_DAMPING_A, numbers.SAFETY_DAMPING_B),
+        _SPEC.safety,
+        "Damping of the safety filter, for the three joints of a finger.",
+    ),
+    (
+        "torque_limit",
+        "N m",
+        numbers.TORQUE_BOUNDS,
+        (numbers.TORQUE_A, numbers.TORQUE_B),
+        _SPEC.limit,
+        "Largest torque of a joint. Torques that are commanded end at 0.36 N m whatever it is.",
+    ),
+)
+"""The joint controller: name, unit, bounds, spaces A and B, default, sentence."""
+
+
+@njit(cache=True)
+def tips(joint_positions: Floats, robot_height: Value) -> Floats:
+    """Compute the three fingertips from the joints, shape (9,) [m]."""
+    found = np.empty(9)
+    forward_kernel(joint_positions, scalar(robot_height), found)
+    return found
+
+
+@njit(cache=True)
+def finger_tip(joint_positions: Floats, robot_height: Value, finger: float) -> Floats:
+    """Compute the tip of one finger from its three joints, shape (3,) [m]."""
+    found = np.empty(3)
+    q0, q1, q2 = joint_positions[0], joint_positions[1], joint_positions[2]
+    tip_kernel(int(finger), q0, q1, q2, scalar(robot_height), found, 0)
+    return found
+
+
+@njit(cache=True)
+def joints_tip(q0: Value, q1: Value, q2: Value, robot_height: Value, finger: float) -> Floats:
+    """Compute the tip of one finger from the angle of each joint, shape (3,) [m]."""
+    found = np.empty(3)
+    height = scalar(robot_height)
+    tip_kernel(int(finger), scalar(q0), scalar(q1), scalar(q2), height, found, 0)
+    return found
+
+
+RESOLUTIONS = ("vector", "finger", "joint")
+"""Whether all joints, those of a finger, or each are a variable; the first is the default."""
+
+QUANTITIES = ("joint_positions", "joint_velocities", "joint_torques")
+"""What moves, in the order of the state vector, by its names for the whole robot."""
+
+
+@final
+@dataclass(frozen=True)
+class Joints:
+    """Some joints that are variables together.
+
+    Attributes:
+        where: Their places among the nine.
+        fingers: Those that they belong to.
+        names: Of ``QUANTITIES``.
+        action: Name of their action.
+        of: What they are joints of, for sentences.
+    """
+
+    where: slice
+    fingers: tuple[str, ...]
+    names: tuple[str, ...]
+    action: str
+    of: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of each of their variables."""
+        n = self.where.stop - self.where.start
+        return (n,) if n > 1 else ()
+
+    def cut(self, box: Box) -> Box:
+        """Give their part of a box of all nine."""
+        return box if self.shape == (N_JOINTS,) else part_of(box, self.where, N_JOINTS, self.shape)
+
+
+def joints_of(resolution: str) -> tuple[Joints, ...]:
+    """Cut the nine joints into those that are variables together, in their order.
+
+    Args:
+        resolution: One of ``RESOLUTIONS``.
+
+    Example:
+        >>> [joints.names[0] for joints in joints_of("finger")]
+        ['finger_60.joint_positions', 'finger_120.joint_positions', 'finger_300.joint_positions']
+        >>> joints_of("joint")[8].action
+        'finger_300_joint_2.action'
+    """
+    if resolution == "vector":
+        return (Joints(slice(0, N_JOINTS), FINGERS, QUANTITIES, "action", "all fingers"),)
+    found = []
+    for index, finger in enumerate(FINGERS):
+        if resolution == "finger":
+            name, where = f"finger_{finger}", slice(3 * index, 3 * index + 3)
+            names = tuple(f"{name}.{quantity}" for quantity in QUANTITIES)
+            found.append(Joints(where, (finger,), names, f"{name}.action", f"finger {finger}"))
+            continue
+        for joint in range(3):
+            name, place = f"finger_{finger}_joint_{joint}", 3 * index + joint
+            names = tuple(f"{name}.{what}" for what in ("position", "velocity", "torque"))
+            of = f"joint {joint} of finger {finger}"
+            found.append(Joints(slice(place, place + 1), (finger,), names, f"{name}.action", of))
+    return tuple(found)
+
+
+STREAM = "actuators"
+"""The stream of the noise; draws of the variable that scales it have another one."""
+
+
+@final
+class RobotCommands(Commands):
+    """Joint positions for fingertips, and the noise of the actuators.
+
+    Args:
+        action_mode: One of ``ACTIONS``.
+    """
+
+    def __init__(self, action_mode: str) -> None:
+        self._by_tips = action_mode == "end_effector_positions"
+        low, high = ACTIONS[action_mode][1].bounds((N_JOINTS,), {})
+        self._half = (high - low) / 2.0
+        self._joints, self._reached = np.empty(N_JOINTS), np.empty(3, dtype=np.bool_)
+
+    def applies(self, values: Values) -> bool:
+        """Tell whether fingertips are commanded, or the actuators have noise."""
+        return self._by_tips or bool(values[ACTUATOR_NOISE] > 0.0)
+
+    def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
+        """Add the noise, then find the joint positions of fingertips, shape (9,)."""
+        noise = float(values[ACTUATOR_NOISE])
+        if noise > 0.0:
+            drawn = moment.draw(Normal(), STREAM, (N_JOINTS,), {})
+            action = action + noise * self._half * drawn
+        if self._by_tips:
+            height = float(values["robot_height"])
+            inverse_kernel(action, height, vector[:N_JOINTS], self._joints, self._reached)
+            action = self._joints
+        return action
+
+
+@final
+class Robot(Entity):
+    """Three fingers with three joints each.
+
+    Args:
+        action_mode: One of ``ACTIONS``.
+        start: Joint positions at the start, shape (9,) [rad].
+        resolution: One of ``RESOLUTIONS``. What is finer than ``"vector"`` is put together again
+            in bundles under the names of the whole robot.
+    """
+
+    name = "robot"
+
+    def __init__(
+        self,
+        action_mode: str,
+        start: tuple[float, ...] = hardware.REST,
+        resolution: str = RESOLUTIONS[0],
+    ) -> None:
+        self.action_mode = action_mode
+        self._start = start
+        self._by_tips = action_mode == "end_effector_positions"
+        self._joints = joints_of(resolution)
+        by_joint = resolution == "joint"
+        # A tip is a point: its three coordinates are those of no single joint.
+        self._acting = joints_of("finger") if by_joint and self._by_tips else self._joints
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare the action, the height, the links and the fingertips."""
+        yield from self._actions()
+        yield Exogenous(
+            name="robot_height",
+            unit="m",
+            bounds=numbers.ROBOT_HEIGHT_BOUNDS,
+            a=numbers.ROBOT_HEIGHT_A,
+            b=numbers.ROBOT_HEIGHT_B,
+            default=hardware.NOMINAL_HEIGHT,
+            doc="Height of the robot's base above a plane 0.011 m below the table top.",
+        )
+        for finger in FINGERS:
+            yield from self._links(finger)
+        yield from self._hidden()
+        yield from self._tips()
+        if len(self._joints) > 1:
+            yield from self._bundles()
+
+    def _actions(self) -> Iterable[Variable]:
+        unit, bounds = ACTIONS[self.action_mode]
+        actions = [
+            Action(
+                name=joints.action,
+                unit=unit,
+                shape=joints.shape,
+                bounds=joints.cut(bounds),
+                doc=f"What the policy commands of {joints.of}: {self.action_mode}.",
+            )
+            for joints in self._acting
+        ]
+        yield from actions
+        if len(actions) > 1:
+            yield bundle("action", actions, bounds=bounds, doc="What the policy commands.")
+
+    def _bundles(self) -> Iterable[Variable]:
+        """Put together what moves, under the names of the whole robot."""
+        parts = [list(self._quantities(joints)) for joints in self._joints]
+        for index, whole in enumerate(Robot(self.action_mode, self._start).states()):
+            states = [quantities[index].declare(()) for quantities in parts]
+            fields = {"bounds": whole.bounds, "a": whole.a, "b": whole.b, "doc": whole.doc}
+            yield bundle(whole.name, states, **fields)
+
+    def _tips(self) -> Iterable[Variable]:
+        """Declare the fingertips, and the three of them together."""
+        name, doc = "end_effector_positions", "The three fingertips."
+        fields: dict[str, Any] = {"unit": "m", "bounds": Box(-1.0, 1.0)}
+        if len(self._joints) == 1:
+            parents = ("joint_positions", "robot_height")
+            yield Measured(
+                name=name, shape=(9,), parents=parents, mechanism=tips, doc=doc, **fields
+            )
+            return
+        found = []
+        for index, finger in enumerate(FINGERS):
+            angles = [joints.names[0] for joints in self._joints if finger in joints.fingers]
+            function = finger_tip if len(angles) == 1 else joints_tip
+            found.append(
+                Measured(
+                    name=f"finger_{finger}.end_effector_position",
+                    shape=(3,),
+                    parents=(*angles, "robot_height"),
+                    mechanism=Function(function, constants={"finger": float(index)}),
+                    doc=f"The tip of finger {finger}.",
+                    **fields,
+                )
+            )
+        yield from found
+        yield bundle(name, found, doc=doc, **fields)
+
+    def _links(self, finger: str) -> Iterable[Variable]:
+        for index, mass in enumerate(hardware.LINK_MASS):
+            link = hardware.link_name(finger, index)
+            still = " It is fixed to the base, so nothing depends on it." if index == 0 else ""
+            yield Exogenous(
+                name=f"{link}.mass",
+                unit="kg",
+                bounds=numbers.LINK_MASS_BOUNDS,
+                a=numbers.MASS_A,
+                b=numbers.MASS_B,
+                default=mass,
+                doc=f"Mass of the link; its inertia scales with it.{still}",
+            )
+            yield color(f"{link}.color", hardware.LINK_COLORS[finger])
+
+    def _hidden(self) -> Iterable[Variable]:
+        """Declare what the predecessor keeps to itself: friction, damping, control and noise."""
+        yield Exogenous(
+            name="finger_friction",
+            bounds=numbers.FRICTION_BOUNDS,
+            a=numbers.FRICTION_A,
+            b=numbers.FRICTION_B,
+            default=numbers.FINGER_FRICTION,
+            doc="Friction of all links; a contact has the product of two frictions.",
+        )
+        yield Exogenous(
+            name="joint_damping",
+            unit="N m s/rad",
+            bounds=numbers.DAMPING_BOUNDS,
+            a=numbers.JOINT_DAMPING_A,
+            b=numbers.JOINT_DAMPING_B,
+            default=0.0,
+            doc="Passive damping of every joint.",
+        )
+        for name, unit, bounds, (a, b), default, doc in CONTROLLER:
+            shape = (3,) if isinstance(default, tuple) else ()
+            yield Exogenous(
+                name=name,
+                unit=unit,
+                shape=shape,
+                bounds=bounds,
+                a=a,
+                b=b,
+                default=default,
+                doc=doc,
+            )
+        yield Exogenous(
+            name=ACTUATOR_NOISE,
+            bounds=numbers.NOISE_BOUNDS,
+            a=numbers.NOISE_A,
+            b=numbers.NOISE_B,
+            default=0.0,
+            doc="Standard deviation of a command, as a fraction of half the range of an action.",
+        )
+
+    def states(self) -> Iterable[State]:
+        """Declare joint positions, velocities and the torques the engine reports."""
+        of_each = [list(self._quantities(joints)) for joints in self._joints]
+        yield from (states[index] for index in range(len(QUANTITIES)) for states in of_each)
+
+    def _quantities(self, joints: Joints) -> Iterable[State]:
+        """Declare what moves of some joints: position, velocity and torque."""
+        always = self._always(joints)
+        start = self._start[joints.where]
+        still = (0.0,) * len(start)
+        position, velocity, torque = joints.names
+        yield State(
+            position,
+            "rad",
+            joints.shape,
+            joints.cut(numbers.JOINT_BOUNDS),
+            start if joints.shape else start[0],
+            f"Angles of the joints of {joints.of}." if joints.shape else f"Angle of {joints.of}.",
+            always=always,
+            a=joints.cut(numbers.JOINTS_A),
+            b=joints.cut(numbers.JOINTS_B),
+        )
+        yield State(
+            velocity,
+            "rad/s",
+            joints.shape,
+            numbers.JOINT_VELOCITY_BOUNDS,
+            still if joints.shape else 0.0,
+            "Angular velocities of the joints.",
+            always=always,
+        )
+        yield State(
+            torque,
+            "N m",
+            joints.shape,
+            Box(-1.0, 1.0),
+            still if joints.shape else 0.0,
+            "Torques of the last physics step.",
+            always=always,
+            settable=False,
+        )
+
+    def _always(self, joints: Joints) -> tuple[str, ...]:
+        """Name what acts on some joints in every control step.
+
+        Other fingers are other kinematic trees: they act by contact only.
+        """
+        others = {
+            name
+            for finger in FINGERS
+            if finger not in joints.fingers
+            for name in self._of_finger(finger)
+        }
+        by_contact = {"finger_friction"} if self._by_tips else {"finger_friction", "robot_height"}
+        acting = (name for name in self.inputs() if name not in others | by_contact)
+        return (*acting, "gravity", PRESET)
+
+    def _of_finger(self, finger: str) -> Iterable[str]:
+        """Name what belongs to one finger and acts on how it moves."""
+        for joints in self._joints:
+            yield from joints.names[:2] if joints.fingers == (finger,) else ()
+        for joints in self._acting:
+            yield from (joints.action,) if joints.fingers == (finger,) else ()
+        yield from (f"{hardware.link_name(finger, index)}.mass" for index in (1, 2, 3))
+
+    def inputs(self) -> Iterable[str]:
+        """Everything but colors, the fixed finger bases and what is only read out."""
+        yield from (joints.names[0] for joints in self._joints)
+        yield from (joints.names[1] for joints in self._joints)
+        yield from (joints.action for joints in self._acting)
+        yield "robot_height"
+        yield from ("finger_friction", "joint_damping", "safety_damping", "torque_limit")
+        if self.action_mode != "joint_torques":
+            yield from ("position_gains", "velocity_gains")
+        yield ACTUATOR_NOISE
+        for finger in FINGERS:
+            yield from (f"{hardware.link_name(finger, index)}.mass" for index in (1, 2, 3))
+
+    def parameters(self) -> Mapping[str, ParameterKey]:
+        """Say which variable sets which physical parameter."""
+        links = {
+            f"{link}.{quantity}": (link, quantity)
+            for link in hardware.LINK_NAMES
+            for quantity in ("mass", "color")
+        }
+        control = {name: ("controller", name) for name, *_ in CONTROLLER}
+        own = {
+            "robot_height": ("robot", "height"),
+            "finger_friction": ("robot", "friction"),
+            "joint_damping": ("robot", "joint_damping"),
+        }
+        return {**own, **control, **links}
+
+    def commands(self) -> Commands:
+        """Give what turns actions into joint positions or torques."""
+        return RobotCommands(self.action_mode)
+
+    def slices(self, block: int) -> Mapping[str, slice]:
+        """Say where its states stand in the state vector."""
+        return {
+            name: slice(N_JOINTS * index + joints.where.start, N_JOINTS * index + joints.where.stop)
+            for joints in self._joints
+            for index, name in enumerate(joints.names)
+        }

@@ -1,0 +1,208 @@
+"""What a policy that grasps does next: which block, and where to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.tasks.trifinger.grasping.bodies import Body, turns
+from scm_world.tasks.trifinger.grasping.sight import Sight
+from scm_world.tasks.trifinger.grasping.ways import Move, Planner, Way
+
+ENOUGH = 0.93
+"""Share of a goal that a block fills where it is left alone."""
+
+FAIR = 0.8
+LATE = 70
+"""So many control steps before the end less is enough, since there is no time to do it better."""
+
+HOVER = 0.001  # [m] above its goal, where a block is held that is not let go of
+ON_FLOOR = 0.006  # [m] that a goal may be above the floor and still be on it
+ON_TOP = 0.01  # [m] that it may be above or in the block below it
+ROOM = 0.03  # [m] for fingers about a block that is put down on the way
+ASIDE = 0.005  # [m] that such a block keeps away from goals
+NEAR = 0.04  # [m] between blocks that are in one another's way
+MOVED = 0.02  # [m]
+TURNED = 0.2  # [rad]
+TRIES = 12
+"""How many places to put a block down on the way are thought through."""
+
+RINGS = (0.0, 0.05, 0.09, 0.12)  # [m] radii of these places
+PARTS = (1.0, 0.5, 0.0)
+"""Shares of a turn that may be made before a block is put down on the way."""
+
+STOPS = [
+    np.array([radius * math.cos(angle), radius * math.sin(angle)])
+    for radius in RINGS
+    for angle in np.linspace(0.0, 2.0 * math.pi, 12 if radius else 1, endpoint=False)
+]
+
+
+@final
+@dataclass(frozen=True)
+class Job:
+    """What to do next.
+
+    Attributes:
+        tool: The block.
+        move: How it is brought where.
+        jobs: How many such moves there still are, this one included.
+    """
+
+    tool: str
+    move: Move
+    jobs: int
+
+
+@final
+class Choice:
+    """Chooses what to do next, from what there is now.
+
+    Args:
+        sight: Of the world.
+        holds: Whether the block with the highest goal is held there, even if it could stand.
+    """
+
+    def __init__(self, sight: Sight, *, holds: bool = False) -> None:
+        self._sight = sight
+        self._bodies = sight.solid()
+        self._goals = {goal: sight.body(goal) for _, goal in sight.pairs}
+        height = {goal: float(body.place[2]) for goal, body in self._goals.items()}
+        pairs = sorted(sight.pairs, key=lambda pair: height[pair[1]])
+        self._kept = pairs[-1][1] if holds and pairs else None
+        self._todo = [
+            (tool, goal)
+            for tool, goal in pairs
+            if sight.filled(tool, goal) < self._enough() or self._hangs(tool, goal)
+        ]
+
+    def job(self) -> Job | None:
+        """Choose the lowest goal that is not filled; None if nothing can be done."""
+        for tool, goal in self._todo:
+            if self._waits(tool, goal):
+                continue
+            hangs, end, start = self._hangs(tool, goal), self._end(goal), self._bodies[tool]
+            ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
+            move = self._best(tool, start, ways, release=not hangs)
+            if move is not None and (not hangs or move.grip.firm):
+                return Job(tool, move, len(self._todo))
+            detour = self._detour(tool, ways, release=not hangs) or move
+            if detour is not None:
+                return Job(tool, detour, len(self._todo) + (detour is not move))
+            found = self._make_way(tool, end)
+            if found is not None:
+                return found
+        return None
+
+    def _enough(self) -> float:
+        """Say which share of a goal is enough: towards the end, better not touch it again."""
+        return ENOUGH if self._sight.left > LATE else FAIR
+
+    def _hangs(self, tool: str, goal: str) -> bool:
+        """Tell whether a block is held at its goal: there is nothing below, or it is asked for."""
+        end = self._goals[goal]
+        return goal == self._kept or (
+            end.bottom > ON_FLOOR
+            and not any(
+                abs(end.bottom - body.top) < ON_TOP and end.depth_in(body, flat=True) > 0.0
+                for body in self._others(tool)
+            )
+        )
+
+    def _end(self, goal: str) -> Body:
+        """Say where a block should be for its goal: a block that is held does not rub."""
+        end = self._goals[goal]
+        return end.at(end.place + lifted(self._kept == goal), end.yaw)
+
+    def _waits(self, tool: str, goal: str) -> bool:
+        """Tell whether a block cannot stand before another goal below its own is filled."""
+        return self._hangs(tool, goal) and any(
+            self._goals[goal].depth_in(self._goals[other], flat=True) > 0.0
+            for _, other in self._todo
+            if other != goal
+        )
+
+    def _others(self, tool: str) -> list[Body]:
+        return [body for name, body in self._bodies.items() if name != tool]
+
+    def _best(self, tool: str, start: Body, ways: Iterable[Way], *, release: bool) -> Move | None:
+        planner = Planner(self._sight.hand, self._sight.joints, self._others(tool))
+        return planner.best(start, ways, wanted=self._sight.wanted(tool), release=release)
+
+    def _make_way(self, tool: str, end: Body) -> Job | None:
+        """Move a block that stands where another one should go, or where its fingers would be."""
+        start = self._bodies[tool]
+        depth = {
+            other: max(self._bodies[other].depth_in(place, flat=True) for place in (end, start))
+            for other, _ in self._todo
+            if other != tool
+        }
+        for other in sorted(depth, key=lambda name: -depth[name]):
+            move = self._detour(other, []) if depth[other] > -NEAR else None
+            if move is not None:
+                return Job(other, move, len(self._todo) + 1)
+        return None
+
+    def _detour(self, tool: str, ways: list[Way], *, release: bool = True) -> Move | None:
+        """Find a way to put a block down from where it can go on, or out of the way.
+
+        Args:
+            tool: The block.
+            ways: Where it should go in the end; nowhere if empty.
+            release: Whether it is let go there.
+        """
+        start = self._bodies[tool]
+        for stop, turn in self._stops(tool, ways):
+            move = self._best(tool, start, [(stop, turn)], release=True)
+            if move is None:
+                continue
+            rest = [(end, full - turn) for end, full in ways]
+            after = self._best(tool, stop, rest, release=release)
+            if not ways or (after is not None and (release or after.grip.firm)):
+                return move
+        return None
+
+    def _stops(self, tool: str, ways: list[Way]) -> Iterator[Way]:
+        """List places where a block may be put down, the shortest detours first."""
+        start, tried = self._bodies[tool], 0
+        end, full = ways[0] if ways else (start, 0.0)
+        for place in sorted(STOPS, key=lambda stop: _length(start, stop, end)):
+            for part in PARTS if ways else PARTS[-1:]:
+                turn = part * full
+                stop = start.at(np.array([*place, start.half[2]]), start.yaw + turn)
+                if self._is_free(tool, stop) and _differs(start, stop):
+                    tried += 1
+                    yield stop, turn
+                if tried == TRIES:
+                    return
+
+    def _is_free(self, tool: str, stop: Body) -> bool:
+        """Tell whether a block can stand somewhere, with room for fingers and beside all goals."""
+        near = ((body, ROOM) for body in self._others(tool))
+        wide = ((body, ASIDE) for body in self._goals.values())
+        return not any(
+            stop.depth_in(body, margin=margin, flat=True) > 0.0
+            for bodies in (near, wide)
+            for body, margin in bodies
+        )
+
+
+def lifted(held: bool) -> Floats:
+    """Say by how much a block is held higher than its goal, so that nothing is in its way [m]."""
+    return np.array([0.0, 0.0, HOVER * held])
+
+
+def _length(start: Body, stop: Floats, end: Body) -> float:
+    """Measure a way over a stop, seen from above [m]."""
+    return math.dist(start.place[:2], stop) + math.dist(stop, end.place[:2])
+
+
+def _differs(start: Body, stop: Body) -> bool:
+    """Tell whether it is worth the while to move a block."""
+    far = math.dist(start.place[:2], stop.place[:2])
+    return far > MOVED or abs(stop.yaw - start.yaw) > TURNED

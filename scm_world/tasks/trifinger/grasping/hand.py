@@ -1,0 +1,252 @@
+"""Three fingertips that press: which command makes them, and what they would run into."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import final
+
+import numpy as np
+from numba import njit
+
+from scm_world._types import Floats, Value
+from scm_world.geometry.penetration import box_capsule_kernel, capsule_capsule_kernel
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.kinematics import (
+    FRAMES_PER_FINGER,
+    N_FINGERS,
+    forward_kernel,
+    inverse_kernel,
+    link_frames_kernel,
+)
+
+TIP_RADIUS = hardware.COLLISION["tip"].radius
+STRENGTH = 0.97
+"""Share of the largest torque that a finger may be asked for."""
+
+STRIDE = 0.12  # [rad] that a joint may go in one control step, at most
+LEAST_GAIN = 1e-3  # [N m/rad] of a controller that can be commanded
+LEAST_DAMPING = 1e-6  # [N m s/rad]
+NUDGE = 1e-6  # [rad] by which joints are moved to find out how the fingertips move
+
+Solids = tuple[Floats, Floats, Floats]
+"""Half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3)."""
+
+_LOW, _HIGH = np.array(hardware.JOINT_LOW), np.array(hardware.JOINT_HIGH)
+_LEG = hardware.LEG_LENGTH
+_MIDDLE_CENTER, _LOWER_CENTER = (hardware.INERTIAL[link].center for link in (2, 3))
+_LOWER, _MIDDLE = hardware.COLLISION["tip"].radius, hardware.COLLISION["middle"].radius
+_MIDDLE_Y = hardware.COLLISION["middle"].start[1]
+_SHOULDER, _KNEE = (hardware.JOINT_ORIGINS[joint][1] for joint in (1, 2))
+_MASSES = (
+    (_SHOULDER + _MIDDLE_CENTER[1], -_MIDDLE_CENTER[2], 0.0),
+    (_SHOULDER + _KNEE + _LOWER_CENTER[1], _LEG, -_LOWER_CENTER[2]),
+    (-hardware.LATERAL_OFFSET, _LEG, _LEG),
+)
+"""Where middle link, lower link and tip are: beside the leg, along it, along its lower half [m]."""
+
+
+@njit(cache=True)
+def _legs_kernel(joints: Floats, height: float, ends: Floats) -> None:
+    """Write both ends of the lower and the middle legs into ``ends`` (3, 2, 2, 3) [m]."""
+    frames = N_FINGERS * FRAMES_PER_FINGER
+    origins, turns = np.empty((frames, 3)), np.empty((frames, 4))
+    link_frames_kernel(joints, height, origins, turns)
+    for finger in range(N_FINGERS):
+        first = FRAMES_PER_FINGER * finger
+        for part in range(2):
+            frame = first + 4 - 2 * part
+            x, y, z, w = turns[frame]
+            for k in range(3):
+                column = (2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w))
+                up = (2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y))
+                if part == 0:
+                    ends[finger, part, 0, k] = origins[frame, k]
+                    ends[finger, part, 1, k] = origins[frame, k] + _LEG * up[k]
+                else:
+                    ends[finger, part, 0, k] = origins[frame, k] + _MIDDLE_Y * column[k]
+                    ends[finger, part, 1, k] = ends[finger, part, 0, k] - _LEG * up[k]
+
+
+@njit(cache=True)
+def deepest_kernel(
+    joints: Floats, height: float, halves: Floats, centers: Floats, turns: Floats
+) -> float:
+    """Measure how deep any leg lies in a box or in a leg of another finger.
+
+    Args:
+        joints: Shape (9,) [rad].
+        height: Of the robot [m].
+        halves: Half edges of the boxes, shape (n, 3) [m].
+        centers: Shape (n, 3) [m].
+        turns: Axes of the boxes as columns, shape (n, 3, 3).
+
+    Returns:
+        The depth [m]; negative where all are apart.
+    """
+    ends = np.empty((N_FINGERS, 2, 2, 3))
+    _legs_kernel(joints, height, ends)
+    deepest = -math.inf
+    for finger in range(N_FINGERS):
+        for part in range(2):
+            start, end = ends[finger, part]
+            radius = _LOWER if part == 0 else _MIDDLE
+            for box in range(len(halves)):
+                depth = box_capsule_kernel(
+                    halves[box], centers[box], turns[box], start, end, radius
+                )
+                deepest = max(deepest, depth)
+            for other in range(finger):
+                for piece in range(2):
+                    far = _LOWER if piece == 0 else _MIDDLE
+                    one, two = ends[other, piece]
+                    depth = capsule_capsule_kernel(start, end, radius, one, two, far)
+                    deepest = max(deepest, depth)
+    return deepest
+
+
+@njit(cache=True)
+def _carrying_kernel(joints: Floats, weights: Floats, out: Floats) -> None:
+    """Write the torques that carry the fingers into ``out`` (9,) [N m].
+
+    Args:
+        joints: Shape (9,) [rad].
+        weights: Of the middle link, the lower link and the tip of each finger, shape (3, 3) [N].
+        out: Overwritten.
+    """
+    for finger in range(N_FINGERS):
+        i = 3 * finger
+        sine, cosine = math.sin(joints[i]), math.cos(joints[i])
+        out[i] = out[i + 1] = out[i + 2] = 0.0
+        for part in range(3):
+            weight, (aside, above, below) = weights[finger, part], _MASSES[part]
+            first, second = joints[i + 1], joints[i + 1] + joints[i + 2]
+            down = -above * math.cos(first) - below * math.cos(second)
+            out[i] += weight * (-aside * cosine - down * sine)
+            out[i + 1] += weight * (above * math.sin(first) + below * math.sin(second)) * cosine
+            out[i + 2] += weight * below * math.sin(second) * cosine
+
+
+@njit(cache=True)
+def _pressing_kernel(joints: Floats, height: float, forces: Floats, out: Floats) -> None:
+    """Write the torques with which fingertips press into ``out`` (9,) [N m].
+
+    Args:
+        joints: Shape (9,) [rad].
+        height: Of the robot [m].
+        forces: Of the fingertips on what they touch, shape (3, 3) [N].
+        out: Overwritten.
+    """
+    here, there, moved = np.empty(9), np.empty(9), joints.copy()
+    forward_kernel(joints, height, here)
+    for joint in range(3):
+        moved[joint::3] += NUDGE
+        forward_kernel(moved, height, there)
+        moved[joint::3] = joints[joint::3]
+        for finger in range(N_FINGERS):
+            i, work = 3 * finger, 0.0
+            for k in range(3):
+                work += (there[i + k] - here[i + k]) * forces[finger, k]
+            out[i + joint] = work / NUDGE
+
+
+@final
+class Hand:
+    """The robot as it is at the moment: its height, its weight and its controller.
+
+    Args:
+        values: Of the variables of a world.
+        period: Of control [s].
+    """
+
+    def __init__(self, values: Mapping[str, Value], period: float) -> None:
+        self.height = float(values["robot_height"])
+        self._gains = np.tile(np.maximum(values["position_gains"], LEAST_GAIN), N_FINGERS)
+        self._limit = STRENGTH * float(values["torque_limit"])
+        self._weights = -float(values["gravity"][2]) * np.array(
+            [
+                [float(values[f"{hardware.link_name(finger, link)}.mass"]) for link in (2, 3)]
+                + [hardware.TIP_MASS]
+                for finger in hardware.FINGERS
+            ]
+        )
+        self._lead = self._delay(values, period) / period
+        self._last: Floats | None = None
+
+    def _delay(self, values: Mapping[str, Value], period: float) -> Floats:
+        """Find by how much a command must be early so that a joint is there in time [s].
+
+        A damped spring whose target jumps once per control step lags behind a steady motion.
+        """
+        damping = float(values["joint_damping"]) + values["velocity_gains"]
+        damping = np.maximum(np.tile(damping + values["safety_damping"], N_FINGERS), LEAST_DAMPING)
+        left = np.exp(-period * self._gains / damping)
+        delay: Floats = period * left / (1.0 - left)
+        return delay
+
+    def solve(self, tips: Floats, near: Floats) -> tuple[Floats, bool]:
+        """Find the joints for fingertips, shape (9,) [m]; tell whether all of them are reached."""
+        joints, reached = np.empty(9), np.empty(3, dtype=np.bool_)
+        inverse_kernel(tips, self.height, near, joints, reached)
+        return joints, bool(reached.all())
+
+    def tips(self, joints: Floats) -> Floats:
+        """Place the fingertips, shape (9,) [m]."""
+        tips = np.empty(9)
+        forward_kernel(joints, self.height, tips)
+        return tips
+
+    def depth(self, joints: Floats, boxes: Solids) -> float:
+        """Measure how deep fingers lie in boxes and in one another; see ``deepest_kernel``."""
+        return float(deepest_kernel(joints, self.height, *boxes))
+
+    def pressing(self, joints: Floats, forces: Floats) -> Floats:
+        """Compute the torques with which fingertips press, without what carries the fingers.
+
+        Args:
+            joints: Shape (9,) [rad].
+            forces: Of the fingertips on what they touch, shape (3, 3) [N].
+
+        Returns:
+            Shape (9,) [N m].
+        """
+        torques = np.empty(9)
+        _pressing_kernel(joints, self.height, forces, torques)
+        return torques
+
+    def carrying(self, joints: Floats) -> Floats:
+        """Compute the torques that carry the fingers themselves, shape (9,) [N m]."""
+        torques = np.empty(9)
+        _carrying_kernel(joints, self._weights, torques)
+        return torques
+
+    def command(self, tips: Floats, forces: Floats, near: Floats) -> Floats:
+        """Find the joint positions to command so that fingertips come somewhere, and press.
+
+        The controller is a damped spring without gravity compensation: what it should carry and
+        press, and how far it lags behind, is added to where the joints should be.
+
+        Args:
+            tips: Shape (9,) [m].
+            forces: On what they touch, shape (3, 3) [N].
+            near: Joint positions to stay close to, shape (9,) [rad].
+
+        Returns:
+            Shape (9,) [rad], within the bounds of a command.
+        """
+        joints, _ = self.solve(tips, near)
+        torques = self.carrying(joints) + self.pressing(joints, forces)
+        wanted = joints + np.minimum(np.maximum(torques, -self._limit), self._limit) / self._gains
+        if self._last is not None:
+            stride = np.minimum(np.maximum(joints - self._last, -STRIDE), STRIDE)
+            wanted += self._lead * stride
+        self._last = joints
+        clipped: Floats = np.minimum(np.maximum(wanted, _LOW), _HIGH)
+        return clipped
+
+    def strength(self, joints: Floats, forces: Floats) -> float:
+        """Tell how many times some forces, shape (3, 3), the fingers can exert."""
+        own, unit = self.carrying(joints), self.pressing(joints, forces)
+        room = self._limit - own * np.sign(unit)
+        asked = np.abs(unit) > 1e-9
+        return max(float((room[asked] / np.abs(unit[asked])).min(initial=np.inf)), 0.0)

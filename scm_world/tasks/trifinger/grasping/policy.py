@@ -1,0 +1,250 @@
+"""A policy that grasps blocks and puts them where their goals are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Any, final
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.errors import ActionError, UnknownOption
+from scm_world.tasks.trifinger.grasping.bodies import QUARTER, Body, smallest, turn_about_z
+from scm_world.tasks.trifinger.grasping.choice import Choice, Job, lifted
+from scm_world.tasks.trifinger.grasping.grips import Grip
+from scm_world.tasks.trifinger.grasping.hold import Hold, Step
+from scm_world.tasks.trifinger.grasping.sight import Sight
+from scm_world.tasks.trifinger.grasping.ways import Move, Planner
+
+PRESS = 5
+SETTLE = 2
+"""Control steps in which fingers come to their force, and in which they are given time."""
+
+LETTING_GO = (0.6, 0.3, 0.0)
+"""Shares of the force, control step by control step."""
+
+SAFE = 0.09  # [m] above the floor, where the fingers wait
+AGAIN = 25
+"""Control steps until it is tried again when nothing can be done."""
+
+RESERVE = 40.0
+"""Control steps that a move keeps for coming to its speed, settling, and letting go."""
+
+HURRY = 20.0
+"""Control steps that a move is given at least, however little time there is."""
+
+LEISURE = 0.6
+"""Share of the time there is that a move takes if it may."""
+
+SLOWEST = 0.0008  # [m] that a block is carried per control step
+HEAVY, LIGHT = 0.7, 0.2
+"""Shares of the force that the weight of a block needs: it is carried slowly, or at full pace."""
+
+_FREE = np.zeros((3, 3))
+
+
+@final
+@dataclass(frozen=True)
+class Pace:
+    """How fast a grasp is, per control step.
+
+    Attributes:
+        travel: Of fingertips that hold nothing [m].
+        close: Of fingertips that come to a block [m].
+        carry: Of a block, at most [m].
+        turn: Of a block about the vertical [rad].
+
+    Raises:
+        UnknownOption: One of them is not a positive number.
+    """
+
+    travel: float = 0.016
+    close: float = 0.0025
+    carry: float = 0.0045
+    turn: float = 0.03
+
+    def __post_init__(self) -> None:
+        for name, rate in asdict(self).items():
+            if not (math.isfinite(rate) and rate > 0.0):
+                raise UnknownOption(name, rate, ("a positive number per control step",))
+
+
+@final
+class Grasp:
+    """Takes block after block, the one with the lowest goal first, and puts it at its goal.
+
+    It sees everything: places, sizes, masses and friction of the blocks, and the robot. It chooses
+    the faces to press and the fingers that do so, goes around what is in the way, turns a block
+    about the vertical if its goal asks for it, puts it down on the way if it cannot go there at
+    once, makes way for it, tries again when it has slipped, and holds it where a goal is in the
+    air. Heavy blocks are carried slowly, as far as there is time. A block that lies on the wrong
+    face stays on it, and one that no two fingers reach stays where it is.
+
+    It is meant for picking, pick and place, stacking two and pushing. Where there are dozens of
+    blocks it begins, and mostly does not finish.
+
+    It depends on nothing but the world, without noise, and begins anew with every episode: one
+    instance serves any number of episodes and of worlds.
+
+    Args:
+        pace: How fast it is; ``Pace()`` if None.
+        holds: Whether the last block is not let go of, but held at its goal. That is easier to
+            imitate: what fingers do while they let go depends on what they did before.
+
+    Example:
+        >>> from scm_world.queries import World
+        >>> world = World("picking", action_mode="end_effector_positions")
+        >>> episode = world.rollout(Grasp())
+        >>> bool(episode.final("success"))
+        True
+    """
+
+    def __init__(self, pace: Pace | None = None, *, holds: bool = False) -> None:
+        self.pace, self.holds = pace or Pace(), holds
+        self._programs: WeakKeyDictionary[Any, _Program] = WeakKeyDictionary()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle without what is going on."""
+        return partial(Grasp, holds=self.holds), (self.pace,)
+
+    def __call__(self, world: Any) -> Floats:
+        """Give the action of the present step.
+
+        Raises:
+            ActionError: Actions are torques, or the task has no blocks that have goals.
+        """
+        if world.action_mode == "joint_torques":
+            problem = "a grasp needs joint or fingertip positions as actions, not torques"
+            raise ActionError(problem, world.action_mode)
+        program = self._programs.get(world)
+        if program is None or not program.goes_on(world):
+            program = self._programs[world] = _Program(world, self.pace, holds=self.holds)
+        return program.action(world)
+
+
+@final
+class _Program:
+    """What is done in one episode, as a generator of steps."""
+
+    def __init__(self, world: Any, pace: Pace, *, holds: bool) -> None:
+        self._pace, self._holds = pace, holds
+        self._sight = Sight(world)
+        self._unit, self._next = _unit(world), world.index
+        self._tips = self._sight.hand.tips(self._sight.joints)
+        self._steps = self._work()
+
+    def goes_on(self, world: Any) -> bool:
+        """Tell whether the present is the step after the last one."""
+        return world.index == self._next and self._unit == _unit(world)
+
+    def action(self, world: Any) -> Floats:
+        """Give the action of the present step."""
+        self._next = world.index + 1
+        self._sight.look(world)
+        self._tips, forces = next(self._steps)
+        hand = self._sight.hand
+        command = hand.command(self._tips, forces, self._sight.joints)
+        return hand.tips(command) if "effector" in world.action_mode else command
+
+    def _work(self) -> Iterator[Step]:
+        while True:
+            job = Choice(self._sight, holds=self._holds).job()
+            if job is None:
+                yield from self._rise(SAFE)
+                for _ in range(AGAIN):
+                    yield self._tips, _FREE
+            else:
+                yield from self._approach(job.move)
+                yield from self._close(job.tool, job.move.grip, self._press(job))
+                yield from self._bring(job)
+                yield from self._rise(job.move.above)
+
+    def _press(self, job: Job) -> float:
+        """Choose the force between the fingers [N]."""
+        return min(self._sight.wanted(job.tool), job.move.strength)
+
+    # --- fingers without a block ----------------------------------------------------------
+
+    def _glide(self, tips: Floats, rate: float) -> Iterator[Step]:
+        """Move the fingertips straight, smoothly."""
+        first = self._tips
+        way = tips - first
+        steps = max(math.ceil(float(np.abs(way).max()) / rate), 1)
+        for step in range(1, steps + 1):
+            yield first + (0.5 - 0.5 * math.cos(math.pi * step / steps)) * way, _FREE
+
+    def _rise(self, above: float) -> Iterator[Step]:
+        tips = self._tips.copy()
+        tips[2::3] = np.maximum(tips[2::3], above)
+        yield from self._glide(tips, self._pace.travel)
+
+    def _approach(self, move: Move) -> Iterator[Step]:
+        """Come to a block from above."""
+        place = Planner(self._sight.hand, self._sight.joints, ()).place
+        grip = move.grip
+        yield from self._rise(move.above)
+        yield from self._glide(place(grip, move.start, grip.opening, move.above), self._pace.travel)
+        yield from self._glide(place(grip, move.start, grip.opening), self._pace.travel)
+
+    def _close(self, tool: str, grip: Grip, press: float) -> Iterator[Step]:
+        """Come to the faces of a block and press, wherever it moves in the meantime."""
+        place = Planner(self._sight.hand, self._sight.joints, ()).place
+        steps = math.ceil(grip.opening / self._pace.close)
+        for step in range(1, steps + PRESS + SETTLE + 1):
+            body = self._sight.body(tool)
+            force = press * min(max((step - steps) / PRESS, 0.0), 1.0)
+            opening = grip.opening * max(1.0 - step / steps, 0.0)
+            yield place(grip, body, opening), force * grip.inward @ turn_about_z(body.yaw).T
+
+    # --- fingers with a block -------------------------------------------------------------
+
+    def _bring(self, job: Job) -> Iterator[Step]:
+        """Bring a block to its end, and let go of it there or when it is lost."""
+        tool, move = job.tool, job.move
+        body, press = self._sight.body(tool), self._press(job)
+        hold = Hold(self._sight, tool, move.grip, press, self._tips)
+        stations = _stations(body, move)
+        rate = self._rate(job, [body, *stations], self._sight.burden(tool) / press)
+        for station in stations:
+            yield from hold.carry(station, rate, self._pace.turn)
+        if not move.release:
+            goal = next(goal for block, goal in self._sight.pairs if block == tool)
+            yield from hold.stay(goal, self._pace.carry, lifted(self._holds))
+        yield from hold.settle()
+        for share in LETTING_GO:
+            yield hold.step(share)
+        axes = turn_about_z(self._sight.body(tool).yaw)
+        away = (move.grip.points(move.grip.opening) - move.grip.touch) @ axes.T
+        yield from self._glide(self._tips + away.ravel(), 2.0 * self._pace.close)
+
+    def _rate(self, job: Job, way: list[Body], burden: float) -> float:
+        """Choose how fast a block is carried [m] per control step.
+
+        Args:
+            job: What is done.
+            way: Where it goes.
+            burden: Share of the force that its weight needs.
+        """
+        length = sum(math.dist(one.place, other.place) for one, other in pairwise(way))
+        time = max(self._sight.left / job.jobs - RESERVE, HURRY)
+        light = min(max((HEAVY - burden) / (HEAVY - LIGHT), 0.0), 1.0) ** 2
+        calm = max(self._pace.carry * light, length / time)
+        slow = max(length / (LEISURE * time), SLOWEST)
+        return float(min(calm, slow, self._pace.carry))
+
+
+def _unit(world: Any) -> tuple[int, int]:
+    """Say which episode this is."""
+    return world.noise.seed, world.episode
+
+
+def _stations(body: Body, move: Move) -> tuple[Body, Body, Body]:
+    """Say where a block comes by: above its place, above its end, its end."""
+    yaw = body.yaw + move.turn + smallest(move.start.yaw - body.yaw, QUARTER)
+    over, there = (np.array([*on.place[:2], move.height]) for on in (body, move.end))
+    return body.at(over, body.yaw), body.at(there, yaw), body.at(move.end.place, yaw)

@@ -1,0 +1,207 @@
+"""Pick and place: bring a block over a wall to a goal on the other side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Unpack, final
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.rewards import FRACTION, term
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import kernels, shapes
+from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
+from scm_world.tasks.trifinger.entities.obstacles import Obstacle, obstacle_size, wall_on_the_floor
+from scm_world.tasks.trifinger.shapes import Place
+from scm_world.tasks.trifinger.single import (
+    GOAL,
+    TOOL,
+    Alike,
+    OneBlock,
+    smoothness,
+    tips_to_block,
+    turned,
+)
+from scm_world.variables import Box, Derived, Exogenous, Function, Parent, Switch, Variable
+
+WALL = "obstacle"
+SIDE = "wall_side"
+
+WALL_SIZE = (0.5, 0.015, 0.065)  # [m]
+WALL_A = Box((0.5, 0.015, 0.02), (0.5, 0.015, 0.065))
+WALL_B = Box((0.5, 0.015, 0.065), (0.5, 0.015, 0.1))
+RADIUS_A = (0.07, 0.12)  # [m]
+RADIUS_B = (0.12, 0.15)
+ANGLES = (math.pi / 6, 5 * math.pi / 6)  # [rad] on the side where y > 0
+
+
+def mirrored(polar_position: Floats, side: Value) -> Floats:
+    """Reflect a radius and an angle at the wall where the sides are exchanged, shape (..., 2).
+
+    Args:
+        polar_position: Radius [m] and angle [rad], shape (..., 2).
+        side: 0 or 1, shape (...).
+    """
+    sign = 1.0 - 2.0 * np.asarray(side)
+    return polar_position * np.stack([np.ones_like(sign), sign], axis=-1)
+
+
+def goal_across(side: Value, polar_position: Floats, size: Floats, orientation: Floats) -> Floats:
+    """Put a box on the floor on its side of the wall, shape (..., 3) [m]."""
+    return turned_on_the_floor(mirrored(polar_position, side), size, orientation)
+
+
+def hull_across(
+    side: Value, polar_position: Floats, corners: Floats, orientation: Floats
+) -> Floats:
+    """Put a hull on the floor on its side of the wall, shape (..., 3) [m]."""
+    return shapes.hull_on_the_floor(mirrored(polar_position, side), corners, orientation)
+
+
+def stand_across(size: Floats, orientation: Floats, *causes: Value, place: Floats) -> Floats:
+    """Stand a body on its side of the wall, shape (3,) [m].
+
+    Args:
+        size: Edge lengths of a box, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w).
+        causes: Corners of a hull, shape (n, 3) [m], if it is one; the side, 0 or 1.
+        place: Where it stands on side 0: x, y and the height of its lowest point, shape (3,) [m].
+    """
+    *corners, side = causes
+    sign = 1.0 - 2.0 * float(side)
+    return shapes.stand(size, orientation, *corners, place=place * [1.0, sign, 1.0])
+
+
+@final
+class PickAndPlace(OneBlock):
+    """A wall, a block on one side of it, and a goal of the same size on the other.
+
+    The blocks share the parents ``block.size`` and ``wall_side``. Which side the block begins
+    on decides where the goal is, so that the wall is always between them; the wall stands on the
+    floor however high it is.
+
+    Reward terms:
+        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
+        reward.block_to_goal: How much nearer the block came to the goal, seen from above [m].
+        reward.block_to_height: How much nearer it came to 0.15 m, or to the floor on the side of
+            the goal [m].
+        reward.orientation: By how much the angle between block and goal shrank [rad].
+        reward.smoothness: Minus the change of the joint velocities [rad/s].
+        fractional_success: How much of the goal the block fills.
+
+    Args:
+        tool_block_position: Where the center of the block begins while ``wall_side`` is 0: x and
+            y if it stands on the floor, or x, y and z [m].
+        goal_block_position: Default x and y of the goal, which is on the floor, likewise [m].
+        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+    """
+
+    name = "pick_and_place"
+    default_weights = {  # noqa: RUF012 # a constant
+        "reward.tips_to_block": 750.0,
+        "reward.block_to_goal": 50.0,
+        "reward.block_to_height": 250.0,
+        "reward.orientation": 0.0,
+        "reward.smoothness": 0.005,
+        FRACTION: 0.0,
+    }
+    paper_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
+    goal_causes = (SIDE, f"{GOAL}.polar", f"{GOAL}.euler_orientation")
+
+    def __init__(
+        self,
+        *,
+        tool_block_position: Place = (0.0, -0.09),
+        goal_block_position: Place = (0.0, 0.09),
+        **options: Unpack[Alike],
+    ) -> None:
+        super().__init__(tool_block_position=tool_block_position, **options)
+        self._polar = self.floor_polar(goal_block_position)
+
+    def obstacles(self) -> tuple[str, ...]:
+        """One wall."""
+        return (WALL,)
+
+    def entities(self) -> Iterable[Entity]:
+        """A block, its goal and the wall between them."""
+        yield self.tool(
+            spaces=self._sector(TOOL, sign=-1.0),
+            start=Function(stand_across, constants={"place": self.place}),
+            causes=(SIDE,),
+        )
+        a, b = (Box((near, ANGLES[0]), (far, ANGLES[1])) for near, far in (RADIUS_A, RADIUS_B))
+        yield self.goal(
+            polar(GOAL, self._polar, a=a, b=b),
+            goal_position(
+                GOAL,
+                parents=(SIDE, f"{GOAL}.polar", *self.form(GOAL)),
+                mechanism=Function(goal_across if self.shape is None else hull_across),
+            ),
+            spaces=self._sector(GOAL, sign=1.0),
+        )
+        size = obstacle_size(f"{WALL}.size", WALL_SIZE, a=WALL_A, b=WALL_B)
+        yield Obstacle(WALL, size=size, position=_wall_position())
+
+    def _sector(self, name: str, *, sign: float) -> tuple[Box, Box]:
+        """Give the cylindrical positions on one side of the wall.
+
+        Args:
+            name: Of block or goal.
+            sign: Of y while the side is 0.
+        """
+        height = self.level(name)
+        near, far = ANGLES if sign > 0.0 else (-ANGLES[1], -ANGLES[0])
+        low = Switch(parent=SIDE, below=near, above=-far)
+        high = Switch(parent=SIDE, below=far, above=-near)
+        a, b = (
+            Box((inner, low, height), (outer, high, height))
+            for inner, outer in (RADIUS_A, RADIUS_B)
+        )
+        return a, b
+
+    def shared(self) -> Iterable[Variable]:
+        """One size for both, and on which side of the wall they are."""
+        yield from super().shared()
+        yield Exogenous(
+            name=SIDE,
+            dtype="categorical",
+            bounds=numbers.SIDE_BOUNDS,
+            a=numbers.SIDE_BOUNDS,
+            b=numbers.SIDE_BOUNDS,
+            default=0,
+            doc="Where the block begins: 0 is at negative y, 1 at positive y; the goal is across.",
+        )
+
+    def dense(self) -> Iterable[Variable]:
+        """Declare how block and fingers come nearer, and how steady they are."""
+        block, goal = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
+        yield tips_to_block()
+        yield term(
+            "reward.block_to_goal",
+            kernels.horizontal_progress,
+            (block, Parent(block, 1), goal),
+            "How much nearer the block came to the goal, seen from above [m].",
+        )
+        yield term(
+            "reward.block_to_height",
+            kernels.crossing_progress,
+            (block, Parent(block, 1), goal, f"{GOAL}.size"),
+            "How much nearer the block came to 0.15 m, or to the floor on the goal's side [m].",
+        )
+        yield turned()
+        yield smoothness()
+
+
+def _wall_position() -> Derived:
+    return Derived(
+        name=f"{WALL}.cartesian_position",
+        unit="m",
+        shape=(3,),
+        bounds=numbers.POSITION_BOUNDS,
+        parents=(f"{WALL}.size",),
+        mechanism=Function(wall_on_the_floor),
+        doc="Position of the center; it stands on the floor in the middle.",
+    )

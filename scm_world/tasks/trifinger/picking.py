@@ -1,0 +1,167 @@
+"""Picking: lift a block from the floor to a goal in the air."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Unpack, final
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.tasks.arguments import checked
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.rewards import FRACTION, term
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import kernels
+from scm_world.tasks.trifinger.entities.goals import goal_position
+from scm_world.tasks.trifinger.shapes import Place
+from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, smoothness, tips_to_block
+from scm_world.variables import Box, Exogenous, Function, Parent, Variable
+
+HEIGHT = f"{GOAL}.height"
+HEIGHT_BOUNDS = Box(0.0, 0.5)  # [m] of the center of the goal
+HEIGHT_A = (0.08, 0.2)  # [m]
+HEIGHT_B = (0.2, 0.25)
+
+
+def lifted(height: Value, *, place: Floats) -> Floats:
+    """Put something at a height above a place, shape (..., 3) [m].
+
+    Args:
+        height: Shape (...) [m].
+        place: x and y, shape (2,) [m].
+    """
+    at = np.broadcast_to(place, (*np.shape(height), 2))
+    return np.concatenate([at, np.asarray(height)[..., None]], axis=-1)
+
+
+@final
+class Picking(OneBlock):
+    """A block on the floor, and a goal of the same size in the air above its place.
+
+    The blocks share the parent ``block.size``. How high the goal is does not depend on it.
+
+    Reward terms:
+        reward.block_to_height: How much nearer the block came to the height of the goal [m].
+        reward.height_error: Minus the difference of their heights [m].
+        reward.block_to_center: How much nearer the block came to the axis of the arena [m].
+        reward.center_distance: Minus its distance from there [m].
+        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
+        reward.tips_distance: Minus their distance from it [m].
+        reward.grasp: Minus how far the two nearest fingertips are from the block [m].
+        reward.smoothness: Minus the change of the joint velocities [rad/s].
+        fractional_success: How much of the goal the block fills.
+
+    Args:
+        tool_block_position: Where the center of the block begins: x and y if it stands on the
+            floor, or x, y and z [m]. The goal is above it.
+        goal_height: Default height of the center of the goal [m].
+        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+    """
+
+    name = "picking"
+    default_weights = {  # noqa: RUF012 # a constant
+        "reward.block_to_height": 250.0,
+        "reward.height_error": 0.0,
+        "reward.block_to_center": 125.0,
+        "reward.center_distance": 0.0,
+        "reward.tips_to_block": 750.0,
+        "reward.tips_distance": 0.0,
+        "reward.grasp": 0.0,
+        "reward.smoothness": 0.005,
+        FRACTION: 1.0,
+    }
+    goal_causes = (HEIGHT,)
+
+    def __init__(
+        self,
+        *,
+        tool_block_position: Place = (0.0, 0.0),
+        goal_height: float = 0.15,
+        **options: Unpack[Alike],
+    ) -> None:
+        super().__init__(tool_block_position=tool_block_position, **options)
+        self._height = checked("goal_height", goal_height, HEIGHT_BOUNDS)
+
+    def entities(self) -> Iterable[Entity]:
+        """A block and its goal."""
+        yield self.tool(spaces=self.spaces(TOOL, airborne=self.conventions.published_spaces))
+        yield self.goal(
+            Exogenous(
+                name=HEIGHT,
+                unit="m",
+                bounds=HEIGHT_BOUNDS,
+                a=Box(*HEIGHT_A),
+                b=Box(*HEIGHT_B),
+                default=self._height,
+                doc="Height of its center.",
+            ),
+            goal_position(
+                GOAL,
+                parents=(HEIGHT,),
+                mechanism=Function(lifted, constants={"place": self.place[:2]}),
+            ),
+            spaces=self._above(),
+        )
+
+    def _above(self) -> tuple[Box, Box]:
+        """Give the cylindrical positions above the block's place; at radius 0 any angle will do.
+
+        The predecessor publishes wider spaces, but puts whatever is drawn above the middle.
+        """
+        if self.conventions.published_spaces:
+            return (
+                numbers.cylindrical(numbers.RADIUS_A, *HEIGHT_A),
+                numbers.cylindrical(numbers.RADIUS_B, *HEIGHT_B),
+            )
+        x, y, _ = self.place
+        radius, angle = math.hypot(x, y), math.atan2(y, x)
+        low, high = (angle, angle) if radius > 0.0 else (-math.pi, math.pi)
+        a, b = (
+            Box((radius, low, bottom), (radius, high, top)) for bottom, top in (HEIGHT_A, HEIGHT_B)
+        )
+        return a, b
+
+    def dense(self) -> Iterable[Variable]:
+        """Declare how block and fingers come nearer, and how steady they are."""
+        block, goal = f"{TOOL}.cartesian_position", f"{GOAL}.cartesian_position"
+        tips, was = "end_effector_positions", Parent(f"{TOOL}.cartesian_position", 1)
+        yield term(
+            "reward.block_to_height",
+            kernels.height_progress,
+            (block, was, goal),
+            "How much nearer the block came to the height of the goal [m].",
+        )
+        yield term(
+            "reward.height_error",
+            kernels.minus_height_error,
+            (block, goal),
+            "Minus the difference of the heights of block and goal [m].",
+        )
+        yield term(
+            "reward.block_to_center",
+            kernels.centering_progress,
+            (block, was),
+            "How much nearer the block came to the axis of the arena [m].",
+        )
+        yield term(
+            "reward.center_distance",
+            kernels.minus_eccentricity,
+            (block,),
+            "Minus the distance of the block from the axis of the arena [m].",
+        )
+        yield tips_to_block()
+        yield term(
+            "reward.tips_distance",
+            kernels.minus_tips_distance,
+            (tips, block),
+            "Minus the distance of the fingertips from the block [m].",
+        )
+        yield term(
+            "reward.grasp",
+            kernels.minus_grasp_distance,
+            (tips, block, f"{TOOL}.size"),
+            "Minus how far the two nearest fingertips are from the block [m].",
+        )
+        yield smoothness()

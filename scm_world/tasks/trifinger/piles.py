@@ -1,0 +1,167 @@
+"""Piles: where blocks come to lie that are dropped one after another."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from scm_world._types import Floats, Value
+from scm_world.geometry.rotations import from_rotation_vector
+from scm_world.models import ControlMode, Difference, Scene
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import hardware
+from scm_world.tasks.trifinger.entities.block_world import lowest_point
+from scm_world.tasks.trifinger.state import PhysicalState
+from scm_world.tasks.trifinger.structure import Structure, default_parameters
+
+MOST = 9
+SHAPE = (MOST, 7)
+ENGINE = "mujoco"
+
+FALL = 0.8  # [s] that each block is given
+AWAY = 2.0  # [m] height of the robot in the simulation: nothing reaches it
+SKY = 100.0  # [m] where blocks wait
+
+_NOBODY = (0.0, 0.0, 0.0, *numbers.IDENTITY)
+
+
+def pile(
+    count: Value,
+    size: Value,
+    mass: Value,
+    positions: Floats,
+    orientations: Floats,
+    gravity: Floats,
+    floor_friction: Value,
+    *frictions: Value,
+) -> Floats:
+    """Drop blocks one after another, and see where they lie 0.8 s after the last.
+
+    A simulation on MuJoCo, whatever engine moves the world: one seed gives one goal everywhere.
+    There is no robot in reach; what is no argument here has its default. A block that would
+    begin in the floor or in another block begins above it. Blocks that leave the arena (gravity
+    may point anywhere) are put at its border.
+
+    Args:
+        count: How many blocks, shape (...).
+        size: Edge length, shape (...) [m].
+        mass: Of each block, shape (...) [kg].
+        positions: Where they are let go, shape (..., MOST, 3) [m].
+        orientations: Rotation vectors, shape (..., MOST, 3) [rad].
+        gravity: Shape (..., 3) [m/s²].
+        floor_friction: Shape (...).
+        frictions: Of the blocks that there are, shape (...) each; more are not dropped.
+
+    Returns:
+        Position [m] and quaternion (x, y, z, w) of each block, shape (..., MOST, 7); zero and
+        the identity for those that there are not.
+
+    Raises:
+        MissingEngine: MuJoCo is not installed.
+    """
+    signature = "(),(),(),(n,k),(n,k),(k),(),(f)->(n,p)"
+    together = np.stack(np.broadcast_arrays(*frictions), axis=-1)
+    each = np.vectorize(_pile, signature=signature)
+    return np.asarray(
+        each(count, size, mass, positions, orientations, gravity, floor_friction, together)
+    )
+
+
+def _pile(
+    count: Value,
+    size: Value,
+    mass: Value,
+    positions: Floats,
+    orientations: Floats,
+    gravity: Floats,
+    floor_friction: Value,
+    frictions: Floats,
+) -> Floats:
+    n = min(int(count), len(frictions))  # no more than there are
+    lone = np.array([size, mass, floor_friction, *gravity], dtype=np.float64)
+    each = np.column_stack([positions[:n], orientations[:n], frictions[:n]])
+    found = np.tile(_NOBODY, (len(positions), 1))
+    found[:n] = np.frombuffer(_dropped(lone.tobytes(), each.tobytes())).reshape(n, 7)
+    return found
+
+
+@lru_cache(maxsize=512)
+def _dropped(lone: bytes, each: bytes) -> bytes:
+    """Simulate a pile once, and remember it."""
+    size, mass, floor, *gravity = np.frombuffer(lone).tolist()
+    drops = np.frombuffer(each).reshape(-1, 7)
+    names = tuple(f"block_{index}" for index in range(len(drops)))
+    structure = Structure(names)
+    parameters = default_parameters(structure)
+    common = {("world", "gravity"): gravity, ("floor", "friction"): floor}
+    common[("robot", "height")] = AWAY
+    for name, drop in zip(names, drops, strict=True):
+        common |= {(name, "size"): [size] * 3, (name, "mass"): mass, (name, "friction"): drop[6]}
+    parameters |= {key: np.asarray(value, dtype=np.float64) for key, value in common.items()}
+    scene = Scene(structure, parameters, _waiting(len(names)))
+    return _simulated(scene, size, drops[:, :6]).tobytes()
+
+
+def _waiting(count: int) -> PhysicalState:
+    """Give the state in which all blocks are in the sky, far from one another."""
+    state = PhysicalState(count)
+    state.joint_positions[:] = hardware.RAISED
+    state.positions[:, 0] = 10.0 * np.arange(count)
+    state.positions[:, 2] = SKY
+    return state
+
+
+def _simulated(scene: Scene, size: float, drops: Floats) -> Floats:
+    """Drop the blocks of a scene, shape (n, 7)."""
+    from scm_world.backends import make_backend  # it loads an engine
+
+    rest, state = scene.state, scene.state.copy()
+    substeps = round(FALL / scene.structure.preset.timestep)
+    engine = make_backend(ENGINE)
+    engine.build(scene)
+    for index, drop in enumerate(drops):
+        state.vector[:27] = rest.vector[:27]
+        state.blocks[index:] = rest.blocks[index:]
+        state.orientations[index] = turned = from_rotation_vector(drop[3:])
+        low = lowest_point(np.full(3, size), turned)
+        state.positions[index] = _lifted(drop[:3], low, state.positions[:index], size)
+        engine.apply(Difference(state=state.copy()))
+        engine.step(ControlMode.JOINT_POSITIONS, rest.joint_positions, substeps)
+        engine.read(state)
+    engine.close()
+    inside = np.clip(state.positions, *numbers.POSITION_BOUNDS.bounds((3,), {}))
+    return np.concatenate([inside, state.orientations], axis=1)
+
+
+def _lifted(place: Floats, low: float, there: Floats, size: float) -> Floats:
+    """Raise a block until it is above the floor and clear of those that lie there.
+
+    Args:
+        place: Where it should be let go, shape (3,) [m].
+        low: How far it reaches below its center [m].
+        there: Centers of the others, shape (n, 3) [m].
+        size: Edge length of all [m].
+    """
+    x, y, z = place.tolist()
+    height, reach = max(z, low), np.sqrt(3.0) * size
+    near = there[np.hypot(there[:, 0] - x, there[:, 1] - y) < reach]
+    for other in sorted(near[:, 2].tolist()):
+        if abs(height - other) < reach:
+            height = other + reach
+    return np.array([x, y, height])
+
+
+def part_of(found: Floats, *, index: float) -> Floats:
+    """Pick the position of a block, shape (..., 3) [m].
+
+    Args:
+        found: A pile, shape (..., MOST, 7).
+        index: Which block.
+    """
+    return found[..., int(index), :3]
+
+
+def turn_of(found: Floats, *, index: float) -> Floats:
+    """Pick the quaternion of a block, made a unit one, shape (..., 4); see ``part_of``."""
+    return numbers.QUATERNION_BOUNDS.nearest(found[..., int(index), 3:])

@@ -1,0 +1,80 @@
+"""Pushing: bring a block on the floor to a goal on the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Unpack, final
+
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.rewards import term
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import kernels, shapes
+from scm_world.tasks.trifinger.entities.goals import goal_position, polar, turned_on_the_floor
+from scm_world.tasks.trifinger.shapes import Place
+from scm_world.tasks.trifinger.single import GOAL, TOOL, Alike, OneBlock, tips_to_block, turned
+from scm_world.variables import Function, Parent, Variable
+
+
+@final
+class Pushing(OneBlock):
+    """One tool block and one goal block of the same size, both on the floor.
+
+    The blocks share the parent ``block.size``. An intervention on it keeps them alike; one on
+    the pose of one leaves the other where it is.
+
+    Reward terms:
+        reward.tips_to_block: How much nearer the three fingertips came to the block [m].
+        reward.block_to_goal: How much nearer the block came to the goal [m].
+        reward.orientation: By how much the angle between block and goal shrank [rad].
+        fractional_success: How much of the goal the block fills.
+
+    Args:
+        tool_block_position: Where the center of the block begins: x and y if it stands on the
+            floor, or x, y and z [m].
+        goal_block_position: Default x and y of the goal, which is on the floor [m].
+        options: Of block, goal and every task; see ``Alike`` and ``Common``.
+    """
+
+    name = "pushing"
+    default_weights = {  # noqa: RUF012 # a constant
+        "reward.tips_to_block": 750.0,
+        "reward.block_to_goal": 250.0,
+        "reward.orientation": 100.0,
+        "fractional_success": 1.0,
+    }
+    paper_weights = {"reward.orientation": 0.0}  # noqa: RUF012 # a constant
+    goal_causes = ("goal_block.polar", "goal_block.euler_orientation")
+
+    def __init__(
+        self,
+        *,
+        tool_block_position: Place = (0.0, -0.08),
+        goal_block_position: Place = (0.0, 0.08),
+        **options: Unpack[Alike],
+    ) -> None:
+        super().__init__(tool_block_position=tool_block_position, **options)
+        self._polar = self.floor_polar(goal_block_position)
+
+    def entities(self) -> Iterable[Entity]:
+        """A block and its goal."""
+        yield self.tool(spaces=self.spaces(TOOL))
+        rests = turned_on_the_floor if self.shape is None else shapes.hull_on_the_floor
+        yield self.goal(
+            polar(GOAL, self._polar, a=numbers.POLAR_A, b=numbers.POLAR_B),
+            goal_position(
+                GOAL, parents=(f"{GOAL}.polar", *self.form(GOAL)), mechanism=Function(rests)
+            ),
+            spaces=self.spaces(GOAL),
+        )
+
+    def dense(self) -> Iterable[Variable]:
+        """Declare how the fingers and the block come nearer."""
+        block = f"{TOOL}.cartesian_position"
+        yield tips_to_block()
+        yield term(
+            "reward.block_to_goal",
+            kernels.block_progress,
+            (block, Parent(block, 1), f"{GOAL}.cartesian_position"),
+            "How much nearer the block came to the goal [m].",
+        )
+        yield turned()

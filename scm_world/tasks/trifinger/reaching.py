@@ -1,0 +1,229 @@
+"""Reaching: bring each fingertip to a point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, Unpack, final
+
+import numpy as np
+from numba import njit
+
+from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world.geometry.scalars import fused, scalar
+from scm_world.tasks.arguments import checked
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.observed import Observed
+from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import hardware, kernels, shaping
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.entities.goals import GoalSphere
+from scm_world.tasks.trifinger.kinematics import inverse
+from scm_world.tasks.trifinger.observed import observe_obstacle, observe_position
+from scm_world.tasks.trifinger.scattered import COUNT, MOST, obstacle_names, scattered, scattering
+from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
+from scm_world.variables.kinds import SpaceName
+
+REACHED = 0.01  # [m] mean error of a coordinate that counts as success
+FAR = 0.03  # [m] mean error at which the fractional success is zero
+
+GOALS = tuple(f"goal_{finger}" for finger in hardware.FINGERS)
+_TINTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@njit(cache=True)
+def nearness(error: Value, reached: Value, far: Value) -> float:
+    """Compute the fractional success: 1 at ``reached`` or nearer, 0 at ``far`` or farther."""
+    near, end = scalar(reached), scalar(far)
+    return 1.0 - (min(max(scalar(error), near), end) - near) / (end - near)
+
+
+@njit(cache=True)
+def within(error: Value, reached: Value) -> int:
+    """Tell whether the error is small enough, as 0 or 1."""
+    return int(scalar(error) < scalar(reached))
+
+
+@njit(cache=True)
+def minus_norm(vector: Floats) -> float:
+    """Compute the negative Euclidean norm of a vector."""
+    total = 0.0
+    for number in vector:
+        total = fused(number, number, total)
+    return -math.sqrt(total)
+
+
+@njit(cache=True)
+def minus_distance(tips: Floats, goal_60: Floats, goal_120: Floats, goal_300: Floats) -> float:
+    """Compute the negative distance of the tips from their goals [m]."""
+    return -kernels.reach_distance(tips, goal_60, goal_120, goal_300)
+
+
+@njit(cache=True)
+def minus_change(now: Floats, before: Floats) -> float:
+    """Compute the negative norm of a difference."""
+    return -kernels.distance(now, before)
+
+
+@final
+class Reaching(TriFingerTask):
+    """Three points in the air, one for each fingertip.
+
+    Reward terms:
+        reward.tips_to_goals: How much nearer the tips came to their goals [m].
+        reward.distance: Minus the distance of the tips from their goals [m].
+        reward.torque: Minus the norm of the joint torques [N m].
+        reward.smoothness: Minus the change of the joint velocities [rad/s].
+        fractional_success: 1 within a centimeter, 0 beyond three.
+
+    Args:
+        default_goal_60: Default goal of the first finger [m].
+        default_goal_120: Of the second.
+        default_goal_300: Of the third.
+        number_of_obstacles: How many small boxes are in the way.
+        common: Options of every task; see ``Common``.
+    """
+
+    name = "reaching"
+    default_weights = {  # noqa: RUF012 # a constant
+        "reward.tips_to_goals": 100_000.0,
+        "reward.distance": 0.0,
+        "reward.torque": 0.0,
+        "reward.smoothness": 0.0,
+        FRACTION: 1.0,
+    }
+    paper_weights = {FRACTION: 0.0}  # noqa: RUF012 # a constant
+    ready_terms = shaping.REACHING
+    decided_by = (COUNT,)
+    goal_causes = tuple(f"{name}.cylindrical_position" for name in GOALS)
+
+    def __init__(
+        self,
+        *,
+        default_goal_60: tuple[float, float, float] = (0.0, 0.0, 0.10),
+        default_goal_120: tuple[float, float, float] = (0.0, 0.0, 0.13),
+        default_goal_300: tuple[float, float, float] = (0.0, 0.0, 0.16),
+        number_of_obstacles: int = 0,
+        **common: Unpack[Common],
+    ) -> None:
+        super().__init__(**common)
+        given = {"60": default_goal_60, "120": default_goal_120, "300": default_goal_300}
+        self._places = tuple(
+            checked(f"default_goal_{finger}", place, numbers.POSITION_BOUNDS, shape=(3,))
+            for finger, place in given.items()
+        )
+        allowed = Integers(0, MOST)
+        self._count = checked(COUNT, number_of_obstacles, allowed)
+
+    @property
+    def seconds(self) -> float:
+        """Five seconds [s]."""
+        return 5.0
+
+    def arrange(self, values: Values) -> int:
+        """Count the obstacles."""
+        return int(values[COUNT])
+
+    def shared(self) -> Iterable[Variable]:
+        """Obstacles."""
+        return scattering(self._count)
+
+    def _obstacles(self) -> int:
+        return self.plan if isinstance(self.plan, int) else self._count
+
+    def entities(self) -> Iterable[Entity]:
+        """Three goals, and obstacles."""
+        for name, place, tint in zip(GOALS, self._places, _TINTS, strict=True):
+            yield GoalSphere(name, position=place, radius=0.015, tint=tint)
+        yield from scattered(self._obstacles())
+
+    def readouts(self) -> Iterable[Variable]:
+        """Declare reward terms and success."""
+        yield from self._terms()
+        yield Measured(
+            name="reach_error",
+            unit="m",
+            parents=("end_effector_positions", *_positions()),
+            mechanism=Function(kernels.reach_error),
+            doc="Mean absolute error of the nine tip coordinates.",
+        )
+        yield Measured(
+            name=FRACTION,
+            bounds=UNIT,
+            parents=("reach_error",),
+            mechanism=Function(nearness, constants={"reached": REACHED, "far": FAR}),
+            doc="1 within a centimeter of the goals, 0 beyond three.",
+        )
+        yield Measured(
+            name=SUCCESS,
+            dtype="integer",
+            bounds=Integers(0, 1),
+            parents=("reach_error",),
+            mechanism=Function(within, constants={"reached": REACHED}),
+            doc="1 where the mean error is below a centimeter.",
+        )
+        yield from self.terms
+        weights = dict(self.weights)
+        if self.conventions.distance_as_reward:
+            weights["reach_error"] = weights.pop(FRACTION)
+        yield reward(weights)
+
+    def _terms(self) -> Iterable[Variable]:
+        tips, goals, speeds = "end_effector_positions", _positions(), "joint_velocities"
+        yield term(
+            "reward.tips_to_goals",
+            kernels.reach_progress,
+            (tips, Parent(tips, 1), *goals),
+            "How much nearer the tips came to their goals [m].",
+        )
+        far = "Minus the distance of the tips from their goals [m]."
+        yield term("reward.distance", minus_distance, (tips, *goals), far)
+        torque = "Minus the norm of the joint torques [N m]."
+        yield term("reward.torque", minus_norm, ("joint_torques",), torque)
+        change = "Minus the change of the joint velocities [rad/s]."
+        yield term("reward.smoothness", minus_change, (speeds, Parent(speeds, 1)), change)
+
+    def observed(self) -> Iterable[Observed]:
+        """Observe the three goals and the obstacles."""
+        for name in GOALS:
+            yield from observe_position(name)
+        for name in obstacle_names(self._obstacles()):
+            yield from observe_obstacle(name)
+
+    def goal_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Name the tips and their goals, nine numbers each [m]."""
+        return ("end_effector_positions",), _positions()
+
+    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
+        """Compute how near tips are to their goals, shape (...)."""
+        error = np.abs(np.asarray(achieved) - np.asarray(desired)).mean(axis=-1)
+        return np.asarray(1.0 - (np.clip(error, REACHED, FAR) - REACHED) / (FAR - REACHED))
+
+    def fulfilled(self, fraction: ArrayLike) -> Value:
+        """Tell whether all tips are there."""
+        return np.asarray(fraction) >= 1.0
+
+    def solution(self, values: Values) -> dict[str, Value]:
+        """Put the joints where the tips are at their goals, as far as they reach."""
+        desired = self.goals(values)[1]
+        height = float(values["robot_height"])
+        found = inverse(desired, height, np.asarray(values["joint_positions"]))
+        return {"joint_positions": found.joint_positions}
+
+    def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
+        """Draw each goal uniformly by volume."""
+        if space == "A|B":
+            return super().sample_goal(space)
+        radii = numbers.RADIUS_A if space == "A" else numbers.RADIUS_B
+        height = numbers.HEIGHT_A if space == "A" else numbers.HEIGHT_B
+        return {
+            f"{name}.cylindrical_position": Draw(
+                Cylinder(numbers.cylindrical(radii, numbers.half_height(f"{name}.size"), height))
+            )
+            for name in GOALS
+        }
+
+
+def _positions() -> tuple[str, ...]:
+    return tuple(f"{name}.cartesian_position" for name in GOALS)

@@ -1,0 +1,267 @@
+"""What the tasks have in common in which one block should fill one goal of its shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, Unpack
+
+import numpy as np
+
+from scm_world._types import ArrayLike, Floats
+from scm_world.errors import ModelError
+from scm_world.geometry.hulls import Hull, extents
+from scm_world.tasks.arguments import checked
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.rewards import FRACTION, UNIT, Common, term
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import kernels, shapes, shaping
+from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size, hull_size
+from scm_world.tasks.trifinger.entities.goals import GoalBlock, goal_orientation
+from scm_world.tasks.trifinger.reaching import minus_change
+from scm_world.tasks.trifinger.shapes import Place, Quaternion
+from scm_world.variables import Box, Draw, Function, Measured, Parent, Variable
+from scm_world.variables.kinds import SpaceName
+from scm_world.variables.spaces import Bound
+
+SIZE = "block.size"
+TOOL = "tool_block"
+GOAL = "goal_block"
+
+
+class Alike(Common, total=False):
+    """Options of tasks with one block and one goal, besides those of every task.
+
+    Attributes:
+        shape: Of block and goal; a box if None. The size of a shape cannot change.
+        tool_block_mass: Default mass of the block [kg].
+        tool_block_orientation: How it begins: quaternion (x, y, z, w). A shape is turned by so
+            much from the way its points were given.
+        goal_block_orientation: Default orientation of the goal, likewise. A shape rests like this
+            on the floor; it is turned about the vertical by ``goal_block.yaw``.
+    """
+
+    shape: Hull | None
+    tool_block_mass: float
+    tool_block_orientation: Quaternion
+    goal_block_orientation: Quaternion
+
+
+class OneBlock(Building):
+    """A task with one block and one goal of the same shape.
+
+    Args:
+        tool_block_position: Where the center of the block begins: x and y if it stands on the
+            floor, or x, y and z [m].
+        shape: See ``Alike``, also for what follows.
+        tool_block_mass: [kg].
+        tool_block_orientation: Quaternion.
+        goal_block_orientation: Quaternion.
+        common: Options of every task; see ``Common``.
+
+    Attributes:
+        shape: Of block and goal; None for a box.
+        place: x and y of the block at the start, and the height of its lowest point [m].
+    """
+
+    ready_terms = shaping.ONE_BLOCK
+
+    def __init__(
+        self,
+        *,
+        tool_block_position: Place,
+        shape: Hull | None = None,
+        tool_block_mass: float = numbers.BLOCK_MASS,
+        tool_block_orientation: Quaternion = numbers.IDENTITY,
+        goal_block_orientation: Quaternion = numbers.IDENTITY,
+        **common: Unpack[Common],
+    ) -> None:
+        super().__init__(**common)
+        if not (shape is None or isinstance(shape, Hull)):
+            raise ModelError(
+                [f"shape must be a Hull: load_hull(path) or hull_of(points); {shape!r}"]
+            )
+        self.shape = shape
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
+        self._turns = {
+            TOOL: shapes.turn_of("tool_block_orientation", tool_block_orientation, shape),
+            GOAL: shapes.turn_of("goal_block_orientation", goal_block_orientation, shape),
+        }
+        self.place = shapes.start_place(
+            "tool_block_position", tool_block_position, self._below(TOOL)
+        )
+
+    def _below(self, name: str) -> float:
+        """Compute how far block or goal reaches below its center as it begins [m]."""
+        corners = () if self.shape is None else (np.array(self.shape.vertices),)
+        size, turn = np.array(numbers.BLOCK_SIZE), np.array(self._turns[name])
+        return shapes.depth(size, turn, *corners)
+
+    def floor_polar(self, place: Place) -> tuple[float, float]:
+        """Turn the place of a goal on the floor into radius [m] and angle [rad]."""
+        x, y = shapes.floor_place("goal_block_position", place, self._below(GOAL))
+        return math.hypot(x, y), math.atan2(y, x)
+
+    def tools(self) -> tuple[str, ...]:
+        """One block."""
+        return (TOOL,)
+
+    def targets(self) -> dict[str, str]:
+        """One goal."""
+        return {GOAL: TOOL}
+
+    def shared(self) -> Iterable[Variable]:
+        """One size for both, or one shape."""
+        if self.shape is None:
+            yield block_size(SIZE)
+        else:
+            yield from (shapes.vertices(name, self.shape) for name in (TOOL, GOAL))
+
+    def size_of(self, name: str) -> Variable:
+        """Declare the size of the block or of the goal."""
+        if self.shape is None:
+            return block_size(f"{name}.size", SIZE)
+        x, y, z = extents(self.shape).tolist()
+        return hull_size(f"{name}.size", (x, y, z))
+
+    def form(self, name: str) -> tuple[str, ...]:
+        """Name the variables that say how high block or goal is on the floor."""
+        form = "size" if self.shape is None else "vertices"
+        return f"{name}.{form}", f"{name}.orientation"
+
+    def tool(
+        self,
+        *,
+        spaces: tuple[Box, Box],
+        start: Function | None = None,
+        causes: tuple[str, ...] = (),
+    ) -> Entity:
+        """Describe the block.
+
+        Args:
+            spaces: A and B of its cylindrical position.
+            start: Where it begins, if that has further causes than size, orientation and shape.
+            causes: The further ones.
+        """
+        corners = () if self.shape is None else (f"{TOOL}.vertices",)
+        block = ToolBlock(
+            TOOL,
+            size=self.size_of(TOOL),
+            mass=block_mass(f"{TOOL}.mass", default=self._mass),
+            spawn=start or Function(shapes.stand, constants={"place": self.place}),
+            spawn_from=(*corners, *causes),
+            a=spaces[0],
+            b=spaces[1],
+            hull=self.shape,
+        )
+        return shapes.Standing(block, orientation=self._turns[TOOL])
+
+    def goal(self, *place: Variable, spaces: tuple[Box, Box]) -> Entity:
+        """Describe the goal.
+
+        Args:
+            place: Its position, and the causes of it.
+            spaces: A and B of its cylindrical position.
+        """
+        (a, b), box = spaces, self.shape is None
+        pose = (*place, *self._goal_turn())
+        size = self.size_of(GOAL)
+        return GoalBlock(GOAL, size=size, pose=pose, a=a, b=b, yaw=box, hull=self.shape)
+
+    def _goal_turn(self) -> Iterable[Variable]:
+        """Declare the orientation of the goal; a shape keeps to the side it rests on."""
+        rest = self._turns[GOAL]
+        if self.shape is None:
+            yield goal_orientation(GOAL, default=rest)
+        else:
+            yaw = shapes.yaw_of(GOAL)
+            turn = Function(shapes.about_z, constants={"rest": rest})
+            yield from (yaw, goal_orientation(GOAL, parents=(yaw.name,), mechanism=turn))
+
+    def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
+        """Draw a new goal; one that is a shape is turned about the vertical only."""
+        drawn = super().sample_goal(space)
+        if self.shape is not None and drawn.pop(f"{GOAL}.euler_orientation", None):
+            drawn[f"{GOAL}.yaw"] = Draw(space)
+        return drawn
+
+    def level(self, name: str) -> Bound:
+        """Give the height of the center of block or goal on the floor, as a bound of a space."""
+        return shapes.level(f"{name}.size", self.shape, self._turns[name])
+
+    def spaces(self, name: str, *, airborne: bool = False) -> tuple[Box, Box]:
+        """Give the spaces A and B of the cylindrical position of block or goal.
+
+        Args:
+            name: Which.
+            airborne: Whether it may be in the air.
+        """
+        return shapes.block_spaces(
+            f"{name}.size", airborne=airborne, hull=self.shape, rest=self._turns[name]
+        )
+
+    def fractional_success(self) -> Measured:
+        """Declare how much of the goal is filled."""
+        if self.shape is None:
+            return super().fractional_success()
+        exact, parts = not self.conventions.aligned_boxes, ("vertices", *_POSE)
+        return Measured(
+            name=FRACTION,
+            bounds=UNIT if exact else None,
+            parents=tuple(f"{body}.{part}" for body in (TOOL, GOAL) for part in parts),
+            mechanism=Function(shapes.hull_filled if exact else shapes.hull_aligned),
+            doc="Fraction of the volume of the goal that the block fills.",
+        )
+
+    def fraction(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
+        """Compute how much of the desired poses the achieved ones fill, shape (...)."""
+        if self.shape is None:
+            return super().fraction(achieved, desired)
+        exact = not self.conventions.aligned_boxes
+        overlap = shapes.hull_filled if exact else shapes.hull_aligned
+        corners = np.array(self.shape.vertices)
+
+        def filled(have: Floats, want: Floats) -> float:
+            poses = ((corners, box[3:6], box[6:]) for box in (have, want))
+            return overlap(*(part for pose in poses for part in pose))
+
+        vectorized = np.vectorize(filled, signature="(n),(n)->()", otypes=[float])
+        have, want = (np.asarray(boxes, dtype=float) for boxes in (achieved, desired))
+        return np.asarray(vectorized(have, want))
+
+
+_POSE = ("cartesian_position", "orientation")
+
+
+def tips_to_block(block: str = TOOL) -> Measured:
+    """Declare the term for fingertips that come nearer."""
+    tips, place = "end_effector_positions", f"{block}.cartesian_position"
+    return term(
+        "reward.tips_to_block",
+        kernels.tips_progress,
+        (tips, Parent(tips, 1), place, Parent(place, 1)),
+        "How much nearer the fingertips came to the block [m].",
+    )
+
+
+def turned() -> Measured:
+    """Declare the term for a block that turns towards its goal."""
+    turn = f"{TOOL}.orientation"
+    return term(
+        "reward.orientation",
+        kernels.turn_progress,
+        (turn, Parent(turn, 1), f"{GOAL}.orientation"),
+        "By how much the angle between block and goal shrank [rad].",
+    )
+
+
+def smoothness() -> Measured:
+    """Declare the term for joints that change their velocities."""
+    speeds = "joint_velocities"
+    return term(
+        "reward.smoothness",
+        minus_change,
+        (speeds, Parent(speeds, 1)),
+        "Minus the change of the joint velocities [rad/s].",
+    )

@@ -1,0 +1,264 @@
+"""Stacking: build a tower of two blocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Unpack, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.geometry import rotation_matrix
+from scm_world.tasks.arguments import checked
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.rewards import FRACTION, Common, term
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import kernels, shapes
+from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.entities.block_world import lowest_point
+from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass, block_size, coordinates
+from scm_world.tasks.trifinger.entities.goals import (
+    GoalBlock,
+    goal_orientation,
+    goal_position,
+    polar,
+    turned_on_the_floor,
+)
+from scm_world.tasks.trifinger.shapes import Place, Quaternion
+from scm_world.tasks.trifinger.single import SIZE, smoothness
+from scm_world.variables import Affine, Function, Parent, Variable
+
+TOWER = "goal_tower"
+TOOLS = ("tool_block_1", "tool_block_2")
+GOALS = ("goal_block_1", "goal_block_2")
+GAP = 0.005  # [m] at least between the blocks at the start
+
+
+def tower_center(polar_position: Floats, size: Floats, orientation: Floats) -> Floats:
+    """Put a tower of two blocks on the floor: its lowest point touches it.
+
+    Args:
+        polar_position: Radius [m] and angle [rad], shape (..., 2).
+        size: Edge lengths of a block, shape (..., 3) [m].
+        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
+
+    Returns:
+        The center of the tower, shape (..., 3) [m].
+    """
+    return turned_on_the_floor(polar_position, size * [1.0, 1.0, 2.0], orientation)
+
+
+def floor_of_tower(center: Floats, size: Floats, orientation: Floats, *, side: float) -> Floats:
+    """Find the center of a block of the tower, shape (..., 3) [m].
+
+    Args:
+        center: Of the tower, shape (..., 3) [m].
+        size: Edge lengths of a block, shape (..., 3) [m].
+        orientation: Of the tower: quaternion (x, y, z, w), shape (..., 4).
+        side: -1 for the lower block, 1 for the upper one.
+    """
+    upwards = rotation_matrix(orientation)[..., :, 2]
+    return np.asarray(center + (0.5 * side) * size[..., 2:] * upwards)
+
+
+def beside(size: Floats, orientation: Floats, *, place: Floats, other: Floats) -> Floats:
+    """Stand a block on the floor, at least ``GAP`` away from another one of the same size.
+
+    Args:
+        size: Edge lengths, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w).
+        place: x, y and the height of the lowest point where it stands if there is room, shape
+            (3,) [m]. Else it is farther away in the same direction.
+        other: Those of the other block, shape (3,) [m].
+
+    Returns:
+        The center, shape (3,) [m].
+    """
+    offset, room = place[:2] - other[:2], size[:2] + GAP
+    apart = np.abs(offset) > 1e-9
+    farther = max(1.0, float((room[apart] / np.abs(offset[apart])).min(initial=np.inf)))
+    x, y = (other[:2] + (farther if math.isfinite(farther) else 1.0) * offset).tolist()
+    return np.array([x, y, place[2] + lowest_point(size, orientation)])
+
+
+@final
+class GoalTower(Entity):
+    """The place of a tower of two blocks.
+
+    Args:
+        place: Default radius [m] and angle [rad].
+        orientation: Default orientation: quaternion (x, y, z, w).
+    """
+
+    name = TOWER
+
+    def __init__(self, place: tuple[float, float], orientation: Quaternion) -> None:
+        self._place, self._orientation = place, orientation
+
+    def variables(self) -> Iterable[Variable]:
+        """Declare position and orientation, in all coordinates."""
+        yield polar(TOWER, self._place, a=numbers.POLAR_A, b=numbers.POLAR_B)
+        causes = (f"{TOWER}.polar", SIZE, f"{TOWER}.orientation")
+        yield goal_position(TOWER, parents=causes, mechanism=Function(tower_center))
+        yield goal_orientation(TOWER, default=self._orientation)
+        height = Affine(parent=SIZE, index=2)
+        yield from coordinates(
+            TOWER,
+            a=numbers.cylindrical(numbers.RADIUS_A, height, height),
+            b=numbers.cylindrical(numbers.RADIUS_B, height, height),
+        )
+
+
+@final
+class Stacking2(Building):
+    """Two blocks on the floor, and two goals of the same size that stand on one another.
+
+    All four share the parent ``block.size``. The goals follow ``goal_tower``, whose center is as
+    high as a block.
+
+    Reward terms:
+        reward.tips_to_block: How much nearer the three fingertips came to the first block, and to
+            the second one once the first is at its goal [m].
+        reward.block_to_goal: How much nearer the first block came to its goal [m].
+        reward.block_to_height: How much nearer the second block came to the height of its goal
+            afterwards [m].
+        reward.block_to_block: How much nearer it came to the first one, seen from above, while it
+            is higher than its goal [m].
+        reward.smoothness: Minus the change of the joint velocities [rad/s].
+        fractional_success: How much of the two goals the blocks fill.
+
+    Args:
+        tool_block_mass: Default mass of a block [kg].
+        tool_block_size: Default edge length of all blocks and goals [m].
+        tool_block_1_position: Where the center of the first block begins: x and y if it stands on
+            the floor, or x, y and z [m].
+        tool_block_1_orientation: How it begins: quaternion (x, y, z, w).
+        tool_block_2_position: Of the second block; it begins farther away from the first one if
+            they are too large for that.
+        tool_block_2_orientation: Likewise.
+        goal_position: Default x and y of the tower, whose lower block is on the floor [m].
+        goal_orientation: Default orientation of the tower.
+        common: Options of every task; see ``Common``.
+    """
+
+    name = "stacking2"
+    default_weights = {  # noqa: RUF012 # a constant
+        "reward.tips_to_block": 750.0,
+        "reward.block_to_goal": 250.0,
+        "reward.block_to_height": 250.0,
+        "reward.block_to_block": 125.0,
+        "reward.smoothness": 0.005,
+        FRACTION: 1.0,
+    }
+    goal_causes = (f"{TOWER}.polar", f"{TOWER}.euler_orientation")
+
+    def __init__(
+        self,
+        *,
+        tool_block_mass: float = numbers.BLOCK_MASS,
+        tool_block_size: float = numbers.BLOCK_SIZE[0],
+        tool_block_1_position: Place = (0.0, 0.0),
+        tool_block_1_orientation: Quaternion = numbers.IDENTITY,
+        tool_block_2_position: Place = (0.01, 0.08),
+        tool_block_2_orientation: Quaternion = numbers.IDENTITY,
+        goal_position: Place = (-0.06, -0.06),
+        goal_orientation: Quaternion = numbers.IDENTITY,
+        **common: Unpack[Common],
+    ) -> None:
+        super().__init__(**common)
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
+        edge = checked("tool_block_size", tool_block_size, numbers.SIZE_BOUNDS)
+        self._size = (edge, edge, edge)
+        given = (
+            (tool_block_1_position, tool_block_1_orientation),
+            (tool_block_2_position, tool_block_2_orientation),
+        )
+        starts = [self._start(t, *pose) for t, pose in zip(TOOLS, given, strict=True)]
+        self._places, self._turns = zip(*starts, strict=True)
+        self._tower_turn = shapes.unit_quaternion("goal_orientation", goal_orientation)
+        size, turn = np.array(self._size), np.array(self._tower_turn)
+        lower = floor_of_tower(tower_center(np.zeros(2), size, turn), size, turn, side=-1.0)
+        x, y = shapes.floor_place("goal_position", goal_position, float(lower[2]))
+        self._tower = math.hypot(x, y), math.atan2(y, x)
+
+    def _start(
+        self, tool: str, place: Place, orientation: Quaternion
+    ) -> tuple[tuple[float, float, float], Quaternion]:
+        turn = shapes.unit_quaternion(f"{tool}_orientation", orientation)
+        below = lowest_point(np.array(self._size), np.array(turn))
+        return shapes.start_place(f"{tool}_position", place, below), turn
+
+    def tools(self) -> tuple[str, ...]:
+        """Two blocks."""
+        return TOOLS
+
+    def targets(self) -> dict[str, str]:
+        """Two goals, the lower one first."""
+        return dict(zip(GOALS, TOOLS, strict=True))
+
+    def shared(self) -> Iterable[Variable]:
+        """One size for all."""
+        yield block_size(SIZE, default=self._size)
+
+    def entities(self) -> Iterable[Entity]:
+        """Two blocks, a tower, and its two floors."""
+        first, second = self._places
+        yield self._tool(0, Function(shapes.stand, constants={"place": first}))
+        yield self._tool(1, Function(beside, constants={"place": second, "other": first}))
+        yield GoalTower(self._tower, self._tower_turn)
+        causes = (f"{TOWER}.cartesian_position", SIZE, f"{TOWER}.orientation")
+        for name, side in zip(GOALS, (-1.0, 1.0), strict=True):
+            center = Function(floor_of_tower, constants={"side": side})
+            yield GoalBlock(
+                name,
+                size=block_size(f"{name}.size", SIZE, spaces=False),
+                pose=(
+                    goal_position(name, parents=causes, mechanism=center),
+                    goal_orientation(name, parents=(f"{TOWER}.orientation",)),
+                ),
+                yaw=False,
+            )
+
+    def _tool(self, index: int, start: Function) -> Entity:
+        name, size = TOOLS[index], f"{TOOLS[index]}.size"
+        a, b = shapes.block_spaces(size, airborne=self.conventions.published_spaces)
+        block = ToolBlock(
+            name,
+            size=block_size(size, SIZE, spaces=False),
+            mass=block_mass(f"{name}.mass", default=self._mass),
+            spawn=start,
+            a=a,
+            b=b,
+        )
+        return shapes.Standing(block, orientation=self._turns[index])
+
+    def dense(self) -> Iterable[Variable]:
+        """Declare how blocks and fingers come nearer, and how steady they are."""
+        tips = "end_effector_positions"
+        first, second, goal, top = (f"{name}.cartesian_position" for name in (*TOOLS, *GOALS))
+        yield term(
+            "reward.tips_to_block",
+            kernels.stacking_tips_progress,
+            (tips, Parent(tips, 1), first, Parent(first, 1), second, Parent(second, 1), goal),
+            "How much nearer the fingertips came to the block whose turn it is [m].",
+        )
+        yield term(
+            "reward.block_to_goal",
+            kernels.placing_progress,
+            (first, Parent(first, 1), goal),
+            "How much nearer the first block came to its goal [m].",
+        )
+        yield term(
+            "reward.block_to_height",
+            kernels.lifting_progress,
+            (first, goal, second, Parent(second, 1), top),
+            "How much nearer the second block came to the height of its goal [m].",
+        )
+        yield term(
+            "reward.block_to_block",
+            kernels.stacking_progress,
+            (first, Parent(first, 1), goal, second, Parent(second, 1), top),
+            "How much nearer the second block came to the first one, seen from above [m].",
+        )
+        yield smoothness()

@@ -1,0 +1,226 @@
+"""Walls: what the families have in common in which blocks form levels on one another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, ClassVar, Unpack
+
+import numpy as np
+
+from scm_world._types import Value, Values
+from scm_world.errors import InterventionError
+from scm_world.tasks.arguments import checked
+from scm_world.tasks.composition import Entity
+from scm_world.tasks.rewards import FRACTION, Common
+from scm_world.tasks.trifinger import catalogue as numbers
+from scm_world.tasks.trifinger import hardware, layouts
+from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.generated import MASS, blocks_mass, part_goal, part_tool
+from scm_world.variables import Box, Categories, Derived, Exogenous, Function, Integers, Variable
+from scm_world.variables.kinds import SpaceName
+
+LEVELS = "stack_levels"
+SIZE = "blocks_min_size"
+WIDTH = "max_level_width"
+PATTERN = "wall_pattern"
+NOISE = "wall_noise"
+LAYOUT = "wall.layout"
+RANDOM = 1  # the category of ``wall_pattern``
+
+LOW = 0.25  # [m] what is lower fits under the raised fingers
+
+
+class Walls(Building):
+    """A wall of blocks.
+
+    How many levels it has, how wide it is and how small its blocks are, are variables, and so is
+    the noise of a random wall: an intervention on one of the others keeps it. The layout follows
+    from them, or can be set as a whole. The fingers begin raised: at rest they would stand where
+    larger blocks begin.
+
+    Attributes:
+        levels_a: Space A of the number of levels.
+
+    Args:
+        tool_block_mass: Default mass of a block [kg].
+        blocks_min_size: Default depth, height and least width of a block [m].
+        num_of_levels: Default number of levels.
+        max_level_width: Default greatest width of a level [m].
+        common: Options of every task; see ``Common``.
+
+    Raises:
+        UnknownOption: An argument is out of the bounds of its variable.
+    """
+
+    default_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
+    decided_by: ClassVar[tuple[str, ...]] = (LAYOUT,)
+    goal_causes = (LEVELS, MASS, SIZE, WIDTH, NOISE)
+    interleaved = True
+    rest = hardware.RAISED
+    levels_a: ClassVar[Integers] = numbers.STACK_LEVELS_A
+
+    def __init__(
+        self,
+        *,
+        tool_block_mass: float = numbers.BLOCKS_MASS,
+        blocks_min_size: float = 0.035,
+        num_of_levels: int = 5,
+        max_level_width: float = 0.25,
+        **common: Unpack[Common],
+    ) -> None:
+        super().__init__(**common)
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
+        self._size = checked(SIZE, blocks_min_size, numbers.MIN_SIZE_BOUNDS)
+        self._levels = checked("num_of_levels", num_of_levels, numbers.STACK_LEVELS_BOUNDS)
+        self._width = checked(WIDTH, max_level_width, numbers.LEVEL_WIDTH_BOUNDS)
+
+    def arrange(self, values: Values) -> Any:
+        """Count the blocks of each level.
+
+        Raises:
+            InterventionError: There are none.
+        """
+        counts = layouts.counts(values[LAYOUT])
+        if not counts:
+            message = f"do({LAYOUT}): a wall has at least one block; give one a width above zero"
+            raise InterventionError(message, variable=LAYOUT)
+        return counts
+
+    def counts(self) -> tuple[int, ...]:
+        """Say how many blocks each level has."""
+        return self.plan or self.regular()  # type: ignore[return-value] # what arrange gives
+
+    def regular(self) -> tuple[int, ...]:
+        """Count the blocks of each level of the wall that there is without interventions."""
+        levels, size, width = (np.array(x) for x in (self._levels, self._size, self._width))
+        unused = np.zeros((layouts.MAX_LEVELS, 3))
+        return layouts.counts(layouts.layout(levels, size, width, np.array(0), unused))
+
+    def _bricks(self) -> Iterable[tuple[str, dict[str, float]]]:
+        for level, count in enumerate(self.counts()):
+            for num in range(count):
+                yield f"level_{level}_num_{num}", {"level": float(level), "num": float(num)}
+
+    def wanted(self, level: int) -> bool:
+        """Tell whether the blocks of a level have goals."""
+        return True
+
+    def tools(self) -> tuple[str, ...]:
+        """Name the blocks, level by level."""
+        return tuple(f"tool_{name}" for name, _ in self._bricks())
+
+    def targets(self) -> dict[str, str]:
+        """Name the goals, level by level."""
+        bricks = self._bricks()
+        return {f"goal_{n}": f"tool_{n}" for n, which in bricks if self.wanted(int(which["level"]))}
+
+    def entities(self) -> Iterable[Entity]:
+        """A block, and perhaps a goal, for each place in the wall."""
+        airborne = self.conventions.published_spaces
+        for name, which in self._bricks():
+            size = ((LAYOUT, SIZE), Function(layouts.brick_size, constants=which))
+            first = Function(layouts.start, constants={**which, "airborne": float(airborne)})
+            spawn = ((LAYOUT, SIZE, PATTERN), first)
+            yield part_tool(f"tool_{name}", size=size, spawn=spawn, airborne=airborne)
+        for name, which in self._bricks():
+            if self.wanted(int(which["level"])):
+                size = ((LAYOUT, SIZE), Function(layouts.brick_size, constants=which))
+                where = ((LAYOUT, SIZE), Function(layouts.brick_place, constants=which))
+                yield part_goal(f"goal_{name}", size=size, position=where)
+
+    def solution(self, values: Values) -> dict[str, Value]:
+        """Build the wall: all of it, so that it stands, with the fingers out of its way."""
+        found = {}
+        for name, which in self._bricks():
+            place = layouts.brick_place(values[LAYOUT], values[SIZE], **which)
+            found[f"tool_{name}.cartesian_position"] = place
+            found[f"tool_{name}.orientation"] = np.array(numbers.IDENTITY)
+        if len(self.counts()) * float(values[SIZE]) > LOW:
+            found["joint_positions"] = np.array(hardware.ASIDE)
+        return found
+
+    def nearby(self, values: Values) -> Iterable[dict[str, Value]]:
+        """Take the last block away, or put one more beside it or on it."""
+        layout = np.array(values[LAYOUT])
+        level = int(np.flatnonzero(layout[:, :, 2].any(axis=1))[-1])
+        last = int(np.flatnonzero(layout[level, :, 2])[-1])
+        fewer, more = layout.copy(), layout.copy()
+        fewer[level, last] = 0.0
+        if last + 1 < layout.shape[1]:
+            more[level, last + 1] = layout[level, last] + [layout[level, last, 2], 0.0, 0.0]
+            yield {LAYOUT: more}
+        if level or last:
+            yield {LAYOUT: fewer}
+
+    def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
+        """Draw a new random wall."""
+        return {**super().sample_goal(space), PATTERN: RANDOM}
+
+    def shared(self) -> Iterable[Variable]:
+        """Declare the wall."""
+        yield blocks_mass(self._mass)
+        yield from self._numbers()
+        yield from _noise()
+        yield Derived(
+            name=LAYOUT,
+            unit="m",
+            shape=layouts.SHAPE,
+            bounds=Box(-0.3, 0.3),
+            parents=(LEVELS, SIZE, WIDTH, PATTERN, NOISE),
+            mechanism=Function(layouts.layout),
+            doc="For each place in each level: x and y of a block, and its width, or zero.",
+        )
+
+    def _numbers(self) -> Iterable[Variable]:
+        """Declare what the predecessor has too."""
+        yield Exogenous(
+            name=LEVELS,
+            dtype="integer",
+            bounds=numbers.STACK_LEVELS_BOUNDS,
+            a=self.levels_a,
+            b=numbers.STACK_LEVELS_B,
+            default=self._levels,
+            doc="How many levels the wall has, as far as they fit into the arena.",
+        )
+        yield Exogenous(
+            name=SIZE,
+            unit="m",
+            bounds=numbers.MIN_SIZE_BOUNDS,
+            a=numbers.MIN_SIZE_A,
+            b=numbers.MIN_SIZE_B,
+            default=self._size,
+            doc="Depth and height of every block, and the least width.",
+        )
+        yield Exogenous(
+            name=WIDTH,
+            unit="m",
+            bounds=numbers.LEVEL_WIDTH_BOUNDS,
+            a=numbers.LEVEL_WIDTH_A,
+            b=numbers.LEVEL_WIDTH_B,
+            default=self._width,
+            doc="Greatest width of a level; it is never narrower than a block.",
+        )
+
+
+def _noise() -> Iterable[Variable]:
+    """Declare what the predecessor takes from a global generator."""
+    both = Categories((0, RANDOM))
+    yield Exogenous(
+        name=PATTERN,
+        dtype="categorical",
+        bounds=both,
+        a=both,
+        b=both,
+        default=0,
+        doc="How the blocks are laid out: 0 is regular, 1 is random.",
+    )
+    unit = Box(0.0, 1.0)
+    yield Exogenous(
+        name=NOISE,
+        shape=(layouts.MAX_LEVELS, 3),
+        bounds=unit,
+        a=unit,
+        b=unit,
+        default=(0.5,) * (3 * layouts.MAX_LEVELS),
+        doc="What a random wall is made of: x, y and width of each level, as fractions.",
+    )

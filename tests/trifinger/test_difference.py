@@ -1,0 +1,83 @@
+"""Facts about what a change of structure leaves as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from scm_world.geometry.hulls import box_hull
+from scm_world.models import Difference, Scene, diff
+from scm_world.models.scene import complete
+from scm_world.tasks.trifinger.controller import ControllerSpec
+from scm_world.tasks.trifinger.presets import PRECISE
+from scm_world.tasks.trifinger.structure import (
+    Structure,
+    controller_spec,
+    default_scene,
+    parameter_keys,
+)
+from scm_world.testing.scenes import busy_scene, other_value
+
+
+def changed_scene() -> Scene:
+    """Give every parameter of the busy scene another value."""
+    scene = busy_scene()
+    other = {key: other_value(key, value) for key, value in scene.parameters.items()}
+    return scene.with_(parameters=other)
+
+
+def test_what_stays_keeps_everything() -> None:
+    """When blocks and obstacles come, all that was there keeps parameters and state."""
+    now = changed_scene()
+    blocks = ("new", *now.structure.blocks)
+    more = replace(now.structure, blocks=blocks, obstacles=("wall", "ledge"))
+    change = complete(now, more, Difference(structure=more))
+    assert set(change.parameters) == set(parameter_keys(more))
+    for key, value in now.parameters.items():
+        assert np.array_equal(change.parameters[key], value)
+    assert change.state is not None
+    assert np.array_equal(change.state.blocks[1:], now.state.blocks)
+    default = default_scene(more).parameters
+    assert np.array_equal(change.parameters["wall", "position"], default["wall", "position"])
+
+
+def test_a_preset_is_a_structure() -> None:
+    """Another preset is a change of structure in which every parameter and the state stay."""
+    now = changed_scene()
+    finer = replace(now.structure, preset=PRECISE)
+    difference = diff(now, now.with_(structure=finer))
+    assert difference.structure == finer
+    change = complete(now, finer, Difference(structure=finer))
+    assert change.state == now.state
+    assert all(np.array_equal(change.parameters[k], v) for k, v in now.parameters.items())
+
+
+def test_a_shape_is_a_structure() -> None:
+    """A box that becomes a hull keeps its mass and its place, and loses its size."""
+    now = changed_scene()
+    hulls = (*now.structure.hulls, ("near", box_hull([0.03, 0.04, 0.05])))
+    shaped = replace(now.structure, hulls=hulls)
+    assert diff(now, now.with_(structure=shaped)).structure == shaped
+    change = complete(now, shaped, Difference(structure=shaped))
+    assert change.state == now.state
+    assert set(now.parameters) - set(change.parameters) == {("near", "size")}
+    assert change.parameters["near", "mass"] == now.parameters["near", "mass"]
+
+
+def test_what_is_said_counts() -> None:
+    """Parameters in the difference go before those that stay and before the defaults."""
+    now = changed_scene()
+    said = {("ledge", "friction"): np.array(0.9), ("wall", "size"): np.array([0.1, 0.2, 0.3])}
+    more = replace(now.structure, obstacles=("ledge", "wall"))
+    change = complete(now, more, Difference(more, said))
+    assert all(np.array_equal(change.parameters[key], value) for key, value in said.items())
+
+
+def test_default_parameters_specify_the_published_controller() -> None:
+    """The controller of the default parameters is the default one, and it follows them."""
+    parameters = dict(default_scene(Structure()).parameters)
+    assert controller_spec(parameters) == ControllerSpec()
+    parameters["controller", "torque_limit"] = np.array(0.2)
+    parameters["controller", "velocity_gains"] = np.array([0.3, 0.2, 0.1])
+    assert controller_spec(parameters) == ControllerSpec(kd=(0.3, 0.2, 0.1), limit=0.2)
