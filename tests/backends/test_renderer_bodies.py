@@ -9,13 +9,13 @@ import pytest
 
 from scm_world._types import Floats
 from scm_world.backends.renderer import body_names, render
-from scm_world.backends.renderer.bodies import MOUNT
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.geometry.hulls import Hull, box_hull, hull_of
 from scm_world.models import Goal, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
+from scm_world.tasks.trifinger.drawing import MOUNT
 from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.structure import Structure, default_scene
 

@@ -17,9 +17,10 @@ from scm_world.errors import (
 from scm_world.geometry import from_rotation_vector
 from scm_world.queries import World
 from scm_world.queries.planning import CrossEntropy, Model, Score, Search, nearness
-from scm_world.queries.planning.scores import as_score, corners
+from scm_world.queries.planning.scores import as_score
 from scm_world.queries.policies import NAMED
 from scm_world.tasks import Pushing, Reaching
+from scm_world.tasks.trifinger.building import corners
 from scm_world.variables import Noise
 from scm_world.world import World as Simulated
 
