@@ -32,6 +32,7 @@ from scm_world.backends.renderer import (
     render,
     scene_camera,
 )
+from scm_world.backends.step import StepModel
 from scm_world.errors import EngineError, ModelError, UnknownOption
 from scm_world.models import Goal, Model, Scene
 from scm_world.models.camera import Camera
@@ -284,8 +285,9 @@ def test_unknown_renderer(scene: Scene) -> None:
 
 def test_what_has_no_shapes_has_no_picture() -> None:
     """A system of equations cannot be drawn, and the error says so."""
-    with pytest.raises(ModelError, match="int says nothing about shapes"):
-        picture(Scene(structure=3, parameters={}, state=None))
+    equations = StepModel("still", lambda *given: {}, 0.1, (), ())
+    with pytest.raises(ModelError, match="StepModel says nothing about shapes"):
+        picture(Scene(structure=equations, parameters={}, state=None))
 
 
 def test_without_opengl_pictures_are_ours(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
