@@ -21,7 +21,7 @@ from scm_world.errors import MissingExtra, ModelError, UnknownOption, Unreadable
 from scm_world.graph import SCM, Edge, two_slice
 from scm_world.graph import exchange as ex
 from scm_world.graph.exchange import CausalGraph, Node, causal_graph, read_graph, write_graph
-from scm_world.graph.exchange.layout import CHAR, PAD, lay_out
+from scm_world.graph.exchange.html import CHAR, PAD, lay_out
 from scm_world.tasks import TASKS
 from scm_world.variables import Affine, Box, Either, Exogenous, Measured, Parent, Switch
 from scm_world.world import World
@@ -414,20 +414,24 @@ def overlap(one: Any, other: Any) -> bool:
 
 def test_nothing_overlaps_and_every_text_fits(graph: CausalGraph) -> None:
     """Boxes lie apart and in the picture, nodes in their boxes, labels in their nodes."""
-    made = lay_out(graph)
-    assert not any(overlap(a, b) for a, b in itertools.combinations(made.boxes.values(), 2))
-    for box in made.boxes.values():
-        assert 0 <= box.x < box.right <= made.width
-        assert 0 <= box.y < box.bottom <= made.height
-    assert set(made.nodes) == set(graph.names)
-    for name, place in made.nodes.items():
-        boxes = [b for b in made.boxes.values() if overlap(b, place)]
-        assert len(boxes) == 1
-        assert boxes[0].x < place.x < place.right < boxes[0].right
-        assert boxes[0].y < place.y < place.bottom < boxes[0].bottom
-        assert CHAR * len(made.labels[name]) + 2 * PAD <= place.width
-    for one, other in itertools.pairwise(sorted(made.nodes.values(), key=lambda p: (p.x, p.y))):
+    boxes, places, labels = lay_out(graph)
+    assert not any(overlap(a, b) for a, b in itertools.combinations(boxes.values(), 2))
+    assert all(box.x >= 0 and box.y >= 0 for box in boxes.values())
+    assert set(places) == set(graph.names)
+    for name, place in places.items():
+        (box,) = (box for box in boxes.values() if overlap(box, place))
+        assert box.x < place.x < place.right < box.right
+        assert box.y < place.y < place.bottom < box.bottom
+        assert CHAR * len(labels[name]) + 2 * PAD <= place.width
+    for one, other in itertools.pairwise(sorted(places.values(), key=lambda p: (p.x, p.y))):
         assert not overlap(one, other)
+
+
+def test_causes_stand_left_of_effects_in_other_entities() -> None:
+    """A chain of entities goes from left to right."""
+    nodes = tuple(Node(f"{name}.x") for name in "cab")
+    boxes, _, _ = lay_out(CausalGraph(nodes, (Edge("a.x", "b.x"), Edge("b.x", "c.x", 1))))
+    assert boxes["a"].right < boxes["b"].x < boxes["b"].right < boxes["c"].x
 
 
 def test_the_page_needs_nothing_else(graph: CausalGraph) -> None:

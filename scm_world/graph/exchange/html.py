@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from html import escape
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import final
 
-from scm_world.graph.exchange.layout import HEAD, PAD, Layout, Place, lay_out
+import networkx as nx
+
+from scm_world.graph.exchange.layout import forward, heights_of
 from scm_world.graph.exchange.model import CausalGraph, Node
 from scm_world.graph.structure import Edge
+from scm_world.output.pages import render
 
 FILLS = {
     "exogenous": "#fff1c9",
@@ -16,34 +20,38 @@ FILLS = {
     "action": "#f7d6d0",
     "fixed": "#e6e6e6",
 }
-FACTS = ("unit", "value_shape", "bounds", "a", "b", "doc")
-WORDS = {"value_shape": "shape", "a": "A", "b": "B", "doc": ""}
+FACTS = {"unit": "unit: ", "value_shape": "shape: ", "bounds": "bounds: ", "a": "A: ", "b": "B: ",
+         "doc": ""}  # fmt: skip
 MOST = 12  # names in one line of a title
-FEW = 1500  # edges: of more than these, only those of the node under the pointer are seen
+CHAR, ROW, PAD, HEAD = 6.8, 19.0, 8.0, 24.0  # [pixels]: a character of 11 pixels, a node, …
+GAP, BETWEEN = 14.0, 84.0  # [pixels]: below a box, beside it
+WIDTH = 900.0  # [pixels] at least, of rows of boxes that no edge connects
 
-STYLE = """
-body{margin:0;font:13px sans-serif;color:#222;background:#fff}
-header{padding:10px 14px 0}header h1{font-size:17px;margin:0 12px 0 0;display:inline}
-header i{display:inline-block;width:11px;height:11px;border:1px solid #6b7686;margin:0 4px 0 14px}
-svg{display:block}text{font:11px "DejaVu Sans Mono",Menlo,Consolas,monospace;fill:#222}
-text.t{font-weight:bold;fill:#4a5568}.b{fill:#5a6b8c;fill-opacity:.07;stroke:#c9ced6}
-.n rect{stroke:#6b7686;stroke-width:.7}.n{cursor:pointer}
-.e{fill:none;stroke:#5f6b7a;stroke-width:1;opacity:.28}.l{stroke:#9a6fb0;stroke-dasharray:4 2.5}
-.many .e{visibility:hidden}.on .e{opacity:.05}.on .n{opacity:.3}
-.on .e.in,.on .e.out{visibility:visible;opacity:1;stroke-width:1.7}
-.e.in{stroke:#1f6fb4}.e.out{stroke:#d9660a}.on .n.hot{opacity:1}
-"""
 
-SCRIPT = """
-const svg=document.querySelector("svg"),nodes=[...svg.querySelectorAll(".n")],of=nodes.map(()=>[]);
-for(const e of svg.querySelectorAll(".e")){of[e.dataset.c].push(e);
-  if(e.dataset.c!==e.dataset.e)of[e.dataset.e].push(e)}
-function show(i,on){svg.classList.toggle("on",on);nodes[i].classList.toggle("hot",on);
-  for(const e of of[i]){const out=e.dataset.c==i;e.classList.toggle(out?"out":"in",on);
-    nodes[out?e.dataset.e:e.dataset.c].classList.toggle("hot",on)}}
-nodes.forEach((n,i)=>{n.addEventListener("pointerenter",()=>show(i,true));
-  n.addEventListener("pointerleave",()=>show(i,false))});
-"""
+@final
+@dataclass(frozen=True)
+class Place:
+    """A rectangle [pixels], y downwards."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    @property
+    def right(self) -> float:
+        """Its right side."""
+        return self.x + self.width
+
+    @property
+    def bottom(self) -> float:
+        """Its lower side."""
+        return self.y + self.height
+
+    @property
+    def middle(self) -> float:
+        """Halfway down."""
+        return self.y + self.height / 2
 
 
 def to_html(graph: CausalGraph, *, title: str = "Causal graph") -> str:
@@ -65,59 +73,98 @@ def to_html(graph: CausalGraph, *, title: str = "Causal graph") -> str:
         >>> page.count('class="n"'), "http" in page.replace("http://www.w3.org/2000/svg", "")
         (1, False)
     """
-    made = lay_out(graph)
-    size = f"{len(graph.nodes)} variables, {len(graph.edges)} edges"
-    kinds = [kind for kind in FILLS if any(node.kind == kind for node in graph.nodes)]
-    legend = "".join(f'<i style="background:{FILLS[kind]}"></i>{kind}' for kind in kinds)
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
-            f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>",
-            f"<header><h1>{escape(title)}</h1>{size} {legend} &nbsp; dashed: one control step "
-            "later; point at a variable: <b style='color:#1f6fb4'>causes</b>, "
-            "<b style='color:#d9660a'>effects</b></header>",
-            _picture(graph, made),
-            f"<script>{SCRIPT}</script></body></html>",
-        ]
-    )
-
-
-def _picture(graph: CausalGraph, made: Layout) -> str:
-    many = ' class="many"' if len(graph.edges) > FEW else ""
-    size = f'width="{made.width:.0f}" height="{made.height:.0f}"'
-    frame = f'viewBox="0 0 {made.width:.0f} {made.height:.0f}"'
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg"{many} {size} {frame}>',
-            '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="6" '
-            'markerHeight="6" markerUnits="userSpaceOnUse" orient="auto">'
-            '<path d="M0 0 8 4 0 8z" fill="#5f6b7a"/></marker></defs>',
-            *(_box(title, place) for title, place in made.boxes.items()),
-            *_edges(graph, made),
-            *(_node(graph, made, i, node) for i, node in enumerate(graph.nodes)),
-            "</svg>",
-        ]
-    )
-
-
-def _rect(place: Place, about: str) -> str:
-    corner = f'x="{place.x:.1f}" y="{place.y:.1f}"'
-    return f'<rect {corner} width="{place.width:.1f}" height="{place.height:.1f}" rx="4" {about}/>'
-
-
-def _box(title: str, place: Place) -> str:
-    text = f'<text class="t" x="{place.x + PAD:.1f}" y="{place.y + HEAD - 9:.1f}">{escape(title)}'
-    return _rect(place, 'class="b"') + text + "</text>"
-
-
-def _edges(graph: CausalGraph, made: Layout) -> Iterable[str]:
+    boxes, places, labels = lay_out(graph)
     at = {name: i for i, name in enumerate(graph.names)}
+    kinds = {node.kind for node in graph.nodes}
+    return render(
+        "graph/exchange/graph.html",
+        title=title,
+        size=len(graph.edges),
+        kinds={kind: fill for kind, fill in FILLS.items() if kind in kinds},
+        width=round(max((box.right for box in boxes.values()), default=0.0) + BETWEEN),
+        height=round(max((box.bottom for box in boxes.values()), default=0.0) + GAP),
+        pad=PAD,
+        head=HEAD,
+        boxes=boxes,
+        edges=[
+            (at[e.cause], at[e.effect], e.lag, _line(places[e.cause], places[e.effect]))
+            for e in graph.edges
+            if e.cause != e.effect
+        ],
+        nodes=[
+            (places[n.name], FILLS.get(n.kind, "#ffffff"), describe(graph, n), labels[n.name])
+            for n in graph.nodes
+        ],
+    ).removesuffix("\n")
+
+
+def lay_out(graph: CausalGraph) -> tuple[dict[str, Place], dict[str, Place], dict[str, str]]:
+    """Return the boxes of entities by title, and places and labels of nodes by name.
+
+    A box holds what has the same name before the dot, or else the same role. It stands in the mean
+    column of its nodes; boxes that no edge connects to another one come last, below.
+    """
+    whole = nx.DiGraph()
+    whole.add_nodes_from(graph.names)
     for edge in graph.edges:
-        if edge.cause != edge.effect:
-            line = _line(made.nodes[edge.cause], made.nodes[edge.effect])
-            kind = "e l" if edge.lag else "e"
-            ends = f'data-c="{at[edge.cause]}" data-e="{at[edge.effect]}"'
-            yield f'<path class="{kind}" {ends} d="{line}" marker-end="url(#tip)"/>'
+        lags = whole.get_edge_data(edge.cause, edge.effect, {"lags": set()})["lags"]
+        whole.add_edge(edge.cause, edge.effect, lags={*lags, edge.lag})
+    layers = enumerate(nx.topological_generations(forward(whole)))
+    depth = {name: number for number, layer in layers for name in layer}
+    groups: dict[str, list[Node]] = {}
+    for node in sorted(graph.nodes, key=lambda node: depth[node.name]):
+        before, dot, _ = node.name.partition(".")
+        title = before if dot else node.role or node.kind or "variables"
+        groups.setdefault(title, []).append(node)
+    of = {node.name: title for title, nodes in groups.items() for node in nodes}
+    labels = {name: name.removeprefix(f"{of[name]}.") + " ↻" * whole.has_edge(name, name)
+              for name in graph.names}  # fmt: skip
+    sizes = {
+        title: (
+            CHAR * max(len(title), *(len(labels[n.name]) + 2 for n in nodes)) + 4 * PAD,
+            HEAD + ROW * len(nodes) + PAD,
+        )
+        for title, nodes in groups.items()
+    }
+    joined = nx.Graph(
+        (of[e.cause], of[e.effect]) for e in graph.edges if of[e.cause] != of[e.effect]
+    )
+    column = {
+        title: round(sum(depth[node.name] for node in nodes) / len(nodes))
+        for title, nodes in groups.items()
+        if title in joined
+    }
+    boxes = _columns(column, sizes, joined)
+    x, y, width = GAP, max((b.bottom for b in boxes.values()), default=0.0) + GAP, WIDTH
+    width = max(width, *(box.right for box in boxes.values())) if boxes else width
+    lowest = y
+    for title in groups:
+        if title not in joined:
+            if x > GAP and x + sizes[title][0] > width:
+                x, y = GAP, lowest + GAP
+            boxes[title] = Place(x, y, *sizes[title])
+            x, lowest = x + sizes[title][0] + GAP, max(lowest, boxes[title].bottom)
+    places = {
+        node.name: Place(box.x + PAD, box.y + HEAD + ROW * i, box.width - 2 * PAD, ROW - 3.0)
+        for title, box in boxes.items()
+        for i, node in enumerate(groups[title])
+    }
+    return boxes, places, labels
+
+
+def _columns(
+    column: Mapping[str, int], sizes: Mapping[str, tuple[float, float]], joined: nx.Graph
+) -> dict[str, Place]:
+    near = {title: [o for o in joined[title] if column[o] != column[title]] for title in column}
+    middle = heights_of(column, near, lambda title: sizes[title][1] + GAP)
+    boxes: dict[str, Place] = {}
+    x = GAP
+    for number in sorted(set(column.values())):
+        titles = [title for title in column if column[title] == number]
+        for title in titles:
+            boxes[title] = Place(x, GAP / 2 + middle[title] - sizes[title][1] / 2, *sizes[title])
+        x += max(sizes[title][0] for title in titles) + BETWEEN
+    return boxes
 
 
 def _line(cause: Place, effect: Place) -> str:
@@ -136,18 +183,8 @@ def _line(cause: Place, effect: Place) -> str:
     return f"M{' '.join(numbers[:2])}C{' '.join(numbers[2:])}"
 
 
-def _node(graph: CausalGraph, made: Layout, number: int, node: Node) -> str:
-    place = made.nodes[node.name]
-    fill = f'fill="{FILLS.get(node.kind, "#ffffff")}"'
-    label = f'<text x="{place.x + PAD:.1f}" y="{place.middle + 4:.1f}">'
-    return (
-        f'<g class="n" data-i="{number}"><title>{escape(describe(graph, node))}</title>'
-        f"{_rect(place, fill)}{label}{escape(made.labels[node.name])}</text></g>"
-    )
-
-
 def describe(graph: CausalGraph, node: Node) -> str:
-    """Write down what is known of a node, line by line.
+    """Return what is known of a node, line by line.
 
     Example:
         >>> graph = CausalGraph((Node("x", unit="kg"), Node("y")), (Edge("y", "x", 1, "contact"),))
@@ -157,10 +194,7 @@ def describe(graph: CausalGraph, node: Node) -> str:
         causes one control step ago: y (contact)
     """
     lines = [node.name, " · ".join(dict.fromkeys(filter(None, (node.kind, node.role))))]
-    for fact in FACTS:
-        text = getattr(node, fact)
-        word = WORDS.get(fact, fact)
-        lines.append(f"{word}: {text}" if word and text else text)
+    lines += [word + text for fact, word in FACTS.items() if (text := getattr(node, fact))]
     for lag in sorted({edge.lag for edge in graph.parents(node.name)}):
         when = {0: "at once", 1: "one control step ago"}.get(lag, f"{lag} control steps ago")
         lines.append(f"causes {when}: {_causes(graph.parents(node.name), lag)}")
