@@ -73,8 +73,8 @@ def save(figure: Figure, path: Location | str) -> None:
 
 
 def png(figure: Figure) -> bytes:
-    """Return a figure as PNG: of 1600 x 900 pixels, or else with all that is drawn on it."""
-    whole = {} if tuple(figure.get_size_inches() * DPI) == (WIDTH, HEIGHT) else WHOLE
+    """Return a figure as PNG: 1600 pixels wide, or else with all that is drawn on or beyond it."""
+    whole = {} if figure.get_figwidth() * DPI == WIDTH else WHOLE
     made = io.BytesIO()
     figure.savefig(made, format="png", **whole)
     return made.getvalue()

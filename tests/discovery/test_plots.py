@@ -9,9 +9,8 @@ import pytest
 from matplotlib.image import imread
 
 from scm_world.discovery import DiscoveryReport, discover, score
-from scm_world.discovery.layers import lay_out
 from scm_world.discovery.names import Families, braces, by_entity
-from scm_world.discovery.plots import EXTRA, MATCHED, MISSING, draw_graphs, draw_model
+from scm_world.discovery.plots import EXTRA, MATCHED, MISSING, draw_graphs, draw_model, lay_out
 from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.variables import Derived, Exogenous, Linear, Parent
@@ -85,21 +84,22 @@ def test_a_report_of_a_model_is_drawn(tmp_path: Path) -> None:
 def test_models_are_drawn(tmp_path: Path, model: SCM) -> None:
     """Any model has a picture, even one without edges."""
     draw_model(model, tmp_path / "model.png")
-    assert imread(tmp_path / "model.png").shape[:2] == (900, 1600)
+    assert imread(tmp_path / "model.png").shape[1] == 1600
 
 
-def test_causes_stand_left_of_their_effects_and_boxes_apart() -> None:
-    """In the drawing of pushing arrows go right, and no two boxes overlap."""
-    drawing = lay_out(World("pushing", backend="fake").model)
+@pytest.mark.parametrize("task", ["pushing", "towers"])
+def test_causes_stand_left_of_their_effects_and_boxes_apart(task: str) -> None:
+    """In the drawing of a task arrows go right, and no two boxes overlap."""
+    drawing = lay_out(World(task, backend="fake").model)
 
-    assert all(arrow.path[0][0] < arrow.path[-1][0] for arrow in drawing.arrows)
+    assert all(points[0][0] < points[-1][0] for points, _, _ in drawing.arrows)
     width, height = drawing.box
     places = np.array(list(drawing.places.values()))
     apart = np.abs(places[:, None] - places)
     touching = (apart[..., 0] < width) & (apart[..., 1] < height)
     assert touching.sum() == len(places)
-    assert (places[:, 1] > 60).all()
-    assert (places[:, 1] < 860).all()
+    assert (places - (width / 2, height / 2) >= 0).all()
+    assert (np.array((1600, drawing.height)) - places >= (width / 2, height / 2)).all()
 
 
 def test_drawing_loads_no_pyplot(tmp_path: Path) -> None:
@@ -149,10 +149,3 @@ def test_a_block_that_plays_another_part_is_drawn_apart() -> None:
 
     other = Families(["c"], [*chain, ("b_2", "c", 1)])
     assert {"a_{0,1}", "a_2", "b_{0,1}", "b_2", "c"} == set(other.members)
-
-
-def test_towers_fit_into_a_picture() -> None:
-    """The drawing of five blocks has no more boxes in a column than fit beside one another."""
-    drawing = lay_out(World("towers", backend="fake").model)
-    columns = [x for x, _ in drawing.places.values()]
-    assert max(columns.count(x) for x in columns) * drawing.box[1] < 840 - 85
