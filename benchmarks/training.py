@@ -44,8 +44,9 @@ def ours(how: Recipe, threads: int) -> dict[str, float]:
         with (Path(folder) / "run" / "progress.csv").open(encoding="utf-8") as file:
             rows = [{k: float(v or "nan") for k, v in row.items()} for row in csv.DictReader(file)]
     first, last = rows[len(rows) // 5], rows[-1]
-    steps = last["steps"] - first["steps"]
-    return {clock: steps / (last[clock] - first[clock]) for clock in ("wall_s", "cpu_s")}
+    steps = last["time/total_timesteps"] - first["time/total_timesteps"]
+    clocks = {"wall_s": "time/time_elapsed", "cpu_s": "time/cpu_seconds"}
+    return {name: steps / (last[clock] - first[clock]) for name, clock in clocks.items()}
 
 
 def theirs(its: Predecessor) -> float:

@@ -84,7 +84,7 @@ def command_of(card: Mapping[str, Any]) -> str:
     preset = _preset(card)
     if preset is None or card.get("start") is not None:
         raise UnknownOption("command", None, ("the one that trained it: --command '…'",))
-    words = ["scm-world", "train", preset.task, "--algo", preset.algo, "--preset", preset.name]
+    words = ["scm-world", "train", preset.task, "--algo", preset.algo]
     words += ["--backend", card["backend"], "--seed", card["seed"], "--steps", preset.steps]
     return shlex.join(map(str, words))
 
@@ -93,7 +93,7 @@ def _preset(card: Mapping[str, Any]) -> Recipe | None:
     """Give the recipe of a card if nothing but its steps is another than in its preset."""
     try:
         made = Recipe.from_dict(card.get("recipe"))
-        usual = recipe(made.task, made.algo, preset=made.name, steps=made.steps)
+        usual = recipe(made.task, made.algo, steps=made.steps)
     except UnknownOption:
         return None
     return made if made == usual and {"backend", "seed"} <= card.keys() else None

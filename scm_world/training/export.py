@@ -1,4 +1,4 @@
-"""Networks of Stable-Baselines3 as policy files, and policy files as beginnings."""
+"""Policies of Stable-Baselines3 as policy files: written, begun with, evaluated."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world.errors import UnreadableFile
+from scm_world.evaluation import evaluate
 from scm_world.evaluation.policies.cards import FORM, OPTIONS, PolicyAbout
 from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
-from scm_world.training.learners import torch
 from scm_world.training.recipe import Recipe
+from scm_world.training.settings import Trials
 
-Tensors = dict[str, NDArray[Any]]
+SEED = 7_001
+"""Of the noise of evaluations while training: evaluations by hand have other episodes."""
 
 
 def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> NetworkPolicy:
-    """Give what a trained policy is, without torch.
+    """Return what a trained policy is, without torch.
 
     Args:
         model: Of Stable-Baselines3.
@@ -35,14 +36,11 @@ def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> NetworkPoli
         inputs=None if spaces is None else tuple(spaces),
         card=dict(card),
     )
-    tensors: Tensors = {}
-    for name, layers in _networks(model, recipe).items():
-        for number, layer in enumerate(layers):
-            factor = _scale(model, recipe, number)
-            tensors[f"{name}.{number}.weight"] = _array(layer.weight) * factor
-            tensors[f"{name}.{number}.bias"] = _array(layer.bias)
-    if recipe.algo == "ppo":
-        tensors["log_std"] = _array(model.policy.log_std)
+    tensors = {
+        name: tensor.detach().cpu().numpy().copy() for name, tensor in _tensors(model).items()
+    }
+    for name in _first(tensors):
+        tensors[name] *= _scale(model)
     return NetworkPolicy.of(tensors, about)
 
 
@@ -59,80 +57,90 @@ def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
     Raises:
         UnreadableFile: It is no policy, or one that observes, acts or is built in another way.
     """
-    given = load_policy(start)
-    wrong = _differences(exported(model, recipe, {}), given)
-    if wrong:
-        advice = "begin with a policy of the same form, or change the recipe to its form"
-        raise UnreadableFile(str(start), "; ".join(wrong), advice)
-    tensors = given.tensors()
-    with torch().no_grad():
-        for name, layers in _networks(model, recipe).items():
-            for number, layer in enumerate(layers):
-                if f"{name}.{number}.weight" in tensors:
-                    factor = _scale(model, recipe, number)
-                    _fill(layer.weight, tensors[f"{name}.{number}.weight"] / factor)
-                    _fill(layer.bias, tensors[f"{name}.{number}.bias"])
-        if "log_std" in tensors and recipe.algo == "ppo":
-            _fill(model.policy.log_std, tensors["log_std"])
-        if recipe.algo == "td3":
-            model.actor_target.load_state_dict(model.actor.state_dict())
-
-
-def _differences(mine: NetworkPolicy, given: NetworkPolicy) -> list[str]:
-    """Say in what a policy file is not what a recipe trains."""
-    pairs: dict[str, tuple[Any, Any]] = {
-        name: (given.about.option(name), mine.about.option(name)) for name in FORM
-    }
-    for name in ("task", "activation", "output", "inputs"):
-        pairs[name] = getattr(given.about, name), getattr(mine.about, name)
-    del pairs["task"]  # what was learned in one task may be a beginning in another one
+    given, mine = load_policy(start), exported(model, recipe, {})
     theirs, ours = given.tensors(), mine.tensors()
+    pairs: dict[str, Any] = {n: (given.about.option(n), mine.about.option(n)) for n in FORM}
+    for name in ("activation", "output", "inputs"):
+        pairs[name] = getattr(given.about, name), getattr(mine.about, name)
     for name in sorted({*theirs, *ours}):
         if name in theirs and name in ours:
             pairs[f"shape of {name}"] = theirs[name].shape, ours[name].shape
         elif name.startswith("layers"):
             pairs[name] = name in theirs, name in ours
-    return [
-        f"{name} is {theirs!r} there and {ours!r} here"
-        for name, (theirs, ours) in pairs.items()
-        if theirs != ours
+    wrong = [
+        f"{n} is {one!r} there and {two!r} here" for n, (one, two) in pairs.items() if one != two
     ]
+    if wrong:
+        advice = "begin with a policy of the same form, or change the recipe to its form"
+        raise UnreadableFile(str(start), "; ".join(wrong), advice)
+    for name, tensor in _tensors(model).items():
+        if name in theirs:
+            array = theirs[name] / _scale(model) if name in _first(theirs) else theirs[name]
+            tensor.data.copy_(tensor.new_tensor(np.ascontiguousarray(array)))
+    if recipe.algo == "td3":
+        model.actor_target.load_state_dict(model.actor.state_dict())
 
 
-def _networks(model: Any, recipe: Recipe) -> dict[str, list[Any]]:
-    """List the layers of the policy, and of the value if there is one, by the names in a file."""
+def _tensors(model: Any) -> dict[str, Any]:
+    """List the tensors of the policy, and of PPO's value, by their names in a policy file."""
     policy = model.policy
-    match recipe.algo:
-        case "ppo":
-            body = policy.mlp_extractor
-            return {
-                "layers": [*_linear(body.policy_net), policy.action_net],
-                "value.layers": [*_linear(body.value_net), policy.value_net],
-            }
-        case "sac":
-            return {"layers": [*_linear(policy.actor.latent_pi), policy.actor.mu]}
-    return {"layers": _linear(policy.actor.mu)}
+    actor = getattr(policy, "actor", None)
+    if actor is not None:
+        parts = {"layers": [actor.mu]}  # of TD3 all layers, of SAC the last one
+        if hasattr(actor, "latent_pi"):
+            parts["layers"].insert(0, actor.latent_pi)
+    else:
+        body = policy.mlp_extractor
+        parts = {
+            "layers": [body.policy_net, policy.action_net],
+            "value.layers": [body.value_net, policy.value_net],
+        }
+    found = {}
+    for name, networks in parts.items():
+        linear = [m for network in networks for m in network.modules() if hasattr(m, "weight")]
+        for number, layer in enumerate(linear):
+            found[f"{name}.{number}.weight"] = layer.weight
+            found[f"{name}.{number}.bias"] = layer.bias
+    return found if actor is not None else {**found, "log_std": policy.log_std}
 
 
-def _scale(model: Any, recipe: Recipe, layer: int) -> NDArray[np.float32]:
-    """Give what observations are multiplied by before a layer: a policy file has it in its weights.
+def _first(tensors: Mapping[str, Any]) -> list[str]:
+    """Name the weights that observations meet first."""
+    return [name for name in tensors if name.endswith("layers.0.weight")]
+
+
+def _scale(model: Any) -> Any:
+    """Return what observations are multiplied by first: a policy file has it in its weights."""
+    owner = getattr(model.policy, "actor", model.policy)
+    scale = getattr(owner.features_extractor, "scale", None)
+    return np.float32(1.0) if scale is None else scale.cpu().numpy()
+
+
+def scored(
+    policy: NetworkPolicy, task: str, env: Mapping[str, Any], trials: Trials, backend: str
+) -> tuple[str, dict[str, float]]:
+    """Evaluate a policy while something is trained.
 
     Returns:
-        Shape (inputs,), or shape () for layers that see no observations.
+        The name of the metric, the first one of the task, and its means by protocol.
     """
-    if layer > 0 or not recipe.network.scaled:
-        return np.ones((), np.float32)
-    owner = model.policy if recipe.algo == "ppo" else model.policy.actor
-    return _array(owner.features_extractor.scale)
+    form = {name: value for name, value in env.items() if name in (*OPTIONS, "task_options")}
+    protocols = list(trials.protocols)
+    given: dict[str, Any] = {"task": task, "n": trials.episodes, "seeds": SEED, "env": form}
+    found = evaluate(policy, protocols, backend=backend, **given)
+    return found.metric(), {name: float(found.score(name).value) for name in found.protocols}
 
 
-def _linear(network: Any) -> list[Any]:
-    return [part for part in network if hasattr(part, "weight")]
+def words(scores: Mapping[str, float]) -> str:
+    """Say what an evaluation gave.
+
+    Example:
+        >>> words({"P0": 0.5, "P5": 0.25})
+        'P0 0.500, P5 0.250'
+    """
+    return ", ".join(f"{name} {score:.3f}" for name, score in scores.items())
 
 
-def _array(tensor: Any) -> NDArray[np.float32]:
-    return np.array(tensor.detach().cpu().numpy(), dtype=np.float32)
-
-
-def _fill(tensor: Any, array: NDArray[Any]) -> None:
-    tensor.copy_(torch().from_numpy(np.ascontiguousarray(array)))
+def mean(scores: Mapping[str, float]) -> float | None:
+    """Return the mean over protocols; None without any."""
+    return sum(scores.values()) / len(scores) if scores else None

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, final
 
-from scm_world.errors import Diverged, UnknownOption
+from scm_world.backends import backends
+from scm_world.errors import Diverged, UnknownOption, UnreadableFile
 from scm_world.evaluation.policies.trained import in_run
 from scm_world.evaluation.policies.weights import load_policy
+from scm_world.evaluation.setups import Place
 from scm_world.evaluation.zoo.shelf import PREFIX, path_of
 from scm_world.graph.exchange.libraries import load
-from scm_world.output.durable import locked, made
+from scm_world.output.durable import draft_of, locked, made, write_whole
+from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.training.checkpoints import checkpoints, read_checkpoint
-from scm_world.training.export import begin_with
-from scm_world.training.instants import resumed
-from scm_world.training.learners import device_for, library, make_learner, torch
-from scm_world.training.memory import Memory
 from scm_world.training.recipe import Recipe
-from scm_world.training.runs import Run
-from scm_world.training.watching import Stopped, Watching, is_finite, watch
-from scm_world.training.worlds import Worlds, make_worlds
 from scm_world.world.start import whole_number
 
+FORMAT = "scm_world/run/1"
 EVERY = 60.0  # [s] between checkpoints
 LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
 
@@ -47,7 +46,7 @@ class Trained:
         policy: The file of the policy at the end.
         best: The file of the one that was best in the evaluations while it ran; that at the end
             if there were none.
-        score: Of that one, mean last fractional success; None without evaluations.
+        score: Of that one, mean of the metric; None without evaluations.
     """
 
     folder: Path
@@ -84,14 +83,14 @@ def train(
 
     Args:
         recipe: How it is trained.
-        out: Folder of the run; see ``Run``.
+        out: Folder of the run.
         seed: Of everything that is drawn.
         backend: Name of the engine.
         steps: Control steps, in place of those of the recipe.
         start: Policy to begin with: a file, the folder of a run, or one of the zoo.
         progress: Told how many steps are done, and how many there are.
         tell: Told in words what happens.
-        device: ``"cpu"``, ``"cuda"``, or ``"auto"``.
+        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one.
         threads: Of the engine and of torch. None: as many as there are cores for the engine,
             whose results do not depend on it, and one for torch, whose last bits do.
         every: Seconds between checkpoints.
@@ -105,143 +104,205 @@ def train(
         UnreadableFile: Another training is in the folder, somebody else is writing to it, or its
             last checkpoint is damaged.
         UnwritableFolder: There is no room; the last checkpoint is still whole.
+        Diverged: Weights are not finite any more.
     """
-    library(), torch(), load("tensorboard", "tensorboard", "train")
+    for library, module in (("stable-baselines3", "stable_baselines3"), ("torch", "torch")):
+        load(module, library, "train")
+    from scm_world.training import agents
+
     if steps is not None:
-        recipe = with_steps(recipe, steps)
-    number = whole_number("seed", seed, least=0)
-    if number > LARGEST_SEED:
+        recipe = recipe.but(steps=whole_number("steps", steps, least=1))
+    if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
     count = None if threads is None else whole_number("threads", threads, least=1)
-    where = device_for(recipe, device)
+    if backend not in backends():
+        raise UnknownOption("backend", backend, backends())
     first = None if start is None else named(start)
-    run = Run(Path(out), recipe, number, backend, count or 1, where, first)
-    run.identity  # noqa: B018 # refuses a start that is not there before a folder is made
-    with locked_new(run.folder), torch_threads(run.threads):
-        worlds = make_worlds(recipe, backend=backend, seed=number, threads=count)
+    given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
+    given["device"] = agents.device_for(recipe, device)
+    identity = identity_of(recipe, first, **given)
+    folder, say = Path(out), tell or (lambda _: None)
+    with torch_threads(given["threads"]):
+        worlds = agents.make_worlds(recipe, backend=backend, threads=count)
         try:
-            return _trained(run, worlds, progress, tell or _nobody, every)
+            model = agents.make_learner(recipe, worlds, seed=seed, device=given["device"])
+            if first is not None:
+                agents.begin_with(model, recipe, first)
+            (world,) = worlds.get_attr("world", 0)
+            libraries = {name: version(name) for name in ("torch", "stable-baselines3")}
+            card = {**identity, "versions": {**versions(world.engine), **libraries}}
+            watch = agents.Watch(
+                recipe,
+                worlds,
+                folder,
+                backend=backend,
+                card=card,
+                progress=progress,
+                tell=say,
+                every=every,
+            )
+            with locked(folder):
+                open_folder(folder / "run.json", FORMAT, identity, card, say, recipe.may_grow)
+                if there := agents.checkpoints(folder):
+                    watch.resume(model, there[-1])
+                    say(f"goes on after {model.num_timesteps:,} steps")
+                elif getattr(model, "learning_starts", 0) >= recipe.steps:
+                    first_step = model.learning_starts
+                    say(f"nothing will be learned: learning starts after {first_step:,} steps")
+                if recipe.steps > model.num_timesteps:
+                    _learn(model, watch, recipe.steps - model.num_timesteps, folder, say)
         finally:
             worlds.close()
+    policy, best = folder / "policy.safetensors", folder / "best.safetensors"
+    done = int(load_policy(policy).about.card["steps"])  # type: ignore[arg-type] # JSON
+    best = best if best.exists() else policy
+    return Trained(folder, recipe, seed, done, policy, best, watch.score)
+
+
+def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
+    """Learn; the first Ctrl-C ends it after the present round, and the second one at once."""
+    logger: Any = load("stable_baselines3.common.logger", "stable-baselines3", "train")
+    after = f"-{model.num_timesteps}" if model.num_timesteps else ""
+    outputs = [
+        logger.make_output_format("csv", str(folder), after),
+        logger.make_output_format("tensorboard", str(made(folder / "tensorboard"))),
+    ]
+    model.set_logger(logger.Logger(str(folder), outputs))
+    is_main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT)
+
+    def stop(*_: Any) -> None:
+        watch.stop = True
+        signal.signal(signal.SIGINT, before)
+        tell("stops after this round with a checkpoint; Ctrl-C again stops at once")
+
+    try:
+        if is_main:
+            signal.signal(signal.SIGINT, stop)
+        every = 1 if watch.recipe.algo == "ppo" else watch.recipe.worlds  # rounds, or episodes
+        model.learn(left, callback=watch, reset_num_timesteps=False, log_interval=every)
+    except ValueError:
+        if watch.is_finite:
+            raise
+        raise Diverged(model.num_timesteps) from None  # torch found it before a round was over
+    finally:
+        if is_main:
+            signal.signal(signal.SIGINT, before)
+        model.logger.close()
 
 
 def named(start: Path | str) -> Path:
-    """Give the file of a policy: of a run, of the zoo, or the one that is given.
+    """Return the file of a policy: of a run, of the zoo, or the one that is given.
 
     Raises:
         UnknownOption: There is none of this name in the zoo.
         UnreadableFile: The folder is of no run.
     """
-    text = str(start)
-    if text.startswith(PREFIX):
-        return path_of(text)
-    return in_run(Path(text)) if Path(text).is_dir() else Path(text)
-
-
-def with_steps(recipe: Recipe, steps: int) -> Recipe:
-    """Give the same recipe with another number of control steps.
-
-    Raises:
-        UnknownOption: There are fewer than in one round.
-    """
-    number = whole_number("steps", steps, least=1)
-    if number < recipe.round:
-        allowed = (f"at least {recipe.round:,}, what {recipe.worlds} worlds make in one round",)
-        raise UnknownOption("steps", steps, allowed)
-    return recipe.model_copy(update={"steps": number})
-
-
-def _trained(
-    run: Run, worlds: Worlds, progress: Progress | None, tell: Tell, every: float
-) -> Trained:
-    engine = worlds.engine
-    for line in run.newer(engine):
-        tell(line)
-    model = make_learner(
-        run.recipe, worlds.vec_env, seed=run.seed, length=worlds.length, device=run.device
-    )
-    if run.start is not None:
-        begin_with(model, run.recipe, run.start)
-    goes_on = run.open(engine)
-    worlds.begin_with(run.seed)  # the algorithm has set other seeds
-    memory = Memory(model, run.replay) if hasattr(model, "replay_buffer") else None
-    watching = Watching(run, worlds, memory, run.card(engine), progress, tell, every)
-    if goes_on:
-        checkpoint = read_checkpoint(checkpoints(run.checkpoints)[-1])
-        resumed(model, worlds, memory, checkpoint.tensors, checkpoint.state)
-        watching.resume(checkpoint)
-        tell(f"goes on after {checkpoint.steps:,} steps")
-    elif memory is not None:
-        memory.clear()
-    if getattr(model, "learning_starts", 0) >= run.recipe.steps:
-        tell(f"nothing will be learned: learning starts after {model.learning_starts:,} steps")
-    left = run.recipe.steps - model.num_timesteps
-    if left > 0:
-        with _interruptible(watching, tell):
-            _learn(model, watching, left)
-    policy = load_policy(run.policy)
-    best = run.best if run.best.exists() else run.policy
-    steps = int(policy.about.card["steps"])  # type: ignore[arg-type] # JSON
-    return Trained(run.folder, run.recipe, run.seed, steps, run.policy, best, watching.score)
-
-
-def _learn(model: Any, watching: Watching, left: int) -> None:
-    logger = library("common.logger")
-    folder = made(watching.run.folder / "tensorboard")
-    model.set_logger(logger.configure(str(folder), ["tensorboard"]))
-    try:
-        model.learn(left, callback=watch(watching), reset_num_timesteps=False, log_interval=1)
-    except Stopped:
-        raise KeyboardInterrupt from None
-    except ValueError:
-        if is_finite(model.policy):
-            raise
-        raise Diverged(model.num_timesteps) from None  # torch found it before a round was over
-    finally:
-        model.logger.close()
-
-
-def _nobody(_: str) -> None:
-    """Tell nobody."""
-
-
-@contextmanager
-def locked_new(folder: Path) -> Iterator[None]:
-    """Be the only one who writes to a folder; one that is made and stays empty is removed."""
-    with locked(folder):
-        try:
-            yield
-        finally:
-            if not any(folder.iterdir()):
-                folder.rmdir()
+    if str(start).startswith(PREFIX):
+        return path_of(str(start))
+    return in_run(Path(start)) if Path(start).is_dir() else Path(start)
 
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Let torch have so many threads for a while; its last bits depend on them."""
-    before = torch().get_num_threads()
-    torch().set_num_threads(count)
+    torch: Any = load("torch", "torch", "train")
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
     try:
         yield
     finally:
-        torch().set_num_threads(before)
+        torch.set_num_threads(before)
 
 
-@contextmanager
-def _interruptible(watching: Watching, tell: Tell) -> Iterator[None]:
-    """Let the first Ctrl-C end the training after the present round, and the second one at once."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.getsignal(signal.SIGINT)
+# --- folders --------------------------------------------------------------------------------------
 
-    def stop(*_: Any) -> None:
-        watching.stop = True
-        signal.signal(signal.SIGINT, before)
-        tell("stops after this round with a checkpoint; Ctrl-C again stops at once")
 
-    signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, Any]:
+    """Return what decides what is learned, as plain data.
+
+    Raises:
+        UnreadableFile: The policy to begin with is not there.
+    """
+    digest = None
+    if start is not None:
+        try:
+            digest = sha256(start.read_bytes()).hexdigest()
+        except OSError as error:
+            advice = "give a policy file to start from"
+            raise UnreadableFile(str(start), str(error), advice) from None
+    options = recipe.env.get("task_options")
+    about = Place(recipe.task, {"task_options": options}).about()
+    custom = {name: value for name, value in about.items() if name in ("class", "model")}
+    return {**custom, "recipe": recipe.as_dict(), **more, "start": digest}
+
+
+def open_folder(
+    path: Path,
+    form: str,
+    identity: Mapping[str, Any],
+    card: Mapping[str, Any],
+    tell: Tell,
+    may_grow: bool = False,
+) -> None:
+    """Begin in a folder, or go on there.
+
+    Args:
+        path: The file that says what is in the folder.
+        form: Format of that file.
+        identity: What decides what comes out, as plain data.
+        card: The same, and versions.
+        tell: Told which versions are others than before.
+        may_grow: Whether there may be fewer steps in the folder.
+
+    Raises:
+        UnreadableFile: Something else is in the folder; it says what is different.
+        UnwritableFolder: There is no room, or no permission.
+    """
+    folder = path.parent
+    if path.exists():
+        try:
+            there = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(there, dict) or there.get("format") != form:
+                raise ValueError(f"it is not of the format {form!r}")
+        except (OSError, ValueError) as error:
+            raise UnreadableFile(str(path), str(error), "give another folder") from None
+        before, now = _flat({n: there.get(n) for n in identity}), _flat(identity)
+        if may_grow and before.get("recipe.steps", 0) < now["recipe.steps"]:
+            before["recipe.steps"] = now["recipe.steps"]
+        wrong = [
+            f"{name.removeprefix('recipe.')} is {before.get(name)!r} there, and {now.get(name)!r} "
+            "was asked for"
+            for name in dict.fromkeys((*now, *before))
+            if before.get(name) != now.get(name)
+        ]
+        if wrong:
+            reason = f"it holds other work: {'; '.join(wrong)}"
+            raise UnreadableFile(str(folder), reason, "give another folder, or the same options")
+        for name, one in card.get("versions", {}).items():
+            old = there.get("versions", {}).get(name, one)
+            if old != one:
+                tell(f"{name} was {old} and is {one} now: the last bits may be others")
+    elif strangers := sorted({*_names(folder)} - {draft_of(path).name}):
+        reason = f"it holds something else: {', '.join(strangers[:5])}"
+        raise UnreadableFile(str(folder), reason, "give an empty folder, or a new one")
+    write_whole(json.dumps({"format": form, **card}, indent=2, allow_nan=False), path)
+
+
+def _names(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir()] if folder.exists() else []
+
+
+def _flat(data: Any, where: str = "") -> dict[str, Any]:
+    """Return the leaves of plain data by their paths.
+
+    Example:
+        >>> _flat({"seed": 1, "recipe": {"steps": 8}})
+        {'seed': 1, 'recipe.steps': 8}
+    """
+    if not isinstance(data, Mapping) or not data:
+        return {where: data}
+    found: dict[str, Any] = {}
+    for name, value in data.items():
+        found |= _flat(value, f"{where}.{name}" if where else str(name))
+    return found

@@ -1,4 +1,4 @@
-"""A recipe says how an agent is trained: a value, with JSON without loss."""
+"""A recipe says how an agent is trained: immutable and JSON-serialisable."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
-from scm_world.tasks import TASKS, Task, make_task, tasks
+from scm_world.tasks import TASKS, make_task, tasks
 from scm_world.training.settings import (
     ALGORITHMS,
     Count,
@@ -38,15 +38,13 @@ from scm_world.training.settings import (
     known_task,
     merged,
     nested,
+    observed,
     refused,
-    seen,
 )
 from scm_world.training.tuned import tuned
 from scm_world.variables.spaces import Frozen
 
 FORMAT = "scm_world/recipe/1"
-PRESETS = {"tuned": tuned}
-"""Recipes that are there for the asking: each gives the fields for a task and an algorithm."""
 
 PUBLISHED: dict[int, Curriculum] = {
     0: Curriculum(),
@@ -55,12 +53,9 @@ PUBLISHED: dict[int, Curriculum] = {
 }
 """The published curricula: nothing varies, goals, everything."""
 
-CURRICULA = ("0", "1", "2", "the path of a JSON file", "a Curriculum")
-
 RESERVED = ("task", "backend", "render_mode", "normalize_actions")
 """Options of the environment that a recipe does not set."""
 
-SPARSE = {"weights": "sparse"}
 REWARDS = (
     "terms",
     "weights",
@@ -78,7 +73,7 @@ class Recipe(Frozen):
     Attributes:
         task: Name of the task; a file, or ``"module:function"``, for one of a model.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
-        name: Of the preset that it comes from.
+        name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
         curriculum: What is done in it; plain data of a ``Curriculum``.
         worlds: How many are simulated at once.
@@ -88,9 +83,8 @@ class Recipe(Frozen):
         network: Of the policy, and likewise of the values.
         scale_rewards: Divide rewards by the running standard deviation of the return (PPO).
         episode_length: Control steps of an episode while it is trained; as the environment has it
-            if None. Short ones show more beginnings; evaluations are as long as ever.
-        staggered: Cut the first episodes short, each at another step, so that the worlds are
-            not all at the same place of their episodes forever after.
+            if None. Evaluations are as long as ever.
+        staggered: Begin the worlds at different steps of their episodes.
         critic_warmup: Control steps in which PPO learns the value only.
         hindsight: Hindsight experience replay, with sparse rewards, if given (SAC and TD3).
         observations: ``"plain"``, or ``"privileged"``: with every causal parameter.
@@ -139,47 +133,43 @@ class Recipe(Frozen):
     @classmethod
     def _of_algorithm(cls, given: Any, info: ValidationInfo) -> Any:
         kind = ALGORITHMS.get(info.data.get("algo", ""))
-        if kind is None or isinstance(given, kind):
-            return given
-        return kind.model_validate(given)
+        return given if kind is None or isinstance(given, kind) else kind.model_validate(given)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Refuse what does not go together."""
-        if self.algo == "ppo" and self.hindsight is not None:
-            raise UnknownOption("hindsight with PPO", True, ("none: it needs SAC or TD3",))
-        if self.algo != "ppo":
+        kept: Any = self.settings
+        if self.algo == "ppo":
+            if self.hindsight is not None:
+                raise UnknownOption("hindsight with PPO", True, ("none: it needs SAC or TD3",))
+            if self.round < 2:
+                raise UnknownOption("n_steps of PPO in 1 world", 1, ("any whole number from 2 on",))
+        else:
             own = {
                 "scale_rewards": self.scale_rewards,
                 "critic_warmup": self.critic_warmup > 0,
                 "log_std_end": self.network.log_std_end is not None,
+                "adaptive learning rate": self.rate.schedule == "adaptive",
             }
             for name in (name for name, given in own.items() if given):
                 raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
-            if self.rate.schedule == "adaptive":
-                allowed = ("constant", "linear", "adaptive with PPO")
-                raise UnknownOption(f"schedule of {self.algo}", "adaptive", allowed)
-        kept: Any = self.settings
-        if self.algo == "ppo" and self.round < 2:
-            raise UnknownOption("n_steps of PPO in 1 world", 1, ("any whole number from 2 on",))
-        if self.hindsight is not None and kept.n_steps > 1:
-            raise UnknownOption("n_steps with hindsight", kept.n_steps, ("1",))
+            if self.hindsight is not None and kept.n_steps > 1:
+                raise UnknownOption("n_steps with hindsight", kept.n_steps, ("1",))
         if self.steps < self.round:
             least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
             raise UnknownOption("steps", self.steps, (least,))
         if self.trials.protocols:
-            chosen(self.trials.protocols, protocols_of(made(self.task, self.env)))
+            chosen(self.trials.protocols, _protocols(self.task, self.env))
         return self
 
     def but(self, **changes: Any) -> Recipe:
-        """Give the same recipe with some changes, as ``recipe`` takes them; None changes nothing.
+        """Return the same recipe with changes, as ``recipe`` takes them; None changes nothing.
 
         Raises:
             UnknownOption: There is no such field, or a value is impossible.
         """
         wanted = {name: value for name, value in changes.items() if value is not None}
-        fields = changed(self.model_dump(mode="json"), wanted)
-        return _made(_with_hindsight(fields, wanted))
+        return _changed(self.model_dump(mode="json"), wanted)
 
     @property
     def round(self) -> int:
@@ -195,11 +185,11 @@ class Recipe(Frozen):
     @property
     def options(self) -> dict[str, Any]:
         """Options of the environment, with all that follows from the other fields."""
-        found = seen(self.env, self.observations)
+        found = observed(self.env, self.observations)
         if self.hindsight is not None:
             given = found.get("task_options") or {}
             kept = {name: value for name, value in given.items() if name not in REWARDS}
-            found |= {"goal_env": True, "task_options": kept | SPARSE}
+            found |= {"goal_env": True, "task_options": {**kept, "weights": "sparse"}}
         return found
 
     @property
@@ -210,11 +200,11 @@ class Recipe(Frozen):
         return {**self.options, "max_episode_length": self.episode_length}
 
     def as_dict(self) -> dict[str, Any]:
-        """Write it as plain data."""
+        """Return it as plain data."""
         return {"format": FORMAT, **self.model_dump(mode="json")}
 
     def to_json(self) -> str:
-        """Write it as JSON."""
+        """Return it as JSON."""
         return json.dumps(self.as_dict(), indent=2, allow_nan=False)
 
     @classmethod
@@ -252,54 +242,41 @@ def curriculum_of(given: Any) -> Curriculum:
     Raises:
         UnknownOption: It is none of these.
         UnreadableFile: It is a path, and there is no curriculum.
-        ModelError: It calls a function of one's own.
+        ModelError: It calls a custom function.
 
     Example:
         >>> curriculum_of("1").part.kind
         'goal'
     """
-    match given:
-        case None:
-            return PUBLISHED[0]
-        case bool() | float():
-            raise UnknownOption("curriculum", given, CURRICULA)
-        case int():
-            if given not in PUBLISHED:
-                raise UnknownOption("curriculum", given, CURRICULA)
-            return PUBLISHED[given]
-        case str() if given.isdecimal():
-            return curriculum_of(int(given))
-        case str() if not given.endswith(".json"):
-            raise UnknownOption("curriculum", given, CURRICULA)
-        case str() | Path():
-            return Curriculum.load(given)
+    if isinstance(given, str | Path) and str(given).endswith(".json"):
+        return Curriculum.load(given)
+    number = 0 if given is None else given
+    if isinstance(given, str) and given.isdecimal():
+        number = int(given)
+    if isinstance(number, int) and not isinstance(number, bool) and number in PUBLISHED:
+        return PUBLISHED[number]
+    if isinstance(given, bool | int | float | str):
+        allowed = ("0", "1", "2", "the path of a JSON file", "a Curriculum")
+        raise UnknownOption("curriculum", given, allowed)
     return as_curriculum(given)
 
 
-def recipe(
-    task: str,
-    algo: str = "ppo",
-    *,
-    preset: str = "tuned",
-    curriculum: Any = None,
-    **changes: Any,
-) -> Recipe:
-    """Make a recipe from a preset.
+def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: Any) -> Recipe:
+    """Return the recipe that works for a task, as far as we know, with changes.
 
     Args:
-        task: Name of the task, of one's own after ``scm_world.tasks.register``; a model file, or
-            ``"module:function"`` for a function or class that gives a task. Then the presets say
-            nothing of the environment, and trials are in P0, A and B as far as there are these.
+        task: Name of a task, also of one after ``scm_world.tasks.register``; a model file, or
+            ``"module:function"`` for a function or class that gives a task. For such tasks nothing
+            is said of the environment, and trials are in P0, A and B as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
-        preset: ``"tuned"``: what we found to work best.
-        curriculum: See ``curriculum_of``; that of the preset if None.
+        curriculum: See ``curriculum_of``; the usual one of the task if None.
         changes: Fields of the ``Recipe`` or settings of the algorithm. What is a dictionary
-            (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names.
-            ``hindsight=True`` stands for its usual settings.
+            (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names, and
+            ``a.b`` names a part. ``hindsight=True`` stands for its usual settings.
 
     Raises:
-        UnknownOption: There is no such task, algorithm, preset, curriculum, field or setting, or
-            a value is impossible.
+        UnknownOption: There is no such task, algorithm, curriculum, field or setting, or a value
+            is impossible.
 
     Example:
         >>> made = recipe("pushing", curriculum=1, n_steps=32, env={"frame_skip": 5})
@@ -309,43 +286,29 @@ def recipe(
         True
     """
     known_task(task)
-    for what, given, known in (
-        ("algorithm", algo, ALGORITHMS),
-        ("preset", preset, PRESETS),
-    ):
-        if given not in known:
-            raise UnknownOption(what, given, known)
-    fields: dict[str, Any] = {"task": task, "algo": algo, "name": preset}
-    fields |= PRESETS[preset](task, algo)
+    if algo not in ALGORITHMS:
+        raise UnknownOption("algorithm", algo, ALGORITHMS)
+    fields: dict[str, Any] = {"task": task, "algo": algo, "name": "tuned", **tuned(task, algo)}
     if task not in TASKS:
         names: tuple[str, ...] = ("P0",)
         if task not in tasks():
             fields["env"] = {}
-            there = {protocol.name for protocol in protocols_of(made(task, changes.get("env")))}
+            there = {protocol.name for protocol in _protocols(task, changes.get("env"))}
             names = tuple(name for name in ("P0", "A", "B") if name in there)
         fields["trials"] = merged(fields.get("trials", {}), {"protocols": names})
     if curriculum is not None:
         fields["curriculum"] = curriculum
-    return _made(_with_hindsight(changed(fields, changes), changes))
+    return _changed(fields, changes)
 
 
-def made(task: str, env: Mapping[str, Any] | None) -> Task | str:
-    """Make the task of a model; what is registered stays a name."""
+def _protocols(task: str, env: Mapping[str, Any] | None) -> Any:
+    """List the protocols of a task, which is made if it is one of a model."""
     options = (env or {}).get("task_options") or {}
-    return task if task in tasks() else make_task(task, **options)
+    return protocols_of(task if task in tasks() else make_task(task, **options))
 
 
-def changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Change fields of a recipe.
-
-    Args:
-        fields: As they are; there is ``algo``.
-        changes: Fields, or settings of the algorithm, by name. Those that are ``a.b`` change a
-            part of one.
-
-    Raises:
-        UnknownOption: There is no such field.
-    """
+def _changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> Recipe:
+    """Make a recipe of fields and changes, among them settings of the algorithm by name."""
     found = copy.deepcopy(dict(fields))
     settings = ALGORITHMS[fields["algo"]].model_fields
     for name, value in changes.items():
@@ -354,22 +317,13 @@ def changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, 
             first, part = nested(f"settings.{name}", value)
         if first not in Recipe.model_fields:
             raise UnknownOption("field of a recipe", name, (*Recipe.model_fields, *settings))
-        found[first] = _merged(first, found.get(first), part)
-    return found
-
-
-def _with_hindsight(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Sum rewards over one step where goals are made up, unless it was said otherwise."""
+        if first == "hindsight" and isinstance(part, bool):
+            part = {} if part else None
+        found[first] = part if first == "curriculum" else merged(found.get(first), part)
     said = {name.rpartition(".")[2] for name in changes} | {*changes.get("settings", ())}
-    if fields.get("hindsight") is None or fields["algo"] == "ppo" or "n_steps" in said:
-        return dict(fields)
-    return changed(fields, {"n_steps": 1})
-
-
-def _merged(name: str, before: Any, value: Any) -> Any:
-    if name == "hindsight" and isinstance(value, bool):
-        return {} if value else None
-    return value if name == "curriculum" else merged(before, value)
+    if found.get("hindsight") is not None and found["algo"] != "ppo" and "n_steps" not in said:
+        found["settings"] = merged(found["settings"], {"n_steps": 1})  # goals decide no more
+    return _made(found)
 
 
 def _made(fields: Mapping[str, Any]) -> Recipe:

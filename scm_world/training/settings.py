@@ -1,4 +1,4 @@
-"""Settings of the algorithms, by the names that Stable-Baselines3 has for them."""
+"""Parts of recipes and lessons: settings of the algorithms, rates, networks, evaluations."""
 
 from __future__ import annotations
 
@@ -31,42 +31,16 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Observations = Literal["plain", "privileged"]
-"""What a policy sees: its task, or every causal parameter besides."""
-AUTO = r"^auto(_(0\.\d*[1-9]\d*|[1-9]\d*(\.\d+)?))?$"
-
-
-def seen(env: Mapping[str, Any], observations: Observations) -> dict[str, Any]:
-    """Give options of an environment in which a policy sees what it may.
-
-    Example:
-        >>> seen({"frame_skip": 5}, "privileged")
-        {'frame_skip': 5, 'context': 'observation'}
-    """
-    return {**env, "context": "observation"} if observations == "privileged" else dict(env)
+"""What a policy observes: its task, or every causal parameter besides."""
 
 
 class Settings(Frozen):
-    """Settings of an algorithm."""
+    """Keyword arguments of an algorithm of Stable-Baselines3, by its names."""
 
 
 @final
 class Ppo(Settings):
-    """Proximal policy optimization: Schulman et al., arXiv:1707.06347.
-
-    Attributes:
-        n_steps: Control steps of each world between updates.
-        batch_size: Steps of a minibatch.
-        n_epochs: How often each step is used.
-        gamma: Discount of a control step.
-        gae_lambda: Of the generalized advantage.
-        clip_range: How far the ratio of probabilities may go.
-        clip_range_vf: How far the value may go; any distance if None.
-        normalize_advantage: Whether advantages of a minibatch are standardized.
-        ent_coef: Weight of the entropy.
-        vf_coef: Weight of the error of the value.
-        max_grad_norm: To which gradients are clipped.
-        target_kl: Updates stop at 1.5 times this divergence; never if None.
-    """
+    """Of ``stable_baselines3.PPO``; ``n_steps`` are control steps of each world."""
 
     n_steps: Count = 64
     batch_size: Annotated[int, Field(ge=2)] = 1024
@@ -83,18 +57,7 @@ class Ppo(Settings):
 
 
 class OffPolicy(Settings):
-    """What SAC and TD3 have in common.
-
-    Attributes:
-        buffer_size: Control steps that are remembered, of all worlds together.
-        learning_starts: Control steps before the first update; actions are random until then.
-        batch_size: Steps of a minibatch.
-        tau: How much of the network goes into the target network with each update.
-        gamma: Discount of a control step.
-        train_freq: Control steps of each world between updates.
-        gradient_steps: Updates each time; -1 for as many as there were control steps.
-        n_steps: Control steps over which rewards are summed before the value is asked.
-    """
+    """What SAC and TD3 have in common; ``train_freq`` are control steps of each world."""
 
     buffer_size: Count = 1_000_000
     learning_starts: Annotated[int, Field(ge=0)] = 5_000
@@ -115,29 +78,18 @@ class OffPolicy(Settings):
 
 @final
 class Sac(OffPolicy):
-    """Soft actor-critic: Haarnoja et al., arXiv:1812.05905.
+    """Of ``stable_baselines3.SAC``."""
 
-    Attributes:
-        ent_coef: Weight of the entropy; ``"auto"``, or ``"auto_0.1"`` to begin with 0.1.
-        target_entropy: At which ``"auto"`` aims; minus the number of actions with ``"auto"``.
-        target_update_interval: Updates between those of the target network.
-    """
-
-    ent_coef: Annotated[str, Field(pattern=AUTO)] | NotNegative = "auto"
+    ent_coef: (
+        Annotated[str, Field(pattern=r"^auto(_(0\.\d*[1-9]\d*|[1-9]\d*(\.\d+)?))?$")] | NotNegative
+    ) = "auto"
     target_entropy: Literal["auto"] | Finite = "auto"
     target_update_interval: Count = 1
 
 
 @final
 class Td3(OffPolicy):
-    """Twin delayed deep deterministic policy gradient: Fujimoto et al., arXiv:1802.09477.
-
-    Attributes:
-        noise: Standard deviation of what is added to actions while collecting.
-        policy_delay: Updates of the values for each one of the policy.
-        target_policy_noise: Standard deviation of what is added to actions of the target.
-        target_noise_clip: To which that is clipped.
-    """
+    """Of ``stable_baselines3.TD3``; ``noise`` is the standard deviation of its action noise."""
 
     noise: NotNegative = 0.1
     policy_delay: Count = 2
@@ -145,15 +97,13 @@ class Td3(OffPolicy):
     target_noise_clip: NotNegative = 0.5
 
 
+ALGORITHMS: dict[str, type[Settings]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
+"""The settings of each algorithm."""
+
+
 @final
 class Hindsight(Frozen):
-    """Hindsight experience replay: Andrychowicz et al., arXiv:1707.01495.
-
-    Attributes:
-        n_sampled_goal: Goals that are made up for each one that was given.
-        goal_selection_strategy: Where they come from: later in the episode, at its end, or
-            anywhere in it.
-    """
+    """Keyword arguments of ``stable_baselines3.HerReplayBuffer``."""
 
     n_sampled_goal: Count = 4
     goal_selection_strategy: Literal["future", "final", "episode"] = "future"
@@ -161,18 +111,17 @@ class Hindsight(Frozen):
 
 @final
 class Rate(Frozen):
-    """The learning rate, and how it changes.
+    """The learning rate.
 
     Attributes:
         initial: At the beginning.
-        schedule: ``"constant"``; ``"linear"``: falls in a straight line; ``"adaptive"``: after
-            each update of PPO it is divided by 1.5 if the divergence of the new policy from the
-            old one is more than twice ``target_kl``, and multiplied by 1.5 if it is less than
-            half of it.
+        schedule: ``"constant"``; ``"linear"``: falls in a straight line; ``"adaptive"`` (PPO):
+            divided by 1.5 after an update whose divergence is more than twice ``target_kl``, and
+            multiplied by 1.5 after one with less than half of it.
         final: Share of the initial rate that is left at the end of ``"linear"``.
         target_kl: Divergence that ``"adaptive"`` aims at.
-        lowest: Where ``"adaptive"`` ends.
-        highest: Likewise.
+        lowest: Least rate of ``"adaptive"``.
+        highest: Largest rate of ``"adaptive"``.
 
     Source:
         The adaptive schedule is that of Rudin et al., *Learning to Walk in Minutes*, CoRL 2021,
@@ -200,12 +149,12 @@ class Network(Frozen):
 
     Attributes:
         hidden: Widths of its hidden layers.
-        activation: What follows each of them.
+        activation: After each of them.
         log_std: Logarithm of the standard deviation with which PPO begins.
         log_std_end: Ceiling of it at the end of the training; it falls in a straight line from the
             beginning. None: there is no ceiling.
         orthogonal: Whether PPO's weights begin as orthogonal matrices.
-        scaled: Whether observations are multiplied by fixed scales first; see ``scales``.
+        scaled: Whether observations are multiplied by fixed scales first; see ``SCALES``.
     """
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 256)
@@ -231,8 +180,14 @@ class Trials(Frozen):
     times: Count = 10
 
 
-ALGORITHMS: dict[str, type[Settings]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
-"""The algorithms, each with its settings."""
+def observed(env: Mapping[str, Any], observations: Observations) -> dict[str, Any]:
+    """Return options of an environment with the observations that a policy gets.
+
+    Example:
+        >>> observed({"frame_skip": 5}, "privileged")
+        {'frame_skip': 5, 'context': 'observation'}
+    """
+    return {**env, "context": "observation"} if observations == "privileged" else dict(env)
 
 
 def nested(path: str, value: Any) -> tuple[str, Any]:
@@ -261,14 +216,13 @@ def merged(before: Any, value: Any) -> Any:
 
 
 def refused(what: str, error: ValidationError) -> ScmWorldError:
-    """Say in the words of this package what was wrong first."""
+    """Return the first error of a validation as one of this package."""
     first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, ScmWorldError):
         return cause
     path = ".".join(str(step) for step in first["loc"]) or "value"
-    if first["type"] == "extra_forbidden":
-        allowed = ("nothing: there is no such field",)
-        return UnknownOption(f"{path} of {what}", first["input"], allowed)
-    said = str(first["msg"])
-    return UnknownOption(f"{path} of {what}", first["input"], (said[:1].lower() + said[1:],))
+    said = "nothing: there is no such field"
+    if first["type"] != "extra_forbidden":
+        said = str(first["msg"])[:1].lower() + str(first["msg"])[1:]
+    return UnknownOption(f"{path} of {what}", first["input"], (said,))

@@ -9,8 +9,6 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
-from scm_world.cli.cloning import Options
-from scm_world.training.imitation import lesson
 
 QUICK = (
     *("--episodes", "1", "--rounds", "0", "--set", "keep=0", "--set", "updates=5"),
@@ -49,17 +47,6 @@ def test_what_is_impossible_is_one_line(
     assert not (tmp_path / "run").exists()
 
 
-def test_parts_are_set_by_their_names() -> None:
-    """A dotted name changes one part, and leaves the others of the same field as they are."""
-    changes = ("trials.episodes=40", "network.hidden=[128, 128]", "env.frame_skip=5")
-    made = Options("picking", "grasp", {}, "mujoco", 0, changes, quiet=True).made()
-    parts = {"trials": {"episodes": 40}, "network": {"hidden": [128, 128]}}
-    assert made == lesson("picking", **parts, env={"frame_skip": 5})
-    assert (made.trials.episodes, made.network.hidden) == (40, (128, 128))
-    assert (made.trials.protocols, made.network.activation) == (("P1", "P5"), "relu")
-    assert made.env == {**lesson("picking").env, "frame_skip": 5}
-
-
 def test_it_says_what_comes_next(tmp_path: Path) -> None:
     """A small clone names its file and the commands that take it; again, it is there already."""
     pytest.importorskip("torch")
@@ -69,4 +56,6 @@ def test_it_says_what_comes_next(tmp_path: Path) -> None:
         assert f"scm-world evaluate {tmp_path}/run/policy.safetensors picking" in done.output
         assert "scm-world train picking --start" in done.output
     about = json.loads((tmp_path / "run" / "clone.json").read_text())
-    assert about["lesson"]["episodes"] == 1
+    made = about["lesson"]
+    assert (made["episodes"], made["network"]["hidden"], made["keep"]) == (1, [4], 0.0)
+    assert made["network"]["activation"] == "relu"  # a dotted name leaves the other parts alone

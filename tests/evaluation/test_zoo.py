@@ -27,9 +27,7 @@ CARD = {
     "versions": {"numpy": "2.0", "mujoco": "3.3"},
     "trial": {"steps": 512, "scores": {"P0": 0.5}},
 }
-COMMAND = (
-    "scm-world train pushing --algo ppo --preset tuned --backend mujoco --seed 4 --steps 1000000"
-)
+COMMAND = "scm-world train pushing --algo ppo --backend mujoco --seed 4 --steps 1000000"
 
 
 @pytest.fixture

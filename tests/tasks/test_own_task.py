@@ -10,8 +10,8 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import evaluate, protocols_of
 from scm_world.evaluation.again import check
 from scm_world.tasks import TASKS, Building, Reaching, Task, register, tasks
+from scm_world.training.loop import identity_of
 from scm_world.training.recipe import Recipe, recipe
-from scm_world.training.runs import Run
 from scm_world.world import World
 
 
@@ -45,7 +45,7 @@ def test_what_is_registered_is_known_by_its_name(registry: dict[str, type[Task]]
         check(found, episodes=1)
 
 
-def test_a_recipe_takes_it(registry: dict[str, type[Task]], tmp_path: Any) -> None:
+def test_a_recipe_takes_it(registry: dict[str, type[Task]]) -> None:
     """It is evaluated where there is something, and its run says which class it was."""
     with pytest.raises(UnknownOption, match="mine"):
         recipe("mine")
@@ -53,9 +53,8 @@ def test_a_recipe_takes_it(registry: dict[str, type[Task]], tmp_path: Any) -> No
     made = recipe("mine", worlds=2, n_steps=8, batch_size=8, steps=16)
     assert made.trials.protocols == ("P0",)
     assert Recipe.from_dict(made.as_dict()) == made
-    run = Run(tmp_path, made, 0, "fake")
-    assert "Mine" in run.identity["class"]
-    assert "class" not in Run(tmp_path, recipe("reaching"), 0, "fake").identity
+    assert "Mine" in identity_of(made, None)["class"]
+    assert "class" not in identity_of(recipe("reaching"), None)
     with pytest.raises(UnknownOption, match="P5"):
         recipe("mine", trials={"protocols": ["P5"]})
 

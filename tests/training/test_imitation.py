@@ -15,15 +15,17 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
 from scm_world.evaluation.recording import record
-from scm_world.training.imitation import clone, cloning, lesson
-from scm_world.training.imitation.cloning import given_demonstrations
-from scm_world.training.imitation.demonstrations import (
+from scm_world.training import imitation
+from scm_world.training.imitation import (
     Demonstrations,
-    Hands,
-    School,
+    clone,
+    demonstrated,
+    fitted,
+    given_demonstrations,
     joined,
+    lesson,
+    whitening,
 )
-from scm_world.training.imitation.fitting import fitted, whitening
 
 SHORT = {"max_episode_length": 12}
 QUICK: dict[str, Any] = {
@@ -40,11 +42,8 @@ QUICK: dict[str, Any] = {
 
 def shown(n: int = 2, learner: NetworkPolicy | None = None, **changes: Any) -> Demonstrations:
     """Let a teacher show a few short episodes."""
-    school = School(lesson("picking", **{**QUICK, **changes}), backend="mujoco", seed=0)
-    try:
-        return school.shown(0, range(n), learner)
-    finally:
-        school.close()
+    how = lesson("picking", **{**QUICK, **changes})
+    return demonstrated(how, range(n), backend="mujoco", seed=0, learner=learner)
 
 
 def constant(action: float) -> NetworkPolicy:
@@ -83,9 +82,8 @@ def test_an_action_does_what_a_command_says(options: dict[str, Any]) -> None:
 
 def test_demonstrations_follow_from_the_seed_and_the_number() -> None:
     """An episode is the same, whichever ones are shown with it."""
-    both, school = shown(2), School(lesson("picking", **QUICK), backend="mujoco", seed=0)
-    alone = school.shown(0, range(1, 2))
-    school.close()
+    both = shown(2)
+    alone = demonstrated(lesson("picking", **QUICK), range(1, 2), backend="mujoco", seed=0)
     assert both.observations.shape == (24, 56)
     assert both.actions.shape == (24, 9)
     np.testing.assert_array_equal(both.actions[12:], alone.actions)
@@ -122,16 +120,6 @@ def test_who_learns_acts_but_does_not_teach() -> None:
     assert not (together.actions == np.float32(0.9)).all(axis=1).any()
 
 
-def test_hands_shake_as_much_as_was_asked() -> None:
-    """The noise has, over episodes, a standard deviation between nothing and the largest one."""
-    hands = [Hands(lesson("picking", noise=0.1), 9, np.random.default_rng(i)) for i in range(40)]
-    for each in hands:
-        for _ in range(10):  # the noise comes to its size
-            each.action(np.zeros(9), None, None)
-    drawn = np.array([each.action(np.zeros(9), None, None) for each in hands])
-    assert 0.03 < drawn.std() < 0.09  # 0.1 / sqrt(3) is 0.058
-
-
 def test_what_ends_badly_is_left_out() -> None:
     """Only episodes that end well are pairs; how the others ended is known."""
     found = shown(2, keep=1.0)
@@ -139,18 +127,6 @@ def test_what_ends_badly_is_left_out() -> None:
     assert found.scores.shape == (2,)
     with pytest.raises(ModelError, match=r"none of 2 demonstrations ended well enough"):
         joined([found])
-
-
-def test_demonstrations_come_back_from_a_file(tmp_path: Path) -> None:
-    """A file has all of it, and one that is cut short is refused by name."""
-    first, path = shown(1), tmp_path / "first.npz"
-    first.save(path)
-    again = Demonstrations.load(path)
-    for name, array in vars(first).items():
-        np.testing.assert_array_equal(getattr(again, name), array)
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(UnreadableFile, match=r"first\.npz.*damaged"):
-        Demonstrations.load(path)
 
 
 def test_whitening_makes_small_things_count() -> None:
@@ -187,12 +163,14 @@ def test_impossible_lessons_are_refused(changes: dict[str, Any], message: str) -
     [("reaching", {}, "needs blocks"), ("picking", {"action_mode": "joint_torques"}, "torques")],
 )
 def test_a_teacher_that_cannot_teach_says_so_at_once(
-    task: str, env: dict[str, Any], message: str
+    task: str, env: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     """Before any episode: it knows nothing of the task, or cannot act in such units."""
+    pytest.importorskip("torch")
     usual = {"delta_scale": 1.0, "delta_origin": "command", **env} if env else {}
     with pytest.raises(ActionError, match=message):
-        School(lesson(task, env=usual), backend="mujoco", seed=0)
+        clone(None, lesson(task, env=usual), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_unknown_task_is_refused() -> None:
@@ -219,11 +197,11 @@ def test_recordings_are_demonstrations(tmp_path: Path) -> None:
     """A recording says in which environment one learns, and what was done there."""
     path = recorded(tmp_path / "still.parquet")
     for source in (path, tmp_path):
-        given = given_demonstrations(source, lesson("picking", keep=0.0))
-        assert len(given.shown) == 24
-        assert given.lesson.rounds == 0
-        assert given.lesson.env["delta_scale"] == 0.1
-        np.testing.assert_array_equal(given.shown.actions, np.zeros((24, 9)))
+        given, learned = given_demonstrations(source, lesson("picking", keep=0.0))
+        assert len(given) == 24
+        assert learned.rounds == 0
+        assert learned.env["delta_scale"] == 0.1
+        np.testing.assert_array_equal(given.actions, np.zeros((24, 9)))
 
 
 def test_recordings_of_something_else_are_refused(tmp_path: Path) -> None:
@@ -270,7 +248,7 @@ def test_a_clone_learns_what_was_shown(tmp_path: Path) -> None:
     policy = load_policy(found.policy)
     assert policy.about.env["delta_origin"] == "measured"
     assert found.score is None
-    seen = given_demonstrations(path, lesson("picking", keep=0.0)).shown.observations
+    seen = given_demonstrations(path, lesson("picking", keep=0.0))[0].observations
     assert np.abs(policy(seen)).max() < 0.1
 
 
@@ -291,6 +269,11 @@ def test_a_clone_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
     assert parts.policy.read_bytes() == whole.policy.read_bytes()
     assert before == {p: p.stat().st_mtime_ns for p in before}
     assert len(before) == 2
+    (tmp_path / "parts" / "rounds" / "01.safetensors").unlink()
+    damaged = min(before)
+    damaged.write_bytes(damaged.read_bytes()[:500])
+    with pytest.raises(UnreadableFile, match=rf"{damaged.name}.*damaged"):
+        clone(None, how, out=tmp_path / "parts")
 
 
 def test_a_folder_of_other_work_is_refused(tmp_path: Path) -> None:
@@ -339,7 +322,7 @@ def test_a_clone_does_not_depend_on_the_threads_of_torch(
         seen.append(torch.get_num_threads())
         return fitted(*given, **options)
 
-    monkeypatch.setattr(cloning, "fitted", counted)
+    monkeypatch.setattr(imitation, "fitted", counted)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:

@@ -57,5 +57,5 @@ def test_an_agent_is_trained_evaluated_and_goes_on(tmp_path: Path, kind: str) ->
     assert found.metric() == metric
     longer = train(made, out=folder, steps=512)
     assert longer.steps == 512
-    with pytest.raises(UnreadableFile, match="another training"):
+    with pytest.raises(UnreadableFile, match="other work"):
         train(made.but(gamma=0.9), out=folder)

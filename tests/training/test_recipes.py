@@ -7,33 +7,44 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 
+import scm_world  # noqa: F401 # registers the environments
 from scm_world.curricula import Curriculum, goals, physics, together
+from scm_world.env import IDS
 from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.tasks import TASKS
-from scm_world.training.recipe import PRESETS, Recipe, recipe
+from scm_world.training.recipe import Recipe, recipe
 from scm_world.training.settings import ALGORITHMS, Hindsight, Sac
-from scm_world.training.worlds import ENV_IDS
-
-EVERY = [(t, a, p) for t in TASKS for a in ALGORITHMS for p in PRESETS]
 
 
-@pytest.mark.parametrize(("task", "algo", "preset"), EVERY)
-def test_every_preset_is_a_recipe(task: str, algo: str, preset: str) -> None:
+@pytest.mark.parametrize(("task", "algo"), [(t, a) for t in TASKS for a in ALGORITHMS])
+def test_there_is_a_recipe_for_every_task(task: str, algo: str) -> None:
     """It goes to JSON and back, and says what it is of."""
-    made = recipe(task, algo, preset=preset)
+    made = recipe(task, algo)
     assert Recipe.from_dict(json.loads(made.to_json())) == made
-    assert (made.task, made.algo, made.name) == (task, algo, preset)
+    assert (made.task, made.algo, made.name) == (task, algo, "tuned")
 
 
-@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("task", TASKS)
-def test_environments_of_presets_exist(task: str, preset: str) -> None:
-    """Their options are some that the environment has."""
-    made = recipe(task, preset=preset)
-    env = gymnasium.make(ENV_IDS[task], backend="fake", **made.options)
+def test_environments_of_recipes_exist(task: str) -> None:
+    """Their reward has the terms that they name."""
+    options: Any = {**recipe(task).trained_in, "backend": "fake"}
+    (name,) = (id_ for id_, of in IDS.items() if of == task)
+    env: Any = gymnasium.make(name, **options)
     env.reset(seed=0)
+    *_, info = env.step(np.full(9, 0.5, np.float32))
+    given = options.get("task_options", {})
+    assert set(given.get("terms", ())) <= set(info.get("reward_terms", ()))
+
+
+def test_episodes_are_shorter_while_it_is_trained_only() -> None:
+    """Evaluations and policy files do not know of it."""
+    made = recipe("pushing", episode_length=50)
+    assert made.trained_in["max_episode_length"] == 50
+    assert "max_episode_length" not in made.options
+    assert recipe("pushing", episode_length=None).trained_in == made.options
 
 
 def test_changes_reach_every_field() -> None:
@@ -89,7 +100,7 @@ def test_curricula_are_numbers_files_and_values(tmp_path: Path) -> None:
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"task": "pulling"}, "pushing"),
     ({"algo": "pp"}, "ppo"),
-    ({"preset": "papers"}, "paper"),
+    ({"algo": "sac", "network": {"log_std_end": -2.0}}, "log_std_end with sac"),
     ({"curriculum": 3}, "curriculum cannot be 3"),
     ({"curriculum": "none.json"}, "none.json"),
     ({"curriculum": 1.5}, "curriculum cannot be 1.5"),

@@ -1,0 +1,644 @@
+"""Imitation: a network learns to do what a teacher does, a scripted policy or a recording."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, field_validator
+
+from scm_world._types import Floats
+from scm_world.env import ScmWorldEnv
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation.arena import Arena
+from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.policies.cards import OPTIONS, PolicyAbout
+from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
+from scm_world.evaluation.protocols import chosen
+from scm_world.evaluation.recording import Recording
+from scm_world.graph.exchange.libraries import load
+from scm_world.output.durable import locked, made, write_durably
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.policies import NAMED
+from scm_world.queries.progress import Progress
+from scm_world.tasks.rewards import FRACTION, SUCCESS
+from scm_world.training.export import mean, scored, words
+from scm_world.training.loop import Tell, open_folder, torch_threads
+from scm_world.training.settings import (
+    Count,
+    Network,
+    NotNegative,
+    Observations,
+    Positive,
+    Share,
+    TaskName,
+    Trials,
+    merged,
+    nested,
+    observed,
+    refused,
+)
+from scm_world.training.tuned import ENV, LESSONS
+from scm_world.variables.spaces import Frozen
+from scm_world.world.start import whole_number
+
+SHARD = 25
+"""Episodes in a file."""
+
+SEED = 5_000_003
+"""Added to seeds, so that no evaluation has the episodes of the lesson."""
+
+CORRELATION = 0.8
+"""Of the noise of actions, from a control step to the next one."""
+
+UNIT = 0.1
+"""Of actions, while they are learned: errors of that size count fully, larger ones linearly."""
+
+ONLY: Mapping[str, tuple[Any, ...]] = {
+    "normalize_actions": (True,),
+    "observation_mode": ("structured", "full", "custom"),
+    "context": ("none", "observation"),
+    "goal_env": (False,),
+}
+"""Options whose other values give no vector of numbers, or actions that are not in [-1, 1]."""
+
+
+# --- lessons --------------------------------------------------------------------------------------
+
+
+@final
+class Lesson(Frozen):
+    """How a network learns from a teacher.
+
+    Attributes:
+        task: Name of the task.
+        teacher: Name of a policy that reads the world's state.
+        env: Options of the environment, those that a policy file keeps.
+        protocols: Names of what varies while the teacher shows something, in turns.
+        episodes: Which the teacher plays alone.
+        rounds: How often the network acts now and then afterwards, and learns anew.
+        more: Episodes of each of these rounds.
+        noise: Largest standard deviation of what is added to actions, in units of actions; each
+            episode has one between 0 and that.
+        share: Of the control steps in which the network acts in those rounds, on average.
+        stretch: Control steps that it acts at a stretch, on average.
+        keep: Fractional success of an episode, in the end, that is learned from.
+        observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
+        network: What learns.
+        updates: Steps of the optimizer, each time.
+        batch: Control steps that each of them sees.
+        rate: Of learning at the beginning; it falls as a cosine.
+        trials: Evaluations after each round; the best policy is kept.
+
+    Source:
+        Noise: Laskey et al., *DART*, CoRL 2017. Rounds: Ross et al., *DAgger*, AISTATS 2011; here
+        the network acts in short stretches, since a teacher that has a plan is only right about
+        what is not far from it.
+    """
+
+    task: TaskName
+    teacher: str = "grasp"
+    env: dict[str, Any] = Field(default_factory=lambda: dict(ENV))
+    protocols: Annotated[tuple[str, ...], Field(min_length=1)] = ("P0", "P1", "P5")
+    episodes: Count = 250
+    rounds: Annotated[int, Field(ge=0)] = 1
+    more: Count = 100
+    noise: NotNegative = 0.04
+    share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.3
+    stretch: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 10.0
+    keep: Share = 0.9
+    observations: Observations = "plain"
+    network: Network = Field(default_factory=lambda: Network(activation="relu"))
+    updates: Count = 20_000
+    batch: Count = 512
+    rate: Positive = 1e-3
+    trials: Trials = Field(default_factory=lambda: Trials(protocols=("P1", "P5")))
+
+    @field_validator("teacher")
+    @classmethod
+    def _named(cls, teacher: str) -> str:
+        if teacher not in NAMED:
+            raise UnknownOption("teacher", teacher, (*NAMED, "a recording"))
+        return teacher
+
+    @field_validator("env")
+    @classmethod
+    def _of_a_policy(cls, env: dict[str, Any]) -> dict[str, Any]:
+        for name, value in env.items():
+            if name not in OPTIONS:
+                raise UnknownOption("option of the environment of a lesson", name, OPTIONS)
+            if value not in (allowed := ONLY.get(name, (value,))):
+                raise UnknownOption(
+                    f"{name} of a lesson", value, [json.dumps(one) for one in allowed]
+                )
+        return env
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the environment, with all that follows from the other fields."""
+        return observed(self.env, self.observations)
+
+    def about(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return {"format": "scm_world/lesson/1", **self.model_dump(mode="json")}
+
+
+def lesson(task: str, **changes: Any) -> Lesson:
+    """Return the lesson that works for a task, with changes.
+
+    Args:
+        task: Name of the task.
+        changes: Fields of the ``Lesson``. Those that have parts (``env``, ``network``,
+            ``trials``) change the parts that are named; ``a.b`` names a part of ``a``.
+
+    Raises:
+        UnknownOption: There is no such field, or a value is impossible.
+
+    Example:
+        >>> lesson("picking", episodes=10, env={"frame_skip": 5}).env["frame_skip"]
+        5
+        >>> lesson("picking", **{"trials.episodes": 40}).trials.episodes
+        40
+    """
+    fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
+    fields |= LESSONS.get(task, {})
+    for name, value in changes.items():
+        first, part = nested(name, value)
+        if first not in Lesson.model_fields:
+            raise UnknownOption("field of a lesson", name, Lesson.model_fields)
+        fields[first] = merged(fields[first], part)
+    try:
+        found = Lesson.model_validate(fields)
+    except ValidationError as error:
+        raise refused("a lesson", error) from None
+    for names in (found.protocols, found.trials.protocols or ("P0",)):
+        chosen(names, protocols_of(task))
+    return found
+
+
+# --- demonstrations -------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class Demonstrations:
+    """Episodes that ended well, as pairs, and how all of them ended.
+
+    Attributes:
+        observations: Shape (n, k).
+        actions: What the teacher would have done, shape (n, n_actions), in [-1, 1].
+        scores: Fractional success at the end of each episode, shape (episodes,).
+        kept: Whether it is among the pairs, shape (episodes,).
+    """
+
+    observations: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    scores: Floats
+    kept: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+
+def _save(shown: Demonstrations, path: Path) -> None:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **vars(shown))
+    write_durably(path, stream.getvalue())
+
+
+def _load(path: Path) -> Demonstrations:
+    """Read a file of demonstrations.
+
+    Raises:
+        UnreadableFile: It is something else, or damaged.
+    """
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
+        if len(found.observations) != len(found.actions):
+            raise ValueError("observations and actions are not equally many")
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        advice = "remove it: the same call makes it again"
+        raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
+    return found
+
+
+def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
+    """Put demonstrations together.
+
+    Raises:
+        ModelError: There is nothing to learn from, or observations have several lengths.
+    """
+    listed = list(parts)
+    scores = np.concatenate([part.scores for part in listed])
+    filled = [part for part in listed if len(part)]
+    if not filled:
+        problem = (
+            f"none of {len(scores)} demonstrations ended well enough to learn from; the best one "
+            f"reached {scores.max(initial=0.0):.3f}: take another teacher, less noise, or a "
+            "smaller keep"
+        )
+        raise ModelError([problem])
+    lengths = {part.observations.shape[1] for part in filled}
+    if len(lengths) != 1:
+        raise ModelError([f"observations have several lengths: {sorted(lengths)}"])
+    return Demonstrations(
+        np.concatenate([part.observations for part in filled]),
+        np.concatenate([part.actions for part in filled]),
+        scores,
+        np.concatenate([part.kept for part in listed]),
+    )
+
+
+def demonstrated(
+    lesson: Lesson,
+    numbers: range,
+    *,
+    backend: str,
+    seed: int,
+    round_: int = 0,
+    learner: NetworkPolicy | None = None,
+) -> Demonstrations:
+    """Let the teacher show some episodes; those that do not end well are left out.
+
+    An episode follows from the seed, the round and its number.
+
+    Args:
+        lesson: What is shown.
+        numbers: Of the episodes, within the noise.
+        backend: Name of the engine.
+        seed: Of everything that is drawn.
+        round_: Of the lesson.
+        learner: Acts now and then; nobody if None.
+
+    Raises:
+        ActionError: The teacher cannot act in this task.
+        UnknownOption: An option of the environment does not exist, or the task does not say how
+            episodes end.
+    """
+    env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
+    arena = Arena(env)
+    try:
+        told = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
+        if not told:
+            allowed = (
+                f"a task with {FRACTION!r} or {SUCCESS!r}: only what ended well is learned from"
+            )
+            raise UnknownOption("task of a lesson", lesson.task, (allowed,))
+        taught = chosen(lesson.protocols, protocols_of(lesson.task))
+        seen, done, scores = [], [], []
+        for number in numbers:
+            protocol = taught[number % len(taught)]
+            random = np.random.default_rng([seed, round_, number])
+            turn, observation = arena.begin(protocol, seed=SEED + seed, episode=number)
+            pairs, info = _episode(lesson, env, turn, observation, random, learner)
+            seen.append(np.array([one for one, _ in pairs], np.float32))
+            done.append(np.array([one for _, one in pairs], np.float32))
+            scores.append(float(info[told[0]]))
+    finally:
+        arena.close()
+    kept = np.array(scores) >= lesson.keep
+    empty = slice(0, 0)
+    return Demonstrations(
+        np.concatenate([seen[0][empty], *(one for one, k in zip(seen, kept, strict=True) if k)]),
+        np.concatenate([done[0][empty], *(one for one, k in zip(done, kept, strict=True) if k)]),
+        np.array(scores),
+        kept,
+    )
+
+
+def _episode(
+    lesson: Lesson,
+    env: ScmWorldEnv,
+    turn: Any,
+    observation: Any,
+    random: np.random.Generator,
+    learner: NetworkPolicy | None,
+) -> tuple[list[tuple[Any, Any]], dict[str, Any]]:
+    """Run an episode; return what was observed and what the teacher would have done, and infos."""
+    teacher, size = NAMED[lesson.teacher](), env.world.declaration.n_actions
+    scale, share = lesson.noise * random.uniform(), lesson.share * random.uniform(0.0, 2.0)
+    noise, learns, over, info = np.zeros(size), False, False, dict[str, Any]()
+    pairs = []
+    while not over:
+        right = np.clip(env.toward(teacher(env.world)), -1.0, 1.0)
+        pairs.append((np.array(observation, np.float32), right.astype(np.float32)))
+        if learner is not None and random.uniform() < 1.0 / lesson.stretch:
+            learns = random.uniform() < share
+        innovation = np.sqrt(1.0 - CORRELATION**2) * random.standard_normal(size)
+        noise = CORRELATION * noise + innovation
+        action = learner(observation) if learner is not None and learns else right
+        given = np.clip(action + scale * noise, -1.0, 1.0)
+        observation, _, terminated, truncated, info = env.step(given)
+        over = terminated or truncated
+        if not over and turn.step(env):
+            observation = env.observe()
+    return pairs, info
+
+
+def given_demonstrations(
+    source: Recording | Path | str, lesson: Lesson
+) -> tuple[Demonstrations, Lesson]:
+    """Read demonstrations that were made before, and the lesson in their environment.
+
+    Args:
+        source: A recording, its file, or a folder of such files.
+        lesson: What should be learned from them.
+
+    Raises:
+        UnknownOption: They are of another task, their actions are not in [-1, 1], or they lack what
+            privileged observations have.
+        UnreadableFile: There are none.
+        ModelError: None ended well.
+    """
+    recordings = [source] if isinstance(source, Recording) else []
+    if not isinstance(source, Recording):
+        path = Path(source)
+        files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
+        if not files:
+            advice = "give a recording, or a folder with files that Recording.save has written"
+            raise UnreadableFile(str(path), "there is no Parquet file in it", advice)
+        recordings = [Recording.load(file) for file in files]
+    for one in recordings:
+        task = one.environment["task"]
+        name = task if isinstance(task, str) else getattr(task, "name", str(task))
+        if name != lesson.task:
+            raise UnknownOption("task of a recording", name, (lesson.task,))
+    kept = [{n: one.environment[n] for n in OPTIONS if n in one.environment} for one in recordings]
+    if any(options != kept[0] for options in kept):
+        raise ModelError(["the recordings were made in environments with different options"])
+    fields = {**lesson.model_dump(mode="json"), "env": json.loads(json.dumps(kept[0])), "rounds": 0}
+    try:
+        learned = Lesson.model_validate(fields)
+    except ValidationError as error:
+        raise refused("a recording to learn from", error) from None
+    if learned.options != learned.env:
+        allowed = ("plain: these recordings do not have the causal parameters",)
+        raise UnknownOption("observations", lesson.observations, allowed)
+    return joined([_recorded(one, lesson.keep) for one in recordings]), learned
+
+
+def _recorded(recording: Recording, keep: float) -> Demonstrations:
+    told = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in recording)]
+    if not told:
+        problem = f"the recording does not say how episodes ended: record {FRACTION!r}, too"
+        raise ModelError([problem])
+    scores = np.array([float(episode.infos[told[0]][-1]) for episode in recording])
+    kept = scores >= keep
+    good = tuple(episode for episode, is_good in zip(recording, kept, strict=True) if is_good)
+    none = np.empty((0, 1), np.float32), np.empty((0, 1), np.float32)
+    pairs = Recording(recording.environment, good).pairs() if good else none
+    return Demonstrations(*pairs, scores, kept)
+
+
+# --- fitting --------------------------------------------------------------------------------------
+
+
+def fitted(
+    shown: Demonstrations, lesson: Lesson, *, seed: int
+) -> tuple[dict[str, NDArray[np.float32]], float]:
+    """Fit a network to demonstrations, by Adam on Huber's loss.
+
+    Observations are whitened: turned into their principal components, each with a standard
+    deviation of one. So how far a fingertip is from a block counts as much as where both are. The
+    first layer of the result has this turned back.
+
+    Args:
+        shown: What is learned.
+        lesson: How it is learned.
+        seed: Of everything that is drawn.
+
+    Returns:
+        The tensors of the network, by the names in a policy file, and the mean loss of the last
+        tenth of the updates.
+
+    Raises:
+        ModelError: The rate is so large that the network's weights grow without end.
+    """
+    torch: Any = load("torch", "torch", "train")
+    turn, shift = whitening(shown.observations)
+    seen = torch.from_numpy((shown.observations @ turn.T + shift).astype(np.float32))
+    done = torch.from_numpy(shown.actions / np.float32(UNIT))
+    after = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[lesson.network.activation]
+    losses = []
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        layers: list[Any] = []
+        width = seen.shape[1]
+        for hidden in lesson.network.hidden:
+            layers += [torch.nn.Linear(width, hidden), after()]
+            width = hidden
+        network = torch.nn.Sequential(*layers, torch.nn.Linear(width, done.shape[1]))
+        optimizer = torch.optim.Adam(network.parameters(), lr=lesson.rate)
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(
+            optimizer, lesson.updates, eta_min=0.01 * lesson.rate
+        )
+        for _ in range(lesson.updates):
+            rows = torch.randint(0, len(seen), (lesson.batch,))
+            loss = torch.nn.functional.smooth_l1_loss(network(seen[rows]), done[rows])
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+            falling.step()
+            losses.append(loss.item())
+    last = float(np.mean(losses[-max(lesson.updates // 10, 1) :]))
+    if not np.isfinite(last):
+        raise ModelError(["the loss is no finite number any more: take a smaller rate"])
+    arrays = [tensor.detach().numpy().astype(np.float64) for tensor in network.parameters()]
+    arrays[:2] = [arrays[0] @ turn, arrays[0] @ shift + arrays[1]]
+    arrays[-2:] = [UNIT * array for array in arrays[-2:]]
+    names = [f"layers.{i // 2}.{('weight', 'bias')[i % 2]}" for i in range(len(arrays))]
+    return {n: array.astype(np.float32) for n, array in zip(names, arrays, strict=True)}, last
+
+
+def whitening(observations: NDArray[Any]) -> tuple[Floats, Floats]:
+    """Return what turns observations into uncorrelated features with a variance of one.
+
+    Args:
+        observations: Shape (n, k).
+
+    Returns:
+        Matrix, shape (m, k), and shift, shape (m,), of a linear map. Directions that do not vary
+        are left out, unless none does; those that hardly do count less.
+
+    Example:
+        >>> points = np.random.default_rng(0).normal(size=(1000, 2)) * [3.0, 0.1] + 5.0
+        >>> matrix, shift = whitening(points)
+        >>> np.allclose(np.cov((points @ matrix.T + shift).T), np.eye(2), atol=1e-3)
+        True
+    """
+    points = observations.astype(np.float64)
+    middle = points.mean(axis=0)
+    centered = points - middle
+    variances, axes = np.linalg.eigh(centered.T @ centered / len(points))
+    varied = variances > 1e-8
+    varied[-1] = True
+    matrix = (axes[:, varied] / np.sqrt(variances[varied] + 1e-6)).T
+    return matrix, -matrix @ middle
+
+
+# --- cloning --------------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class Cloned:
+    """A network that has learned from a teacher.
+
+    Attributes:
+        folder: Of its files.
+        lesson: How it learned.
+        seed: Of everything that was drawn.
+        policy: The file of the policy after the last round.
+        best: The file of the one that was best in the evaluations; the last one without them.
+        score: Of that one, mean last fractional success; None without evaluations.
+    """
+
+    folder: Path
+    lesson: Lesson
+    seed: int
+    policy: Path
+    best: Path
+    score: float | None
+
+
+def clone(
+    source: Recording | Path | str | None,
+    lesson: Lesson,
+    *,
+    out: Path | str,
+    seed: int = 0,
+    backend: str = "mujoco",
+    progress: Progress | None = None,
+    tell: Tell | None = None,
+) -> Cloned:
+    """Let a network learn to do what a teacher does.
+
+    The teacher shows episodes; those that end well are learned from. In each round after that the
+    network acts now and then, the teacher says what it would have done, and the network learns
+    anew from all of it.
+
+    If ``out`` holds a part of the same work, it goes on after the last whole file of episodes, or
+    the last round. What comes out follows from the lesson, the seed, the engine and the versions.
+
+    Args:
+        source: Where demonstrations come from: None for the teacher of the lesson; a recording,
+            its Parquet file, or a folder of such files, from which alone is learned then, with
+            the environment that they were made in.
+        lesson: What is shown, and how it is learned.
+        out: Folder for all files.
+        seed: Of everything that is drawn.
+        backend: Name of the engine.
+        progress: Told how many episodes have been shown, and how many will be.
+        tell: Told in words what happens.
+
+    Returns:
+        Where its policies are.
+
+    Raises:
+        MissingExtra: torch is not installed.
+        ModelError: There are no demonstrations that ended well.
+        ActionError: The teacher cannot act in this task, or not by such actions.
+        UnknownOption: Something does not exist, or the recording is of another task.
+        UnreadableFile: Something else is in the folder, or a file is damaged.
+        UnwritableFolder: There is no room, or no permission.
+    """
+    torch: Any = load("torch", "torch", "train")
+    number, folder, say = whole_number("seed", seed, least=0), Path(out), tell or (lambda _: None)
+    shown, digest, engine = [], None, ""
+    if source is not None:
+        given, lesson = given_demonstrations(source, lesson)
+        shown.append(given)
+        digest = sha256(given.observations.tobytes() + given.actions.tobytes()).hexdigest()
+    else:
+        engine = _checked(lesson, backend, number)
+    identity = {"lesson": lesson.about(), "seed": number, "backend": backend, "recording": digest}
+    policies: list[NetworkPolicy] = []
+    with locked(folder), torch_threads(1):
+        open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)
+        for round_ in range(lesson.rounds + 1):
+            how: dict[str, Any] = {"backend": backend, "seed": number, "round_": round_}
+            if source is None:
+                learner = policies[-1] if policies else None
+                shown += _collected(folder, lesson, progress, learner=learner, **how)
+            path = made(folder / "rounds") / f"{round_:02}.safetensors"
+            if not path.exists():
+                pairs = joined(shown)
+                ended = f"{int(pairs.kept.sum())} of {len(pairs.kept)} episodes"
+                say(f"round {round_}: learns from {len(pairs):,} control steps, of {ended}")
+                tensors, loss = fitted(pairs, lesson, seed=number)
+                made_with = {**versions(engine), "torch": str(torch.__version__)}
+                card = {
+                    "lesson": lesson.about(),
+                    "seed": number,
+                    "backend": backend,
+                    "round": round_,
+                    "control_steps": len(pairs),
+                    "episodes": {"shown": len(pairs.kept), "kept": int(pairs.kept.sum())},
+                    "teacher": float(pairs.scores.mean()),
+                    "loss": loss,
+                    "versions": made_with,
+                }
+                policy = NetworkPolicy.of(tensors, _about(lesson, card))
+                scores: dict[str, float] = {}
+                if lesson.trials.protocols:
+                    given_to = (lesson.task, lesson.options, lesson.trials, backend)
+                    _, scores = scored(policy, *given_to)
+                say(f"round {round_}: loss {loss:.4f}; {words(scores) or 'not evaluated'}")
+                save_policy(path, policy, policy.about.with_card(trials=scores))
+            policies.append(load_policy(str(path)))
+        means = [mean(policy.about.card.get("trials") or {}) for policy in policies]  # type: ignore[arg-type]
+        last, best = folder / "policy.safetensors", folder / "best.safetensors"
+        save_policy(last, policies[-1])
+        if None in means:
+            return Cloned(folder, lesson, number, last, last, None)
+        ranked = max(range(len(means)), key=lambda i: (means[i], i))
+        save_policy(best, policies[ranked])
+        return Cloned(folder, lesson, number, last, best, means[ranked])
+
+
+def _about(lesson: Lesson, card: Mapping[str, Any]) -> PolicyAbout:
+    activation = lesson.network.activation
+    return PolicyAbout(task=lesson.task, env=lesson.options, activation=activation, card=dict(card))
+
+
+def _checked(lesson: Lesson, backend: str, seed: int) -> str:
+    """Check that the teacher can act before a folder is made; return the engine's version.
+
+    Raises:
+        ActionError: It cannot.
+    """
+    env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
+    try:
+        env.reset(seed=seed)
+        NAMED[lesson.teacher]()(env.world)
+        return env.world.engine
+    finally:
+        env.close()
+
+
+def _collected(
+    folder: Path, lesson: Lesson, progress: Progress | None, *, round_: int, **how: Any
+) -> list[Demonstrations]:
+    """Let a round of episodes be shown, or read what was shown before."""
+    first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
+    stop = first + (lesson.episodes if round_ == 0 else lesson.more)
+    found = []
+    for begin in range(first, stop, SHARD):
+        numbers = range(begin, min(begin + SHARD, stop))
+        path = folder / "demonstrations" / f"{round_:02}-{begin:06}.npz"
+        made(path.parent)
+        if not path.exists():
+            _save(demonstrated(lesson, numbers, round_=round_, **how), path)
+        found.append(_load(path))
+        if progress is not None:
+            progress(numbers.stop, lesson.episodes + lesson.rounds * lesson.more)
+    return found

@@ -1,0 +1,464 @@
+"""Training with Stable-Baselines3: policies, interruptions, the same bits."""
+
+from __future__ import annotations
+
+import errno
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from scm_world.errors import (
+    Diverged,
+    MissingExtra,
+    ScmWorldError,
+    UnknownOption,
+    UnreadableFile,
+    UnwritableFolder,
+)
+from scm_world.evaluation.policies.weights import load_policy, save_policy
+from scm_world.training.loop import train
+from scm_world.training.recipe import Recipe, recipe
+from scm_world.training.settings import Rate
+
+sb3 = pytest.importorskip("stable_baselines3")
+
+from scm_world.training import agents  # noqa: E402 # needs the library
+
+SMALL: dict[str, Any] = {
+    "worlds": 4,
+    "env": {"delta_scale": 0.1},
+    "episode_length": 10,
+    "network": {"hidden": [8, 8], "log_std_end": None},
+    "trials": {"episodes": 1, "times": 2, "protocols": ["P0"]},
+}
+OFF: dict[str, Any] = {
+    **SMALL,
+    "steps": 240,
+    "batch_size": 16,
+    "learning_starts": 60,
+    "buffer_size": 120,
+    "gradient_steps": 1,
+}
+RECIPES: dict[str, Recipe] = {
+    "ppo": recipe(
+        "pushing",
+        **SMALL,
+        steps=256,
+        n_steps=8,
+        batch_size=16,
+        rate={"schedule": "adaptive"},
+        scale_rewards=True,
+        critic_warmup=64,
+    ),
+    "sac": recipe("pushing", "sac", **OFF),
+    "td3": recipe("pushing", "td3", **OFF),
+    "hindsight": recipe("pushing", "sac", **OFF, hindsight=True),
+}
+
+
+class Killed(BaseException):
+    """The power is gone."""
+
+
+def run(name: str | Recipe, out: Path, **options: Any) -> Any:
+    """Train a little."""
+    given = {"out": out, "backend": "fake", "threads": 1, "seed": 3, **options}
+    return train(RECIPES[name] if isinstance(name, str) else name, **given)
+
+
+def killed(name: str, out: Path, patch: pytest.MonkeyPatch, after: int) -> None:
+    """Train until so many checkpoints are written."""
+    write, count = agents.write_checkpoint, iter(range(1, 10_000))
+
+    def fatal(*given: Any) -> None:
+        write(*given)
+        if next(count) == after:
+            raise Killed
+
+    with patch.context() as inner:
+        inner.setattr(agents, "write_checkpoint", fatal)
+        with pytest.raises(Killed):
+            run(name, out, every=0.0)
+
+
+def weights(path: Path) -> dict[str, Any]:
+    """Read a policy file."""
+    found: dict[str, Any] = safetensors.numpy.load_file(path)
+    return found
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_an_interruption_leaves_no_trace(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is learned in pieces is, bit for bit, what is learned at once."""
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    one = run(name, whole)
+    for after in (2, 2, 1):
+        killed(name, pieces, monkeypatch, after)
+    other = run(name, pieces)
+    assert (one.steps, one.score) == (other.steps, other.score)
+    for file in ("policy.safetensors", "best.safetensors"):
+        mine, yours = weights(whole / file), weights(pieces / file)
+        assert mine.keys() == yours.keys()
+        for key, array in mine.items():
+            np.testing.assert_array_equal(array, yours[key], err_msg=key)
+    assert len(agents.checkpoints(pieces)) == 2
+    assert len([*pieces.glob("progress*.csv")]) == 4
+
+
+def test_kill_minus_nine_leaves_no_trace(tmp_path: Path) -> None:
+    """A process that was killed on MuJoCo is gone on with in another one, bit for bit."""
+    program = """
+import os, sys
+from pathlib import Path
+from scm_world.curricula import Curriculum, resample, stages, together
+from scm_world.training.loop import train
+from scm_world.training.recipe import recipe
+made = recipe("pushing", worlds=3, steps=96, n_steps=8, batch_size=8, episode_length=11,
+    curriculum=Curriculum(together(resample("tool_block.mass", "A"), stages({}, {}, up=0.5))),
+    network={"hidden": [8]}, trials={"protocols": []})
+die = (lambda done, _: done >= int(sys.argv[2]) and os.kill(os.getpid(), 9))
+train(made, out=Path(sys.argv[1]), every=0.0, threads=1, progress=die)
+"""
+    for folder, deaths in (("whole", ["1000"]), ("pieces", ["48", "1000"])):
+        for death in deaths:
+            words = [sys.executable, "-c", program, str(tmp_path / folder), death]
+            code = subprocess.run(words, check=False).returncode  # noqa: S603 # our own program
+            assert code == (0 if death == "1000" else -9)
+    one, other = (weights(tmp_path / name / "policy.safetensors") for name in ("whole", "pieces"))
+    for key, array in one.items():
+        np.testing.assert_array_equal(array, other[key], err_msg=key)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("scaled", [False, True])
+def test_the_policy_file_acts_as_the_model(name: str, scaled: bool, tmp_path: Path) -> None:
+    """On observations of every size; scales of observations are in its weights."""
+    made = RECIPES[name].but(**{"network.scaled": scaled, "trials.protocols": []})
+    path = run(made, tmp_path / "run").policy
+    worlds = agents.make_worlds(made, backend="fake")
+    model = agents.make_learner(made, worlds, seed=0)
+    agents.begin_with(model, made, path)
+    worlds.close()
+    rng, space = np.random.default_rng(0), model.observation_space
+
+    def draw(part: Any) -> Any:
+        return rng.normal(0, 0.5, (32, *part.shape)).astype(part.dtype)
+
+    is_dict = isinstance(space, gymnasium.spaces.Dict)
+    seen = {key: draw(part) for key, part in space.items()} if is_dict else draw(space)
+    wanted, policy = model.predict(seen, deterministic=True)[0], load_policy(path)
+    np.testing.assert_allclose(policy(seen), wanted, atol=1e-5)
+    assert np.ptp(wanted) > 0.01
+    assert (policy.about.task, policy.about.card["steps"]) == ("pushing", made.steps)
+    assert (policy.about.inputs is not None) == is_dict
+    if name == "td3":
+        target = model.actor_target.state_dict()
+        for key, tensor in model.actor.state_dict().items():
+            np.testing.assert_array_equal(tensor.numpy(), target[key].numpy())
+
+
+def test_worlds_begin_at_different_steps_of_their_episodes() -> None:
+    """World i of n began i / n of an episode later than the first one."""
+    worlds = agents.make_worlds(RECIPES["sac"], backend="fake")
+    worlds.seed(0)
+    worlds.reset()
+    ends: list[list[int]] = [[] for _ in range(4)]
+    for step in range(1, 25):
+        *_, dones, infos = worlds.step(np.zeros((4, 9)))
+        for index in np.flatnonzero(dones):
+            ends[index].append(step)
+            assert infos[index]["episode"]["l"] == 10
+            assert {"is_success", "fractional_success"} <= infos[index]["episode"].keys()
+    worlds.close()
+    assert ends == [[3, 13, 23], [5, 15], [8, 18], [10, 20]]
+
+
+def test_a_run_is_whole(tmp_path: Path) -> None:
+    """Everything is in its place; the same call again does nothing."""
+    said: list[str] = []
+    told: list[tuple[int, int]] = []
+    folder = tmp_path / "run"
+    found = run("ppo", folder, tell=said.append, progress=lambda *given: told.append(given))
+    assert {path.name for path in folder.iterdir()} == {
+        "best.safetensors",
+        "checkpoints",
+        "evaluations",
+        "policy.safetensors",
+        "progress.csv",
+        "run.json",
+        "tensorboard",
+    }
+    about = json.loads((folder / "run.json").read_text())
+    assert about["versions"]["stable-baselines3"]
+    assert Recipe.from_dict(about["recipe"]) == found.recipe
+    names = sorted(path.name for path in (folder / "evaluations").iterdir())
+    assert names == ["128.json", "256.json"]
+    head = (folder / "progress.csv").read_text().partition("\n")[0].split(",")
+    for name in ("rollout/ep_rew_mean", "rollout/success_rate", "rollout/fractional_success"):
+        assert name in head
+    assert {"train/approx_kl", "train/learning_rate", "evaluation/P0"} <= {*head}
+    assert told[-1] == (256, 256)
+    assert said[-1].startswith("256 steps: P0")
+    before = found.policy.read_bytes()
+    again = run("ppo", folder)
+    assert (again.best, again.score) == (found.best, found.score)
+    assert again.policy.read_bytes() == before
+
+
+def test_one_training_is_not_another(tmp_path: Path) -> None:
+    """Another seed learns something else; what is different is said."""
+    run("ppo", tmp_path / "one"), run("ppo", tmp_path / "two", seed=4)
+    one, two = (weights(tmp_path / name / "policy.safetensors") for name in ("one", "two"))
+    assert not np.array_equal(one["layers.0.weight"], two["layers.0.weight"])
+    for options, said in (
+        ({"seed": 4}, "seed is 3 there, and 4"),
+        ({"backend": "mujoco"}, "'fake' there, and 'mujoco'"),
+        ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, "rate.initial is .* 0.25 was"),
+        ({"start": tmp_path / "two" / "policy.safetensors"}, "start is None there"),
+    ):
+        with pytest.raises(UnreadableFile, match=said):
+            run(**{"name": "ppo", "out": tmp_path / "one", **options})
+    (tmp_path / "strange").mkdir()
+    (tmp_path / "strange" / "thesis.tex").write_text("")
+    with pytest.raises(UnreadableFile, match="thesis"):
+        run("ppo", tmp_path / "strange")
+    (tmp_path / "strange" / "run.json").write_text("{")
+    with pytest.raises(UnreadableFile, match=r"run\.json"):
+        run("ppo", tmp_path / "strange")
+
+
+def test_a_training_becomes_longer(tmp_path: Path) -> None:
+    """It is, bit for bit, the long one; not where the learning rate knows the length."""
+    run("ppo", tmp_path / "once"), run("ppo", tmp_path / "longer", steps=128)
+    found = run("ppo", tmp_path / "longer")
+    assert found.steps == 256
+    one, other = (weights(tmp_path / name / "policy.safetensors") for name in ("once", "longer"))
+    for key, array in one.items():
+        np.testing.assert_array_equal(array, other[key])
+    with pytest.raises(UnreadableFile, match="steps is 256 there, and 128"):
+        run("ppo", tmp_path / "longer", steps=128)
+    for name, value in {"rate.schedule": "linear", "network.log_std_end": -3.0}.items():
+        line = RECIPES["ppo"].but(**{name: value, "steps": 64})
+        run(line, tmp_path / name)
+        with pytest.raises(UnreadableFile, match="steps is 64 there, and 128"):
+            run(line, tmp_path / name, steps=128)
+
+
+@pytest.mark.parametrize("change", [{"network.log_std": 1_000.0}, {"rate.initial": 1e12}])
+def test_divergence_ends_a_training(change: dict[str, float], tmp_path: Path) -> None:
+    """Deviations that are infinite, and steps that are far too long; nothing of it is kept."""
+    with pytest.raises(Diverged, match="lower learning rate"):
+        run(RECIPES["ppo"].but(**change, critic_warmup=0), tmp_path / "run")
+    assert not [*(tmp_path / "run").glob("*.safetensors")]
+
+
+def test_other_versions_are_told(tmp_path: Path) -> None:
+    """They may have other last bits."""
+    run("ppo", tmp_path / "run")
+    about = tmp_path / "run" / "run.json"
+    data = json.loads(about.read_text())
+    data["versions"]["numpy"] = "1.0"
+    about.write_text(json.dumps(data))
+    said: list[str] = []
+    run("ppo", tmp_path / "run", tell=said.append)
+    assert said[0].startswith("numpy was 1.0 and is")
+
+
+def test_the_value_is_learned_alone_at_first(tmp_path: Path) -> None:
+    """During the warm-up of the critic the policy and an adaptive rate stay as they are."""
+    made = RECIPES["ppo"].but(critic_warmup=1_000, steps=64)
+    one = weights(run(made, tmp_path / "one").policy)
+    two = weights(run(made, tmp_path / "two", steps=256).policy)
+    np.testing.assert_array_equal(one["layers.0.weight"], two["layers.0.weight"])
+    np.testing.assert_array_equal(one["log_std"], two["log_std"])
+    assert not np.array_equal(one["value.layers.0.weight"], two["value.layers.0.weight"])
+    rows = (tmp_path / "two" / "progress.csv").read_text().splitlines()
+    column = rows[0].split(",").index("train/learning_rate")
+    assert {float(row.split(",")[column]) for row in rows[2:]} == {made.rate.initial}
+
+
+def test_the_ceiling_of_the_noise_falls(tmp_path: Path) -> None:
+    """At the end of a training no standard deviation is above what was asked for."""
+    made = RECIPES["ppo"].but(**{"network.log_std_end": -3.0})
+    assert weights(run(made, tmp_path / "run").policy)["log_std"].max() <= -3.0
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac", "td3"])
+def test_training_begins_with_a_policy(name: str, tmp_path: Path) -> None:
+    """Its weights are those of the first round; it is part of what the run is."""
+    given = run(name, tmp_path / "first").policy
+    made = RECIPES[name].but(**{"rate.initial": 1e-12, "rate.schedule": "constant"})
+    found = run(made, tmp_path / "second", start=given).policy
+    for key, array in weights(given).items():
+        np.testing.assert_allclose(weights(found)[key], array, atol=1e-6)
+    with pytest.raises(UnreadableFile, match="start is"):
+        run(made, tmp_path / "second")
+    bare = {k: v for k, v in weights(given).items() if k.startswith("layers")}
+    start = save_policy(tmp_path / "bare.safetensors", bare, load_policy(given).about)
+    third = weights(run(made, tmp_path / "third", start=start).policy)
+    np.testing.assert_allclose(third["layers.0.weight"], bare["layers.0.weight"], atol=1e-6)
+
+
+def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    """Other networks, other observations, no policy; nothing is left in the folder."""
+    first, out = run("ppo", tmp_path / "first"), tmp_path / "second"
+    for made, said in (
+        (RECIPES["ppo"].but(**{"network.hidden": [9, 8]}), "shape of layers.0"),
+        (RECIPES["ppo"].but(**{"env.delta_scale": 0.2}), "delta_scale is 0.1 there and 0.2"),
+        (RECIPES["sac"], "output"),
+    ):
+        with pytest.raises(UnreadableFile, match=said):
+            run(made, out, start=first.policy)
+        assert not out.exists()
+    for start in (tmp_path / "nothing", tmp_path / "first" / "run.json"):
+        with pytest.raises(UnreadableFile, match=start.name):
+            run("ppo", out, start=start)
+        assert not out.exists()
+    with pytest.raises(UnknownOption, match="policy of the zoo"):
+        run("ppo", out, start="zoo:nothing-of-this-name")
+    assert run("ppo", out, start=first.folder).steps == 256
+
+
+def test_damaged_checkpoints_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut, another byte, something else; without it the one before is taken."""
+    folder = tmp_path / "run"
+    killed("ppo", folder, monkeypatch, 3)
+    last = agents.checkpoints(folder)[-1]
+    whole = last.read_bytes()
+    middle = len(whole) // 2
+    other = bytes(byte ^ 255 for byte in whole[middle : middle + 256])
+    flipped = whole[:middle] + other + whole[middle + 256 :]
+    for data in (whole[:-9], flipped, b"", b"short"):
+        last.write_bytes(data)
+        with pytest.raises(UnreadableFile, match="remove this file"):
+            run("ppo", folder)
+    last.unlink()
+    assert run("ppo", folder).steps == 256
+
+
+def test_reading_a_checkpoint_runs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pickle that would call something is refused."""
+    import torch
+
+    class Trap:
+        def __reduce__(self) -> Any:
+            return (Path.touch, (tmp_path / "sprung",))
+
+    folder = tmp_path / "run"
+    killed("ppo", folder, monkeypatch, 1)
+    torch.save({"parameters": Trap()}, agents.checkpoints(folder)[-1])
+    with pytest.raises(UnreadableFile):
+        run("ppo", folder)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_full_disk_ends_the_training_with_the_last_checkpoint_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error says what is wrong, and the same call goes on."""
+    folder = tmp_path / "run"
+    killed("ppo", folder, monkeypatch, 2)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("scm_world.output.durable.os.fsync", full)
+        with pytest.raises(UnwritableFolder, match="No space left"):
+            run("ppo", folder, every=0.0)
+    assert run("ppo", folder).steps == 256
+
+
+def test_ctrl_c_writes_a_checkpoint(tmp_path: Path) -> None:
+    """The present round is finished first; the same call goes on."""
+    said: list[str] = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt(done: int, _: int) -> None:
+        if done == 96:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run("ppo", tmp_path / "run", tell=said.append, progress=interrupt)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert "Ctrl-C again stops at once" in said[0]
+    assert agents.checkpoints(tmp_path / "run")[-1].stem == "96"
+    run("ppo", tmp_path / "run", tell=said.append)
+    assert "goes on after 96 steps" in said
+
+
+def test_what_is_never_learned_is_told(tmp_path: Path) -> None:
+    """More random steps than there are steps."""
+    said: list[str] = []
+    made = RECIPES["sac"].but(**{"learning_starts": 5_000, "trials.protocols": []})
+    run(made, tmp_path / "run", tell=said.append)
+    assert said == ["nothing will be learned: learning starts after 5,000 steps"]
+
+
+def test_without_the_library_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before a folder is made."""
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(MissingExtra, match=r"scm-world\[train\]"):
+        run("ppo", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"steps": 0}, "steps"),
+    ({"steps": 10}, "at least 32"),
+    ({"steps": "many"}, "many"),
+    ({"seed": -1}, "seed"),
+    ({"seed": 2**32}, "from 0 to 4294967295"),
+    ({"threads": 0}, "threads"),
+    ({"backend": "fakes"}, "fake"),
+    ({"device": "tpu"}, "tpu"),
+]
+
+
+@pytest.mark.parametrize(("given", "said"), WRONG)
+def test_what_cannot_be_trained_is_refused(
+    given: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    """Before anything is written."""
+    with pytest.raises(ScmWorldError, match=said):
+        run("ppo", tmp_path / "run", **given)
+    assert not (tmp_path / "run").exists()
+
+
+def test_learning_rates() -> None:
+    """Constant, falling in a line, and following the divergence between bounds."""
+    assert agents.rate_of(Rate(initial=0.5)) == 0.5
+    line: Any = agents.rate_of(Rate(initial=1.0, schedule="linear", final=0.5))
+    assert [line(left) for left in (1.0, 0.5, 0.0, -0.1)] == [1.0, 0.75, 0.5, 0.5]
+    kept = Rate(initial=0.1, schedule="adaptive", target_kl=0.01, lowest=0.05, highest=0.12)
+    now, found = kept.initial, []
+    for divergence in (0.01, 0.001, 0.03, 0.03, 0.03):
+        now = agents.adapted(kept, now, divergence)
+        found.append(round(now, 4))
+    assert found == [0.1, 0.12, 0.08, 0.0533, 0.05]
+
+
+def test_scales_follow_the_quantities() -> None:
+    """A position of the block has that of positions; what has none, and goals, are left alone."""
+    for name, goals in (("sac", False), ("hindsight", True)):
+        worlds = agents.make_worlds(RECIPES[name].but(**{"env.observe": None}), backend="fake")
+        found, (layout,) = agents.scales_of(worlds, {}), worlds.get_attr("layout", 0)
+        first = 20 if goals else 0  # achieved and desired goal
+        where = np.arange(len(found))[first:][layout["tool_block.cartesian_position"]]
+        assert set(found[where]) == {agents.SCALES["cartesian_position"]}
+        assert set(found[:first]) <= {1.0}
+        worlds.close()
+    with pytest.raises(UnknownOption, match="normalize_observations"):
+        agents.scales_of(None, {"normalize_observations": False})
