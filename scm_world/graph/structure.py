@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -51,12 +52,17 @@ class Structure:
     def __init__(self, variables: Mapping[str, Variable]) -> None:
         self._parents = {name: variable.all_parents for name, variable in variables.items()}
         self._names = tuple(variables)
-        self.order = _topological(self._names, _edges(self._parents, lag=0))
+        self._instant = _instant(self._parents)
+        self.order = _topological(self._names, self._instant)
 
     @cached_property
     def edges(self) -> tuple[Edge, ...]:
         """All edges; where many bodies can touch there are very many."""
-        return tuple(_edges(self._parents))
+        return tuple(
+            Edge(parent.name, name, parent.lag, parent.when)
+            for name, causes in self._parents.items()
+            for parent in causes
+        )
 
     @cached_property
     def _adjacency(self) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
@@ -90,7 +96,7 @@ class Structure:
     def instant_children(self) -> dict[str, tuple[str, ...]]:
         """For each variable, the ones that follow it within the same instant."""
         children: dict[str, list[str]] = {name: [] for name in self._names}
-        for edge in _edges(self._parents, lag=0):
+        for edge in self._instant:
             if edge.when != "set":
                 children[edge.cause].append(edge.effect)
         return {name: tuple(found) for name, found in children.items()}
@@ -107,11 +113,18 @@ class Structure:
         return [name for name in self.order if name in found] if found else []
 
 
-def _edges(parents: Mapping[str, Sequence[Parent]], *, lag: int | None = None) -> Iterator[Edge]:
-    for name, causes in parents.items():
-        for parent in causes:
-            if lag is None or parent.lag == lag:
-                yield Edge(parent.name, name, parent.lag, parent.when)
+def _instant(parents: Mapping[str, Sequence[Parent]]) -> tuple[Edge, ...]:
+    """List the edges of lag 0. The many states of a model share their parents."""
+    of_lag_0 = {id(causes): [p for p in causes if p.lag == 0] for causes in _distinct(parents)}
+    return tuple(
+        Edge(parent.name, name, 0, parent.when)
+        for name, causes in parents.items()
+        for parent in of_lag_0[id(causes)]
+    )
+
+
+def _distinct(parents: Mapping[str, Sequence[Parent]]) -> Iterable[Sequence[Parent]]:
+    return {id(causes): causes for causes in parents.values()}.values()
 
 
 def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
@@ -125,9 +138,8 @@ def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
     return frozenset(found)
 
 
-def _topological(names: Iterable[str], instant: Iterable[Edge]) -> tuple[str, ...]:
+def _topological(names: Iterable[str], edges: Sequence[Edge]) -> tuple[str, ...]:
     sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(names, ()))
-    edges = tuple(instant)
     for edge in edges:
         sorter.add(edge.effect, edge.cause)
     try:
@@ -158,16 +170,18 @@ def _space_parents(variable: Variable) -> Iterable[tuple[str, str]]:
             yield label, parent
 
 
-def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    seen: set[tuple[str, int]] = set()
-    for parent in variable.all_parents:
-        if parent.name not in known:
-            hint = nearest(parent.name, known)
+def _parent_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
+    named = Counter((parent.name, parent.lag) for parent in variable.all_parents)
+    for (name, lag), times in named.items():
+        if name not in known:
+            hint = nearest(name, known)
             suggestion = f"; did you mean {hint!r}?" if hint else ""
-            yield f"{variable.name!r} has the unknown parent {parent.name!r}{suggestion}"
-        if (parent.name, parent.lag) in seen:
-            yield f"{variable.name!r} names the parent {parent.name!r} twice with lag {parent.lag}"
-        seen.add((parent.name, parent.lag))
+            yield f"{variable.name!r} has the unknown parent {name!r}{suggestion}"
+        if times > 1:
+            yield f"{variable.name!r} names the parent {name!r} twice with lag {lag}"
+
+
+def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
     for label, name in _space_parents(variable):
         if name not in known:
             yield f"{label} of {variable.name!r} depends on the unknown variable {name!r}"
@@ -203,17 +217,17 @@ def checked(variables: Iterable[Variable]) -> dict[str, Variable]:
         if variable.name in by_name:
             problems.append(f"{variable.name!r} is declared twice")
         by_name[variable.name] = variable
+    parents = {name: variable.all_parents for name, variable in by_name.items()}
+    sound: set[int] = set()  # parents that several variables share are checked once
     for variable in by_name.values():
+        if id(parents[variable.name]) not in sound:
+            found = tuple(_parent_problems(variable, by_name))
+            problems.extend(found)
+            sound |= set() if found else {id(parents[variable.name])}
         problems.extend(_variable_problems(variable, by_name))
         problems.extend(_bundle_problems(variable, by_name))
-    known_edges = [
-        Edge(parent.name, variable.name, parent.lag)
-        for variable in by_name.values()
-        for parent in variable.all_parents
-        if parent.lag == 0 and parent.name in by_name
-    ]
     try:
-        _topological(by_name, known_edges)
+        _topological(by_name, [edge for edge in _instant(parents) if edge.cause in by_name])
     except ModelError as error:
         problems.extend(error.problems)
     if problems:

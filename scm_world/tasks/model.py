@@ -249,10 +249,10 @@ class ModelTask(Task):
         ]
         actions = [self._action(row) for row in system.inputs]
         together = [bundle("action", actions, doc="All controls.")] if len(actions) > 1 else []
-        causes = _Causes(system)
+        causes = _causes(system)
         states: list[Variable] = []
         for row in system.states:
-            states += self._state(row, causes.of(row.tree))
+            states += self._state(row, causes[row.tree])
         clock = next(iter(Clock(timing.steps, timing.control_period).variables()))
         readouts = [_readout(row) for row in system.readouts]
         own = [one for one in self.outcomes if not isinstance(one, str)]
@@ -323,30 +323,15 @@ class ModelTask(Task):
             yield Observed(name, (-np.inf, np.inf))
 
 
-class _Causes:
-    """What acts on the states of each tree, as edges of lag 1.
-
-    Args:
-        model: With the tables.
-    """
-
-    def __init__(self, model: Model) -> None:
-        self._rows = [
-            *(row for row in model.parameters if not row.visual),
-            *model.states,
-            *model.inputs,
-        ]
-        self._found: dict[int, tuple[Parent, ...]] = {}
-
-    def of(self, tree: int) -> tuple[Parent, ...]:
-        """Give the causes of the states of a tree."""
-        if tree not in self._found:
-            self._found[tree] = tuple(
-                Parent(row.name, 1, None if tree in row.always else "contact")
-                for row in self._rows
-                if tree in row.always or tree in row.contact
-            )
-        return self._found[tree]
+def _causes(model: Model) -> list[tuple[Parent, ...]]:
+    """List what acts on the states of each tree, as edges of lag 1; the trees share them."""
+    found: list[list[Parent]] = [[] for _ in model.trees]
+    seen = (row for row in model.parameters if not row.visual)
+    for row in (*seen, *model.states, *model.inputs):
+        sure, at_contact = Parent(row.name, 1), Parent(row.name, 1, "contact")
+        for tree in row.always | row.contact:
+            found[tree].append(sure if tree in row.always else at_contact)
+    return [tuple(causes) for causes in found]
 
 
 def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, final, get_args
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, WrapValidator, model_validator
 
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
@@ -78,15 +78,15 @@ def _without(space: Space | None, other: Space | None) -> Space | None:
     return space
 
 
-def _as_parents(value: Any) -> Any:
+def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
     if isinstance(value, str):
         raise ValueError(f"parents must be a sequence of names, got the text {value!r}")
     if isinstance(value, tuple) and set(map(type, value)) <= {Parent}:
-        return value
-    return tuple(Parent(p) if isinstance(p, str) else p for p in value)
+        return value  # variables with the same parents share one tuple of them
+    return validate(tuple(Parent(p) if isinstance(p, str) else p for p in value))
 
 
-AsParents = Annotated[tuple[Parent, ...], BeforeValidator(_as_parents)]
+AsParents = Annotated[tuple[Parent, ...], WrapValidator(_as_parents)]
 
 
 class Variable(Frozen):
