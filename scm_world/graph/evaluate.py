@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import ModelError, WrongShape
+from scm_world.errors import ModelError, ScmWorldError, WrongShape, in_one_line
 from scm_world.variables import (
     SOFT,
     Derived,
@@ -214,13 +214,26 @@ class Evaluator:
     def _derive(
         self, variable: Derived, values: Values, previous: Values, moment: Moment | None
     ) -> Value:
-        arguments = self._arguments(variable.all_parents, values, previous)
-        if variable.noise is None:
-            return np.asarray(self._bound(variable)(*arguments))
-        noise: Value = np.zeros(variable.shape)
-        if moment is not None:
-            noise = moment.nature(variable.noise, variable.name, variable.shape, values)
-        return np.asarray(self._bound(variable)(*arguments, noise=noise))
+        arguments, given = self._arguments(variable.all_parents, values, previous), {}
+        if variable.noise is not None:
+            given["noise"] = np.zeros(variable.shape)
+            if moment is not None:
+                given["noise"] = moment.nature(
+                    variable.noise, variable.name, variable.shape, values
+                )
+        function = self._bound(variable)
+        try:
+            value = np.asarray(function(*arguments, **given))
+        except ScmWorldError:
+            raise
+        except Exception as error:
+            problem = f"the function of {variable.name!r} raised {in_one_line(error)}"
+            raise ModelError([problem]) from error
+        shape = value.shape[value.ndim - len(variable.shape) :]
+        if value.dtype.kind not in "biuf" or shape != variable.shape:
+            wanted = f"numbers of shape {variable.shape}" if variable.shape else "a number"
+            raise ModelError([f"the function of {variable.name!r} gives {value!r}, not {wanted}"])
+        return value
 
     def _arguments(
         self, parents: Iterable[Parent], values: Values, previous: Values

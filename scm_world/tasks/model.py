@@ -244,7 +244,7 @@ class ModelTask(Task):
         """Declare what the tables have, and what counts."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
         parameters: list[Variable] = [
-            ties.pop(row.name) if row.name in ties else self._parameter(row)
+            self._tie(ties.pop(row.name), row) if row.name in ties else self._parameter(row)
             for row in system.parameters
         ]
         actions = [self._action(row) for row in system.inputs]
@@ -298,6 +298,11 @@ class ModelTask(Task):
             default=_numbers(f"{where}['default']", given.get("default", row.default), row.shape),
             distribution=_space(f"{where}['distribution']", given.get("distribution"), row.shape),
         )
+
+    def _tie(self, tie: Variable, row: Row) -> Variable:
+        """Complete a derived variable that takes the place of a parameter: it has its bounds."""
+        bounds = self._fields(row, getattr(row, "kind", "real"))["bounds"]
+        return tie if tie.bounds is not None else tie.model_copy(update={"bounds": bounds})
 
     def _action(self, row: Row) -> Action:
         fields = self._fields(row)

@@ -16,8 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from scm_world._types import Floats, Value, Values
 
 TOLERANCE = 1e-9
-"""How far outside a closed interval a number still counts as inside, so that a value computed
-from a parent, or read from a file, is not refused for its last digit."""
+"""How far outside a closed interval a number still counts as inside, as a share of the end, so that
+a value computed from a parent, or read from a file, is not refused for its last digit. An end at 0,
+beyond which many quantities mean nothing, is exact."""
 
 
 class Frozen(BaseModel):
@@ -100,6 +101,11 @@ def _evaluate(bound: Bounds, shape: tuple[int, ...], values: Values) -> Floats:
     return stacked.reshape(*stacked.shape[:-1], *shape)
 
 
+def _widened(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Move two ends apart by the tolerance."""
+    return low - TOLERANCE * np.abs(low), high + TOLERANCE * np.abs(high)
+
+
 class _Space(Frozen):
     def parents(self) -> frozenset[str]:
         """Name the variables that the bounds depend on."""
@@ -147,15 +153,15 @@ class Box(_Space):
         if self.parents():
             return None
         low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
-        return low - TOLERANCE, high + TOLERANCE
+        return _widened(low, high)
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Tell whether a value lies inside, borders included."""
         if self._widened is not None and np.ndim(value) < 2:
             low, high = self._widened
             return bool((value >= low).all() and (value <= high).all())
-        low, high = self.bounds(np.shape(value), values or {})
-        return bool(np.all(value >= low - TOLERANCE) and np.all(value <= high + TOLERANCE))
+        low, high = _widened(*self.bounds(np.shape(value), values or {}))
+        return bool(np.all(value >= low) and np.all(value <= high))
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
         """Find the point of the box that is nearest to a value."""
@@ -165,8 +171,12 @@ class Box(_Space):
     def nearest_inside(self, value: Value, values: Values | None = None) -> Value:
         """Find a nearest point that is not on the border, along edges that have a length."""
         low, high = self.bounds(np.shape(value), values or {})
-        margin = np.minimum(2.0 * TOLERANCE, 0.5 * np.maximum(high - low, 0.0))
-        return np.asarray(np.clip(value, low + margin, high - margin))
+        half = 0.5 * np.maximum(high - low, 0.0)
+        first, last = (
+            np.minimum(2.0 * TOLERANCE * np.maximum(1.0, np.abs(np.nan_to_num(end))), half)
+            for end in (low, high)
+        )
+        return np.asarray(np.clip(value, low + first, high - last))
 
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Multiply the edge lengths that are not zero, shape ``(...)``."""

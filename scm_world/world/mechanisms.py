@@ -7,21 +7,23 @@ row, a batch one of many; both are computed by the same program, so the bits are
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
+from math import isfinite
 from typing import Any, final
 
 import numpy as np
 from numba.core.errors import NumbaError
 
 from scm_world._types import Floats, Integers, Value
-from scm_world.errors import ModelError
-from scm_world.graph import SCM
-from scm_world.variables import Linear, Parent
-from scm_world.variables.mechanisms import Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
+from scm_world.errors import ModelError, ScmWorldError, in_one_line
+from scm_world.graph import SCM
+from scm_world.variables import Integers as WholeNumbers
+from scm_world.variables import Linear, Parent
+from scm_world.variables.mechanisms import PACKAGE, Stacked, Unboxed
 from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses, run, weighted_sum
 
 
@@ -192,7 +194,10 @@ class _Python:
         parents: tuple[Parent, ...],
         columns: list[slice],
     ) -> None:
-        self._name, self._shape, self._place = name, variable.shape, mechanisms.where[name]
+        self._variable, self._place = variable, mechanisms.where[name]
+        self._clock = mechanisms.where[CONTROL_INDEX].start
+        home = getattr(variable.mechanism, "reference", PACKAGE).partition(":")[0]
+        self._is_users = home.partition(".")[0] != PACKAGE
         self._function: Callable[..., Any] = variable.mechanism.bind()
         self._arguments = partial(mechanisms.arguments, parents=parents, columns=columns)
 
@@ -200,24 +205,55 @@ class _Python:
         """Compute, into a row.
 
         Raises:
-            ModelError: The function gives something else than numbers of the declared shape, or
-                numba cannot compile it.
+            ModelError: The function raised an error or, if it is a user's, gave something else
+                than finite numbers of the declared shape; or numba cannot compile it.
         """
         try:
             value = self._function(*self._arguments(row))
-        except NumbaError as error:
-            reason = str(error).strip().splitlines()[-1]
-            problem = f"numba cannot compile the function of {self._name!r}: {reason}"
-            raise ModelError([problem]) from error
-        try:
-            found = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            found = np.asarray([], dtype=np.float64)
-        if found.shape != self._shape:
-            wanted = f"finite numbers of shape {self._shape}" if self._shape else "a finite number"
-            problem = f"the function of {self._name!r} gives {value!r}, not {wanted}"
-            raise ModelError([problem])
+        except ScmWorldError:
+            raise
+        except Exception as error:
+            reason = str(error).strip().splitlines()[-1:] if isinstance(error, NumbaError) else ()
+            said = f"cannot be compiled: {reason[0]}" if reason else f"raised {in_one_line(error)}"
+            raise ModelError([f"{self._told(row)} {said}"]) from error
+        problem = wrong_value(self._variable, value) if self._is_users else ""
+        if problem:
+            raise ModelError([f"{self._told(row)} {problem}"])
+        found = np.asarray(value, dtype=np.float64)
         row[self._place] = found.ravel()
+
+
+    def _told(self, row: Floats) -> str:
+        return f"in control step {row[self._clock]:.0f}, the function of {self._variable.name!r}"
+
+
+class FunctionFailure(ModelError):
+    """A function of a user failed.
+
+    Attributes:
+        row: In which of several worlds.
+    """
+
+    def __init__(self, problems: Sequence[str], row: int) -> None:
+        self.row = row
+        super().__init__(problems)
+
+
+def wrong_value(variable: Any, value: Any) -> str:
+    """Say what is wrong with a value that the function of a variable gave, or nothing."""
+    if type(value) is float and isfinite(value) and variable.shape == () and not variable.bounds:
+        return ""
+    try:
+        numbers = np.asarray(value)
+    except ValueError:  # a ragged list
+        numbers = np.asarray(None)
+    is_number = numbers.dtype.kind in "biuf" and numbers.shape == variable.shape
+    if not is_number or not np.isfinite(numbers).all():
+        wanted = f"finite numbers of shape {variable.shape}" if variable.shape else "a finite number"
+        return f"gives {value!r}, not {wanted}"
+    if isinstance(variable.bounds, WholeNumbers) and not variable.bounds.contains(numbers):
+        return f"gives {value!r}, not in {variable.bounds.describe(variable.shape, {})}"
+    return ""
 
 
 _Step = _Compiled | _Python
@@ -249,8 +285,11 @@ def _program(steps: Iterable[_Step]) -> list[Any]:
 def _execute(program: list[Any], matrix: Floats, rows: Integers) -> None:
     for step in program:
         if isinstance(step, _Python):
-            for row in rows:
-                step(matrix[row])
+            for row in rows.tolist():
+                try:
+                    step(matrix[row])
+                except ModelError as error:
+                    raise FunctionFailure(error.problems, row) from error.__cause__
         else:
             run(matrix, rows, *step)
 

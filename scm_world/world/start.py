@@ -15,8 +15,9 @@ from scm_world.models import Model, State
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Measured, Subset
-from scm_world.variables.checks import check_bounds, check_subset
+from scm_world.variables.checks import check_bounds, check_subset, coerce
 from scm_world.variables.subsets import AnyRegion
+from scm_world.world.mechanisms import wrong_value
 
 if TYPE_CHECKING:
     from scm_world.world.declaration import Declaration
@@ -66,6 +67,7 @@ def refuse_impossible(declaration: Declaration) -> None:
     for variable in declaration.model.variables:
         if variable.name in values:
             try:
+                coerce(variable, values[variable.name])
                 check_bounds(variable, values[variable.name], values)
             except InterventionError as problem:
                 problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
@@ -141,16 +143,10 @@ def check_functions(declaration: Declaration, values: Values) -> None:
         if not given or variable.name in declaration.bundles:
             continue
         value = values[variable.name]
-        try:
-            numbers = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            numbers = np.asarray(np.nan)
-        wanted = (
-            f"finite numbers of shape {variable.shape}" if variable.shape else "a finite number"
-        )
-        if numbers.shape != variable.shape or not np.isfinite(numbers).all():
-            problems.append(f"the function of {variable.name!r} gives {value!r}, not {wanted}")
-        elif variable.bounds is not None and not variable.bounds.contains(numbers, values):
+        problem = wrong_value(variable, value)
+        if problem:
+            problems.append(f"the function of {variable.name!r} {problem}")
+        elif variable.bounds is not None and not variable.bounds.contains(value, values):
             allowed = variable.bounds.describe(variable.shape, values)
             problems.append(f"the function of {variable.name!r} gives {value!r}, not in {allowed}")
     if problems:

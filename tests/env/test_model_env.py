@@ -12,8 +12,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from model_tasks import ANGLE, CARTPOLE, PLACE, Balance, Decay, Falling, Scored, upright
+from numba import njit
 
-import scm_world  # noqa: F401 # registers the environments
+from scm_world import World
 from scm_world.env import MODEL_ID, ScmWorldEnv
 from scm_world.errors import (
     ActionError,
@@ -236,24 +237,60 @@ def test_what_cannot_be_done_is_refused() -> None:
         env.unwrapped.do({"pole.mas": 0.1})
 
 
-def test_a_reward_that_is_no_number_is_an_error() -> None:
-    """Of a single environment, and of one of many, with its number."""
-    task = Balance(reward=(lambda place: np.nan if place < 0.0 else 1.0, PLACE))
+def fails(place: Any) -> Any:
+    """Divide by zero where the cart has moved to the right."""
+    return 1.0 / 0.0 if place > 0.0 else 1.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda place: np.nan if place > 0.0 else 1.0, "'reward' gives nan, not a finite number"),
+        (lambda place: None if place > 0.0 else 1.0, "'reward' gives None, not a finite number"),
+        (lambda place: "1" if place > 0.0 else 1.0, "'reward' gives '1', not a finite number"),
+        (lambda place: np.ones(2) if place > 0.0 else 1.0, r"'reward' gives array\(\[1., 1.\]\)"),
+        (fails, "'reward' raised ZeroDivisionError: float division by zero"),
+    ],
+)
+def test_a_reward_function_that_fails_later_is_named(wrong: Any, message: str) -> None:
+    """With the control step, and of many environments with the number of the one."""
+    task = Balance(reward=(wrong, PLACE))
     env = make(task)
     env.reset(seed=0)
-    env.unwrapped.do({PLACE: -0.1})
-    with pytest.raises(ModelError, match="no finite number"):
-        env.step([0.0])
+    with pytest.raises(ModelError, match=f"in control step 1, the function of {message}"):
+        env.step([1.0])
     many = gymnasium.make_vec(MODEL_ID, 2, model=task)
-    many.reset(seed=0, options={"do": [{PLACE: 0.1}, {PLACE: -0.1}]})
+    many.reset(seed=0)
+    with pytest.raises(ModelError, match=rf"(?s)environment 1: .*in control step 1, .*{message}"):
+        many.step(np.array([[-1.0], [1.0]]))
+    episode = World(task).rollout(np.array([1.0]), steps=3)
+    with pytest.raises(ModelError, match=f"in control step 1, the function of {message}"):
+        episode["reward"]
+
+
+def test_a_compiled_reward_that_is_no_number_is_an_error() -> None:
+    """Of a single environment, and of one of many, with its number."""
+    task = Balance(reward=(njit(lambda place: np.nan if place > 0.0 else 1.0), PLACE))
+    env = make(task)
+    env.reset(seed=0)
+    with pytest.raises(ModelError, match="no finite number"):
+        env.step([1.0])
+    many = gymnasium.make_vec(MODEL_ID, 2, model=task)
+    many.reset(seed=0)
     with pytest.raises(ModelError, match=r"(?s)environment 1: .*no finite number"):
-        many.step(np.zeros((2, 1)))
+        many.step(np.array([[-1.0], [1.0]]))
+
+
+def test_success_is_0_or_1() -> None:
+    """Another number is refused in the step that gives it."""
+    env = make(Balance(success=(lambda place: 2 if place > 0.0 else 1, PLACE)))
+    env.reset(seed=0)
+    with pytest.raises(ModelError, match="in control step 1, the function of 'success' gives 2"):
+        env.step([1.0])
 
 
 def test_a_function_that_cannot_be_compiled_is_named() -> None:
     """With the variable that it is of."""
-    from numba import njit
-
     task = Balance(reward=(njit(lambda angle: angle.nothing), ANGLE))
     with pytest.raises(ModelError, match="function of 'reward'"):
         make(task).reset(seed=0)

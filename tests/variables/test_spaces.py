@@ -75,9 +75,19 @@ def test_borders_belong_to_a_box() -> None:
     box = Box(0.1, 0.3)
     assert box.contains(np.array(0.1))
     assert box.contains(np.array(0.1 + 0.2))  # 0.30000000000000004
-    assert box.contains(np.array(0.3 + 0.9 * TOLERANCE))
-    assert not box.contains(np.array(0.3 + 2.0 * TOLERANCE))
+    assert box.contains(np.array(0.3 * (1.0 + 0.9 * TOLERANCE)))
+    assert not box.contains(np.array(0.3 * (1.0 + 2.0 * TOLERANCE)))
     assert not box.contains(np.array(np.nan))
+
+
+def test_nothing_beyond_zero_belongs_to_a_box_that_ends_there() -> None:
+    """However small it is; nor is a tiny interval left by an absolute tolerance."""
+    for box in (Box(0.0, np.inf), Box((0.0, 0.0), 1.0)):
+        shape = np.shape(box.low)
+        assert box.contains(np.zeros(shape))
+        assert not box.contains(np.full(shape, -1e-300))
+    assert not Box(1e-9, np.inf).contains(np.array(1e-10))
+    assert not Box(-1e-6, 1e-6).contains(np.array(1.0005e-6))
 
 
 def test_uniform_draws_fill_a_box_evenly() -> None:

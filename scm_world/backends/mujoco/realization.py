@@ -247,8 +247,10 @@ class Realization(ABC):
             self.edited, self._numbers = True, None
             reason = self.followed(before)
             if reason:
-                names = ", ".join(".".join(key) for key in before)
-                raise Infeasible(names, parameters[next(iter(before))], [reason])
+                wrong = self._culprit(before)
+                names = ", ".join(".".join(key).strip(".") for key in wrong)
+                value = [parameters[key].tolist() for key in wrong]
+                raise Infeasible(names, value[0] if len(wrong) == 1 else value, [reason])
         except BaseException:
             self._take_back(before)
             raise
@@ -268,6 +270,22 @@ class Realization(ABC):
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"
         return ""
+
+    def _culprit(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
+        """Name those of some parameters that no body can have; all that constants follow if none.
+
+        These are moments of inertia of which one exceeds the sum of the others, and what is
+        negative.
+        """
+        constant = [key for key in keys if key in self._constant]
+        wrong = []
+        for key in constant:
+            value = self._slots[key].read()
+            if not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0):
+                wrong.append(key)
+            elif key[1] == "inertia" and 2.0 * value.max() - value.sum() > 1e-6 * value.max():
+                wrong.append(key)
+        return wrong or constant
 
     def _take_back(self, before: Mapping[ParameterKey, Floats | None]) -> None:
         """Write old values again; where there is none, the model is new and is given up."""

@@ -24,6 +24,7 @@ from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 from scm_world.world.batch import Batch, Table
+from scm_world.world.mechanisms import FunctionFailure
 
 
 @final
@@ -66,7 +67,10 @@ class NativeCrew:
             return
         self._look()
         commands = self._commands.read(rows, actions, self._batch)
-        self._batch.advance(commands, which)
+        try:
+            self._batch.advance(commands, which)
+        except FunctionFailure as error:
+            raise located(error, error.row) from error.__cause__
         self._commands.passed(rows)
         for table, members in self._batch.tables(rows):
             lens = self._lens(table, int(members[0]))
