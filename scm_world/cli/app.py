@@ -16,7 +16,6 @@ from scm_world.cli.evaluate import evaluate, explain
 from scm_world.cli.options import (
     Acts,
     Arguments,
-    Backend,
     Format,
     Out,
     Policy,
@@ -25,6 +24,7 @@ from scm_world.cli.options import (
     Seed,
     Steps,
     Task,
+    TaskBackend,
 )
 from scm_world.cli.planning import plan
 from scm_world.cli.sampling import collect, sweep
@@ -100,7 +100,7 @@ def discover(
             "the JSON file of an SCM, or several with commas between them.",
         ),
     ],
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     probes: Annotated[int, typer.Option(min=1, help="How many states to experiment in.")] = 32,
     seed: Seed = 0,
     preset: Preset = None,
@@ -157,9 +157,11 @@ def discover(
     """
     if learner is None and not is_scm(task):
         from scm_world.cli.discovery import Options, run
+        from scm_world.cli.tasks import backend_of
 
         Work(engine, workers, address).refuse_others("discover without --learner")
-        options = Options(task, backend, preset, probes, seed, tuple(option or ()), resolution)
+        used = backend_of(backend, task, option)
+        options = Options(task, used, preset, probes, seed, tuple(option or ()), resolution)
         raise typer.Exit(run(options, out=out, strict=strict))
     from scm_world.cli import benchmark
     from scm_world.discovery.problems import TaskView
@@ -171,7 +173,7 @@ def discover(
         policy=policy,
         steps=steps,
         sensor_noise=sensor_noise,
-        options={"backend": backend, **({"preset": preset} if preset else {})},
+        options={"backend": backend or "mujoco", **({"preset": preset} if preset else {})},
     )
     code = benchmark.run(
         task,
@@ -197,7 +199,7 @@ def verify(
     task: Annotated[
         str, typer.Argument(help="A task, a model.xml or .urdf, module:function, or 'all'.")
     ],
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     both: Annotated[bool, typer.Option("--both", help="On MuJoCo and Bullet; compare.")] = False,
     probes: Annotated[int, typer.Option(min=1, help="How many states to try at most.")] = 200,
     seed: Seed = 0,
@@ -211,10 +213,12 @@ def verify(
     Exits 1 unless every declared edge is seen and nothing else. 'all' takes small variants of
     tasks with many blocks. Ctrl-C gives the result so far (exit code 130).
     """
+    from scm_world.cli.tasks import backend_of
     from scm_world.cli.verification import Options, run
 
     arguments = tuple(option or ())
-    options = Options(task, backend, both, preset, probes, seed, arguments, resolution)
+    used = backend_of(backend, task, option)
+    options = Options(task, used, both, preset, probes, seed, arguments, resolution)
     raise typer.Exit(run(options, out=out))
 
 
@@ -243,7 +247,7 @@ def graph(
 def do(
     task: Task,
     assignments: Acts,
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     steps: Annotated[int, typer.Option(min=0, help="Control steps to run afterwards.")] = 25,
     seed: Seed = 0,
     preset: Preset = None,
@@ -258,8 +262,10 @@ def do(
 ) -> None:
     """Intervene on a task and show what followed, beside the same world left alone."""
     from scm_world.cli.intervene import Options, run
+    from scm_world.cli.tasks import backend_of
 
-    options = Options(task, backend, preset, seed, steps, space, tuple(option or ()))
+    used = backend_of(backend, task, option)
+    options = Options(task, used, preset, seed, steps, space, tuple(option or ()))
     raise typer.Exit(run(assignments, options, show_all=show_all, out=out))
 
 
@@ -283,7 +289,7 @@ def effect(
     unpaired: Annotated[bool, typer.Option("--unpaired", help="Compare different units.")] = False,
     steps: Steps = 25,
     policy: Policy = "random",
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     seed: Seed = 0,
     preset: Preset = None,
     out: Out = None,
@@ -291,8 +297,10 @@ def effect(
 ) -> None:
     """Estimate how much an intervention changes an outcome, with a 95 % interval."""
     from scm_world.cli.questions import Circumstances, ask_effect, read_outcome
+    from scm_world.cli.tasks import backend_of
 
-    where = Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ()))
+    used = backend_of(backend, task, option)
+    where = Circumstances(task, used, preset, seed, steps, policy, tuple(option or ()))
     code = ask_effect(
         where,
         read_outcome(outcome, how),
@@ -313,7 +321,7 @@ def counterfactual(
     at: Annotated[int, typer.Option(min=0, help="The control step at which it is done.")] = 0,
     steps: Steps = 25,
     policy: Policy = "random",
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     seed: Seed = 0,
     preset: Preset = None,
     out: Out = None,
@@ -321,8 +329,10 @@ def counterfactual(
 ) -> None:
     """Let an episode happen, and happen otherwise with the same noise; compare them."""
     from scm_world.cli.questions import Circumstances, ask_counterfactual
+    from scm_world.cli.tasks import backend_of
 
-    where = Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ()))
+    used = backend_of(backend, task, option)
+    where = Circumstances(task, used, preset, seed, steps, policy, tuple(option or ()))
     raise typer.Exit(ask_counterfactual(where, assignments, at=at, out=out))
 
 
@@ -334,11 +344,12 @@ def variables(
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Write the tables of all tasks as Markdown.")
     ] = False,
+    option: Arguments = None,
 ) -> None:
     """Show every variable of a task: unit, role, default, and the spaces A and B."""
     from scm_world.cli.variables import run
 
-    run(task, as_markdown=markdown)
+    run(task, option or (), as_markdown=markdown)
 
 
 @app.command(name="list")

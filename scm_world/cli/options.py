@@ -33,6 +33,14 @@ Task = Annotated[
     ),
 ]
 Backend = Annotated[str, typer.Option(help="Physics engine: mujoco, bullet or fake.")]
+TaskBackend = Annotated[
+    str | None,
+    typer.Option(
+        "--backend",
+        help="Physics engine: mujoco, bullet, step or fake.",
+        show_default="that of the task",
+    ),
+]
 Preset = Annotated[
     str | None,
     typer.Option(help="Numerical settings of the robot: fast or precise.", show_default="fast"),

@@ -12,7 +12,7 @@ from typing import Annotated, Any, final
 import numpy as np
 import typer
 
-from scm_world.cli.options import Arguments, Backend, Out, Preset, Seed, Task
+from scm_world.cli.options import Arguments, Out, Preset, Seed, Task, TaskBackend
 
 FORMAT = "scm_world/planned/1"
 DIVIDER = 4  # [pixels] between two pictures
@@ -46,7 +46,7 @@ def plan(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="What is done to the world at the beginning."),
     ] = None,
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     model: Annotated[
         str | None, typer.Option(help="Engine to plan with; that of the world by default.")
     ] = None,
@@ -65,16 +65,17 @@ def plan(
     """
     from scm_world.cli.assignments import parse_assignments
     from scm_world.cli.console import RESULTS, check_writable
-    from scm_world.cli.tasks import suffix, tag
+    from scm_world.cli.tasks import backend_of, suffix, tag
 
     arguments = tuple(option or ())
-    folder = out or RESULTS / f"plan-{tag(task)}-{backend}-seed{seed}{suffix(arguments)}"
+    used = backend_of(backend, task, option)
+    folder = out or RESULTS / f"plan-{tag(task)}-{used}-seed{seed}{suffix(arguments)}"
     check_writable(folder, folder=True)
     believed, happens = (parse_assignments(texts or ()) for texts in (do, given))
     numbers = {"samples": samples, "horizon": horizon, "iterations": iterations, "every": every}
     asked = {name: number for name, number in numbers.items() if number is not None}
     planner = {**asked, "objective": objective, "backend": model, "seed": seed, "threads": threads}
-    run = Run(task, backend, preset, seed, steps, planner, believed, happens, arguments)
+    run = Run(task, used, preset, seed, steps, planner, believed, happens, arguments)
     raise typer.Exit(_played(run, folder))
 
 

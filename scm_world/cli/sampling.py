@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from scm_world.cli.options import Arguments, Backend, Out, Policy, Preset, Seed, Steps, Task
+from scm_world.cli.options import Arguments, Out, Policy, Preset, Seed, Steps, Task, TaskBackend
 from scm_world.cli.working import Address, Engine, Work, Workers
 
 Outcomes = Annotated[
@@ -46,7 +46,7 @@ def collect(
     ] = False,
     steps: Steps = 25,
     policy: Policy = "random",
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     seed: Seed = 0,
     preset: Preset = None,
     shard: Shard = 100,
@@ -63,9 +63,11 @@ def collect(
     """
     from scm_world.cli.collection import Options, run
     from scm_world.cli.questions import Circumstances
+    from scm_world.cli.tasks import backend_of
 
+    used = backend_of(backend, task, option)
     options = Options(
-        Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ())),
+        Circumstances(task, used, preset, seed, steps, policy, tuple(option or ())),
         n,
         design,
         targets=tuple(target or ()),
@@ -100,7 +102,7 @@ def sweep(
     nature: Nature = None,
     steps: Steps = 25,
     policy: Policy = "random",
-    backend: Backend = "mujoco",
+    backend: TaskBackend = None,
     seed: Seed = 0,
     preset: Preset = None,
     shard: Shard = 100,
@@ -118,9 +120,11 @@ def sweep(
     """
     from scm_world.cli.questions import Circumstances
     from scm_world.cli.sweeping import Options, run
+    from scm_world.cli.tasks import backend_of
 
+    used = backend_of(backend, task, option)
     options = Options(
-        Circumstances(task, backend, preset, seed, steps, policy, tuple(option or ())),
+        Circumstances(task, used, preset, seed, steps, policy, tuple(option or ())),
         over=tuple(over),
         outcomes=tuple(outcome or ()),
         n=n,

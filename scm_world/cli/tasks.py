@@ -50,6 +50,12 @@ def build(name: str, arguments: Sequence[str] = ()) -> Task:
         raise typer.BadParameter(f"{', '.join(arguments)}: {error}", param_hint=_HINT) from None
 
 
+def backend_of(backend: str | None, name: str, arguments: Sequence[str] | None) -> str:
+    """Give the backend that was asked for, or that of a task."""
+    own = ":" in name and name not in TASKS
+    return backend or (build(name, arguments or ()).backend if own else Task.backend)
+
+
 def tag(name: str) -> str:
     """Shorten the name of a task for titles and folders: of a file, its stem.
 
@@ -60,7 +66,7 @@ def tag(name: str) -> str:
     home, colon, function = name.rpartition(":")
     if colon:
         return f"{Path(home).stem if home.endswith('.py') else home}-{function}"
-    return Path(name).stem if name.endswith(FILES) else name
+    return Path(name).stem if name.lower().endswith(FILES) else name
 
 
 def suffix(arguments: Iterable[str]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -12,6 +12,7 @@ import typer
 from rich.text import Text
 
 from scm_world.cli.console import console, table
+from scm_world.cli.tasks import build
 from scm_world.tasks import TASKS
 from scm_world.variables import (
     Affine,
@@ -148,11 +149,13 @@ def _part(part: object) -> str:
     return f"{part:.6g}"
 
 
-def sections(tasks: Iterable[str]) -> Iterator[tuple[str, list[Row]]]:
+def sections(
+    tasks: Iterable[str], arguments: Sequence[str] = ()
+) -> Iterator[tuple[str, list[Row]]]:
     """Describe what all tasks have in common, then what each has besides."""
     models = {}
     for name in tasks:
-        world = World(name, backend="fake")
+        world = World(build(name, arguments), backend="fake")
         models[name] = rows(world.model.variables)
         world.close()
     common = [row for row in next(iter(models.values())) if all(row in m for m in models.values())]
@@ -187,12 +190,12 @@ def markdown() -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def run(task: str, *, as_markdown: bool) -> None:
+def run(task: str, arguments: Sequence[str] = (), *, as_markdown: bool) -> None:
     """Print the tables."""
     if as_markdown:
         typer.echo(markdown(), nl=False)
         return
-    for title, found in sections(TASKS if task == "all" else (task,)):
+    for title, found in sections(TASKS if task == "all" else (task,), arguments):
         made = table(*HEADINGS[:5], "A", "B", title=title)
         for row in found:
             unit, shape, role, default, _, a, b, _, _ = row.cells

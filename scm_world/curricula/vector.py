@@ -21,6 +21,7 @@ from scm_world.curricula.wrapper import CurriculumEnv, place
 from scm_world.env import IDS, MODEL_ID
 from scm_world.env.batched.choice import fastest
 from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.tasks import Task
 from scm_world.world.start import whole_number
 
 NATIVE, PROCESSES, LOOP = "native", "processes", "loop"
@@ -79,7 +80,8 @@ def make_vec(
 
 def _has_native(env_id: str, options: Mapping[str, Any]) -> bool:
     """Tell whether the engine steps many worlds in one call, and nothing needs single ones."""
-    kind = fastest(str(options.get("backend", "mujoco")), 1, workers=None)
+    usual = getattr(options.get("model"), "backend", Task.backend)
+    kind = fastest(str(options.get("backend") or usual), 1, workers=None)
     return kind == NATIVE and env_id in (*IDS, MODEL_ID) and options.get(_TIME_LIMIT) is None
 
 

@@ -78,7 +78,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     Args:
         task: Name of a registered task, or a task.
         task_options: Arguments of the constructor of a task that is given by its name.
-        backend: ``"mujoco"``, ``"bullet"`` or ``"fake"``.
+        backend: ``"mujoco"``, ``"bullet"``, ``"step"`` or ``"fake"``; that of the task if None.
         preset: One of the task's ``presets``; the first one if None.
         frame_skip: Length of a control step: of the robot's tasks in units of 4 ms, of a model in
             its physics steps; the task's own if None.
@@ -140,7 +140,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         task: Task | str = "pushing",
         *,
         task_options: Mapping[str, Any] | None = None,
-        backend: str = "mujoco",
+        backend: str | None = None,
         preset: str | None = None,
         frame_skip: int | None = None,
         action_mode: str | None = None,
@@ -193,6 +193,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             variables_space=as_region("variables_space", variables_space),
         )
         used = {"preset": self.world.options.preset, "frame_skip": self.world.frame_skip}
+        used["backend"] = self.world.backend.name
         Copied.__init__(self, **made_with | used | {"action_mode": mode})
         if REWARD not in self.world.model:
             self.world.close()
@@ -307,7 +308,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             ModelError: A reward term of one's own is no number.
         """
         super().reset(seed=seed)
-        asked_for = options or {}
+        asked_for = {} if options is None else options
+        if not isinstance(asked_for, Mapping):
+            raise UnknownOption("options of a reset", options, ("a dictionary", *_RESETS))
         unknown = asked_for.keys() - _RESETS
         if unknown:
             raise UnknownOption("reset option", min(unknown), _RESETS)

@@ -88,5 +88,4 @@ def _split(model: Any, options: Mapping[str, Any]) -> tuple[Task, dict[str, Any]
                 "options of the model", of_task, ("none, with a task that is made",)
             )
         return model, of_env
-    is_text = isinstance(model, str) and "<" not in model
-    return (make_task if is_text else ModelTask)(model, **of_task), of_env
+    return (make_task if isinstance(model, str) else ModelTask)(model, **of_task), of_env

@@ -25,7 +25,7 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
-from scm_world.tasks.model import FILES
+from scm_world.tasks.model import is_model
 from scm_world.world.start import whole_number
 
 _TASK = ("task", "arguments", "class", "model")
@@ -114,7 +114,7 @@ def _place(
         return place
     text = about["task"]
     refuse_untrusted(text, None if known else trusted)
-    if text not in tasks() and not text.endswith(FILES) and ":" not in text:
+    if text not in tasks() and not is_model(text) and ":" not in text:
         allowed = (*tasks(), "one of your own, if it is given: task=")
         raise UnknownOption("task", about.get("class", about["task"]), allowed)
     if about["arguments"]:

@@ -17,7 +17,7 @@ from typing import final
 from scm_world.curricula import together
 from scm_world.curricula.parts import Goal, Part, Resample
 from scm_world.evaluation.protocols import LONGEST, Protocol
-from scm_world.tasks import StepTask, Task, tasks
+from scm_world.tasks import Task, tasks
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import World
 from scm_world.world.start import the_task
@@ -150,10 +150,9 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
 
     Args:
         task: Of a model or a step function.
-        backend: Whose parameters count; MuJoCo's, or that of step functions, if None.
+        backend: Whose parameters count; that of the task if None.
     """
-    usual = "step" if isinstance(task, StepTask) else "mujoco"
-    declaration = World(task, backend=backend or usual).declaration
+    declaration = World(task, backend=backend).declaration
     found = [Protocol("P0", doc="nothing varies")]
     spaces: tuple[SpaceName, ...] = ("A", "B")
     for space in spaces:

@@ -181,6 +181,11 @@ class Model:
             raise ModelError([f"{self.name!r} does not describe its bodies; read it from a file"])
         return self.describe(self)
 
+    @cached_property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of all bodies; the first is the world."""
+        return tuple(body.name for body in self.bodies.bodies)
+
     def empty_state(self) -> State:
         """Give a state to read into."""
         return State(self.layout)

@@ -105,7 +105,7 @@ class World(Simulated):
         cls,
         step: Callable[..., Any],
         *,
-        backend: Backend | str = "step",
+        backend: Backend | str | None = None,
         max_episode_length: int | None = None,
         variables_space: AnyRegion | None = None,
         **options: Any,
@@ -114,7 +114,7 @@ class World(Simulated):
 
         Args:
             step: The function, of four dicts by name; it gives a dict. See ``StepTask``.
-            backend: ``"step"``, or one that wraps it.
+            backend: One that wraps ``"step"``; that itself if None.
             max_episode_length: In control steps.
             variables_space: See ``scm_world.world.World``.
             options: Of ``StepTask``: ``parameters``, ``states``, ``actions``, ``control_dt``,

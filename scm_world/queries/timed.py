@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from scm_world.errors import UnknownOption
+from scm_world.models import Model
 from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Null, Scale, Shift
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
@@ -116,7 +117,15 @@ class Contact(Frozen):
         return self.first, self.second
 
     def happens(self, world: World) -> bool:
-        """Tell whether they touch now: in the last physics step, with a force."""
+        """Tell whether they touch now: in the last physics step, with a force.
+
+        Raises:
+            UnknownOption: The model has no such body.
+        """
+        known = world.structure.body_names if isinstance(world.structure, Model) else ()
+        for body in self.bodies if known else ():
+            if not any(name.startswith(body) for name in known):
+                raise UnknownOption("body of a contact", body, known)
         return any(
             contact.force > 0.0 and (self._are(*contact.bodies) or self._are(*contact.bodies[::-1]))
             for contact in world.backend.contacts()

@@ -69,6 +69,7 @@ class Task(ABC):
         plan: What there is, as ``arrange`` has it; None where that is always the same.
         absent: Entities that an intervention took away.
         checks_functions: Whether what functions of users give is checked when a world begins.
+        backend: Name of the engine that realises it, where none is asked for.
         generated_graph: Whether edges follow from structure, so that some may never show.
         conventions: Ours or the predecessor's.
         given: What it was made with.
@@ -96,6 +97,7 @@ class Task(ABC):
     plan: Hashable = None
     checks_functions: ClassVar[bool] = False
     absent: frozenset[str] = frozenset()
+    backend: ClassVar[str] = "mujoco"
     generated_graph: bool = False
     conventions: Conventions = CONVENTIONS["scm_world"]
 

@@ -261,10 +261,12 @@ class ModelTask(Task):
             for name in (REWARD, SUCCESS, TERMINATED)
             if getattr(self, name) is not None
         ]
-        rest = list(ties.values())
-        return ModelComposition(system), [
-            *rest, *parameters, *actions, *together, *states, clock, *readouts, *own, *counted,
+        variables = [
+            *ties.values(), *parameters, *actions, *together, *states, clock, *readouts, *own,
+            *counted,
         ]  # fmt: skip
+        check_observed(self.observe, variables)
+        return ModelComposition(system), variables
 
     def _fields(self, row: Row, kind: str = "real") -> dict[str, Any]:
         """Give what all kinds of declarations have in common, with what was asked for."""
@@ -308,6 +310,10 @@ class ModelTask(Task):
         fields = self._fields(row)
         if fields["bounds"] is None:  # an actuator without a range
             fields["bounds"] = Box(-1.0, 1.0)
+            fields["doc"] += (
+                " The model has no limit for it: [-1, 1] is assumed; give another one with "
+                f"spaces={{{row.name!r}: {{'bounds': (low, high)}}}}."
+            )
         return Action(**fields)
 
     def _state(self, row: Any, causes: tuple[Parent, ...]) -> Iterable[Variable]:
@@ -371,6 +377,18 @@ def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
     parents = (*state.parents, Parent(name, 0, "set"))
     function = Function(same_value)
     return drawn, state.model_copy(update={"parents": parents, "start": function})
+
+
+def check_observed(names: Iterable[str] | None, variables: Iterable[Variable]) -> None:
+    """Refuse to observe what is no variable.
+
+    Raises:
+        UnknownOption: With the name.
+    """
+    known = {variable.name for variable in variables}
+    for name in names or ():
+        if name not in known:
+            raise UnknownOption("observe", name, known)
 
 
 def _listed(value: Any) -> list[Any]:
@@ -482,24 +500,32 @@ def declared(name: str, given: Any) -> Variable:
     return Measured(name=name, parents=tuple(parents), mechanism=function, **whole)
 
 
+def is_model(source: str) -> bool:
+    """Tell whether a text is that of a model, or names a file that is one."""
+    return source.lstrip().startswith("<") or source.lower().endswith(FILES)
+
+
 def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iterable[str]]) -> Task:
     """Make the task of a file or of ``"module:factory"``.
 
     Args:
-        source: A path that ends in .xml, .mjcf or .urdf, or a module (or Python file) and a
-            function in it that gives a task or a model.
+        source: XML text, a path that ends in .xml, .mjcf or .urdf, or a module (or Python file)
+            and a function in it that gives a task or a model.
         options: Of ``ModelTask``, or arguments of the function.
         known: Names the registered tasks, for the message.
 
     Raises:
         UnknownOption: It is none of these.
+        ModelError: The function, or its module, raised an error.
     """
-    from scm_world.tasks.factories import load_factory
+    from scm_world.tasks.factories import blamed, load_factory
 
-    if str(source).endswith(FILES):
+    if is_model(source):
         return ModelTask(source, **options)
     if ":" in source:
-        made = load_factory(source)(**options)
+        factory = load_factory(source)
+        with blamed(source):
+            made = factory(**options)
         made = getattr(made, "task", made)  # of a world
         return made if isinstance(made, Task) else ModelTask(made)
     raise UnknownOption("task", source, (*known(), "file.xml", "file.urdf", "module:function"))

@@ -15,7 +15,14 @@ from scm_world.graph import Moment
 from scm_world.models import ParameterKey
 from scm_world.tasks.base import Task, Timing
 from scm_world.tasks.composition import Clock, Commands, Composition
-from scm_world.tasks.model import REWARD, TERMINATED, _numbers, beginning, declared
+from scm_world.tasks.model import (
+    REWARD,
+    TERMINATED,
+    _numbers,
+    beginning,
+    check_observed,
+    declared,
+)
 from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import (
@@ -132,6 +139,7 @@ class StepTask(Task):
 
     action_modes = ("actions",)
     presets = ("default",)
+    backend = "step"
     frame_skip = 1
 
     step: Callable[..., Any] | None = None
@@ -281,9 +289,11 @@ class StepTask(Task):
             if getattr(self, name) is not None
         ]
         composition = StepComposition(self.system, self._drawn)
-        return composition, [
+        variables = [
             *self.parameters, *self.actions, *states, clock, *self.outcomes, *counted,
         ]  # fmt: skip
+        check_observed(self.observe, variables)
+        return composition, variables
 
     def _state(self, state: Measured, given: Iterable[str]) -> Iterable[Variable]:
         """Complete the declaration of a state, and declare what its beginning is drawn as."""

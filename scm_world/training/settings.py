@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.tasks import tasks
-from scm_world.tasks.model import FILES
+from scm_world.tasks.model import FILES, is_model
 from scm_world.variables.spaces import Frozen
 
 
@@ -19,7 +19,7 @@ def known_task(task: str) -> str:
     Raises:
         UnknownOption: It is neither.
     """
-    if task not in tasks() and not task.endswith(FILES) and ":" not in task:
+    if task not in tasks() and not is_model(task) and ":" not in task:
         raise UnknownOption("task", task, (*tasks(), *(f"file{end}" for end in FILES), "module:f"))
     return task
 

@@ -18,7 +18,7 @@ def clipped(action: ArrayLike, low: Floats, high: Floats, unit: str) -> Floats:
     try:
         given = np.ascontiguousarray(action, dtype=np.float64)
     except (TypeError, ValueError):  # text, or a ragged list
-        given = np.empty(0)
+        given = np.full(low.size + 1, np.nan)
     command = np.empty(low.shape)
     if given.shape != low.shape or not clip_kernel(given, low, high, command):
         numbers = "a finite number" if low.size == 1 else f"{low.size} finite numbers"

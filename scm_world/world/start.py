@@ -94,16 +94,16 @@ def the_task(task: Any) -> Task:
     raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {made}"))
 
 
-def the_backend(backend: Any) -> Backend:
-    """Take a backend, or make the one of a name.
+def the_backend(backend: Any, usual: str) -> Backend:
+    """Take a backend, or make the one of a name; that of the task if None.
 
     Raises:
         UnknownOption: There is none of this name, or it is neither.
     """
     if isinstance(backend, Backend):
         return backend
-    if isinstance(backend, str):
-        return make_backend(backend)
+    if backend is None or isinstance(backend, str):
+        return make_backend(usual if backend is None else backend)
     raise UnknownOption("backend", backend, (*backends(), "a backend that is made"))
 
 

@@ -63,11 +63,21 @@ class Stepped(Declared):
         except EngineFailure as error:
             left = self.declaration.empty_state()
             self.backend.read(left)
-            if not np.isfinite(left.vector).all():
-                self._lost = f"the state was lost in control step {self._index}: {error}"
-            raise
+            if np.isfinite(left.vector).all():
+                raise
+            said = f"{error}; {self._largest()}" if self._state.vector.size else str(error)
+            self._lost = f"the state was lost in control step {self._index}: {said}"
+            raise EngineFailure(self._lost, self.backend.name) from error
         self.backend.read(self._state)
         self.arrive(self._index + 1)
+
+    def _largest(self) -> str:
+        """Name the state with the largest number, as it was before a step."""
+        vector = self._state.vector
+        worst = int(np.abs(vector).argmax())
+        places = self.declaration.composition.slices().items()
+        name = next((name for name, where in places if where.start <= worst < where.stop), "")
+        return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
 
     def _refuse_lost(self) -> None:
         """Refuse to go on from a state that the engine has lost.

@@ -44,7 +44,8 @@ class World(Stepped):
     Args:
         task: A registered name, a task, or the ``family`` of a world that was made with the same
             options: then they share what is declared.
-        backend: ``"mujoco"``, ``"bullet"``, ``"fake"``, or an engine that is not used elsewhere.
+        backend: ``"mujoco"``, ``"bullet"``, ``"step"``, ``"fake"``, or an engine that is not used
+            elsewhere; that of the task if None.
         preset: Of the robot's tasks: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
         action_mode: Of the robot's tasks: ``"joint_positions"``, ``"joint_torques"`` or
             ``"end_effector_positions"``.
@@ -78,7 +79,7 @@ class World(Stepped):
         self,
         task: Task | Family | str = "pushing",
         *,
-        backend: Backend | str = "mujoco",
+        backend: Backend | str | None = None,
         preset: str | None = None,
         action_mode: str | None = None,
         resolution: str | None = None,
@@ -88,8 +89,9 @@ class World(Stepped):
         variables_space: AnyRegion | None = None,
     ) -> None:
         self.variables_space = as_region("variables_space", variables_space)
-        self.backend = the_backend(backend)
-        kind = task.task if isinstance(task, Family) else the_task(task).on(self.backend)
+        given = task.task if isinstance(task, Family) else the_task(task)
+        self.backend = the_backend(backend, given.backend)
+        kind = given if isinstance(task, Family) else given.on(self.backend)
         self.options = Options.checked(
             kind,
             preset=preset,

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import typer
 from matplotlib.image import imread
+from typer.testing import CliRunner
 
-from scm_world.cli import discovery, graphs, intervene
+from scm_world.cli import app, discovery, graphs, intervene, variables
 from scm_world.cli.tasks import build, suffix
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.graph import from_json
@@ -61,6 +62,45 @@ def test_graph_takes_options(capsys: pytest.CaptureFixture[str]) -> None:
     expected = World(build("general", SMALL["general"]), backend="fake").model
     assert from_json(capsys.readouterr().out) == expected
     assert Path("general-nums_objects=2-graph.png").exists()
+
+
+def test_variables_takes_options(capsys: pytest.CaptureFixture[str]) -> None:
+    """The table is that of the variant."""
+    variables.run("general", SMALL["general"], as_markdown=False)
+    small = capsys.readouterr().out
+    variables.run("general", as_markdown=False)
+    assert small != capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("def make():\n    raise KeyError('no room')\n", "own.py:make raised KeyError: 'no room'"),
+        ("def make(size):\n    pass\n", "own.py:make raised TypeError: make() missing 1"),
+        ("1 / 0\ndef make():\n    pass\n", "own.py raised ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_factory_that_fails_is_named(text: str, message: str) -> None:
+    """With the cause, and without a traceback."""
+    Path("own.py").write_text(text)
+    result = CliRunner().invoke(app, ["variables", "own.py:make"])
+    assert result.exit_code == 2
+    assert message in " ".join(result.stderr.split())
+    assert "Traceback" not in result.output
+
+
+def test_a_step_function_needs_no_backend() -> None:
+    """It is that of the task."""
+    Path("own.py").write_text(
+        "from scm_world import Measured, StepTask\n"
+        "def step(parameters, state, action, noise):\n    return {'x': 0.5 * state['x']}\n"
+        "def make():\n"
+        "    states = [Measured(name='x', default=1.0, parents=('x',))]\n"
+        "    return StepTask(step, states=states)\n"
+    )
+    result = CliRunner().invoke(app, ["do", "own.py:make", "x=2", "--steps", "1", "--out", "here"])
+    assert result.exit_code == 0, result.stderr
+    assert "on step" in result.stdout
 
 
 def test_do_takes_options() -> None:

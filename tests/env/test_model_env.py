@@ -225,6 +225,24 @@ def test_what_cannot_be_made_is_refused(options: dict[str, Any], error: Any, sai
         gymnasium.make(MODEL_ID, **options)
 
 
+def test_options_of_a_reset_are_a_dictionary() -> None:
+    """Anything else is refused with what is allowed."""
+    env = make()
+    with pytest.raises(UnknownOption, match="a dictionary"):
+        env.reset(options=3)
+
+
+def test_a_task_brings_its_backend() -> None:
+    """A step function needs no name of one, alone or as one of many."""
+    env = make(Decay())
+    many = gymnasium.make_vec(MODEL_ID, 2, model=Decay())
+    assert env.unwrapped.world.backend.name == World(Decay()).backend.name == "step"
+    many.reset(seed=0)
+    env.reset(seed=0)
+    action = np.zeros(many.action_space.shape)
+    assert same(many.step(action)[0][0], env.step(action[0])[0])
+
+
 def test_what_cannot_be_done_is_refused() -> None:
     """Actions of another size, and interventions on what is no variable."""
     env = make()

@@ -133,6 +133,21 @@ def test_what_cannot_be_computed_is_an_error(name: str, message: str) -> None:
         read_model(PENDULUM, readouts=["tip.position", name])
 
 
+def test_a_name_of_several_elements_needs_their_kind() -> None:
+    """The error lists them; with the kind it is one of them."""
+    text = (
+        "<mujoco><worldbody><body name='hand' pos='0 0 1'><joint name='wrist'/><geom name='hand' "
+        "size='.1' pos='0 0 .2'/><site name='hand' pos='0 0 .3'/></body></worldbody></mujoco>"
+    )
+    choices = "'site:hand.position' or 'body:hand.position' or 'geom:hand.position'"
+    with pytest.raises(ModelError, match=f"write {choices}"):
+        read_model(text, readouts=["hand.position"])
+    heights = {"body": 1.0, "geom": 1.2, "site": 1.3}
+    for kind, height in heights.items():
+        place = only(read_model(text, readouts=[f"{kind}:hand.position"]))
+        assert place.function(0.0)[2] == pytest.approx(height)
+
+
 def test_a_sensor_of_a_joint_follows_from_that_joint() -> None:
     """Nothing else is its parent."""
     readout = only(read_model(PENDULUM, readouts=["angle.value"]))

@@ -19,7 +19,7 @@ from scm_world.backends.base import (
 from scm_world.backends.mujoco.articulated import Articulated
 from scm_world.backends.mujoco.batch import MujocoBatch, Seat
 from scm_world.backends.mujoco.contacts import Touches
-from scm_world.backends.mujoco.realization import Realization
+from scm_world.backends.mujoco.realization import Realization, refuse_callbacks
 from scm_world.errors import EngineFailure, ModelError, SnapshotMismatch
 from scm_world.models.model import Model
 from scm_world.models.scene import (
@@ -155,11 +155,13 @@ class MujocoBackend(Backend):
         """Hold a command for some physics steps.
 
         Raises:
-            EngineFailure: A number is not finite afterwards, or memory did not suffice.
+            EngineFailure: A number is not finite afterwards, memory did not suffice, or a callback
+                of the user is in use.
             UnknownOption: The structure has no such mode.
         """
         if self.seat is not None:
             self._return()
+        refuse_callbacks()
         now = self._now
         if mode is not now.mode:
             now.switch(mode)

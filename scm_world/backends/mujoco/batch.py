@@ -13,7 +13,7 @@ from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
-from scm_world.backends.mujoco.realization import FULL, LOST, STATE, Realization
+from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost, refuse_callbacks
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode
 
@@ -138,10 +138,11 @@ class MujocoBatch(EngineBatch):
 
         Raises:
             EngineFailure: A number is not finite afterwards, or memory did not suffice; all were
-                stepped.
+                stepped. Or a callback of the user is in use; none was.
         """
         if self._process != os.getpid():
             self._leave_threads()
+        refuse_callbacks()
         if self._last is not None and len(which) == len(self._guests):
             room, last = self._last
             if mode is last and [guest.seat for guest in self._guests] == self._seats:
@@ -217,5 +218,6 @@ def _step(room: _Room, which: Any, commands: Floats, substeps: int, into: Floats
     if not said and full[which].any():
         said = f"scene {which[full[which]][0]} of the batch: {FULL}"
     elif not said and wrong >= 0:
-        said = f"scene {wrong} of the batch: {LOST}"
+        vector, time = into[wrong, : room.structure.layout.size], float(room.batch.state[wrong, 0])
+        said = f"scene {wrong} of the batch: {lost(room.structure, vector, time)}"
     return said

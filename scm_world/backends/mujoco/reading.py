@@ -23,6 +23,7 @@ from scm_world.backends.mujoco.fields import (
     table,
 )
 from scm_world.backends.mujoco.readouts import find_readouts
+from scm_world.backends.mujoco.realization import callbacks
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, nearest
@@ -41,7 +42,6 @@ _CONTROLS = {
     "damper": "How much the actuator damps.",
     "": "What the actuator makes a force of, with its gain and gear.",
 }
-_CALLBACKS = ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
 
 
 def read_model(
@@ -74,15 +74,9 @@ def read_model(
             names nothing.
         UnknownOption: A setting does not exist.
     """
-    callbacks = [n for n in _CALLBACKS if getattr(mujoco, f"get_mjcb_{n}")() is not None]
-    if callbacks:
-        raise ModelError(
-            [
-                f"the callback mjcb_{name} is in use: what it acts on is unknown; call "
-                f"mujoco.set_mjcb_{name}(None)"
-                for name in callbacks
-            ]
-        )
+    found = callbacks()
+    if found:
+        raise ModelError(found)
     sealed, own_name, where = read_source(
         source, fixed_base=fixed_base, options=dict(settings or {})
     )

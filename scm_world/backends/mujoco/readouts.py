@@ -192,9 +192,16 @@ class _Finder:
         if attribute not in _POSES:
             allowed = ", ".join((*_POSES, "value"))
             return f"{attribute!r} is nothing that can be computed; there are: {allowed}"
-        for kind in [prefix] if prefix else _OBJECTS:
-            if kind in _OBJECTS and clean(element) in self._names[kind]:
-                return self._pose(name, kind, self._names[kind].index(clean(element)), attribute)
+        kinds = [
+            kind for kind in _OBJECTS
+            if clean(element) in self._names[kind] and prefix in ("", kind)
+        ]  # fmt: skip
+        if len(kinds) > 1:
+            choices = " or ".join(repr(f"{kind}:{plain}") for kind in kinds)
+            return f"a {', a '.join(kinds)} are called {element!r}; write {choices}"
+        if kinds:
+            index = self._names[kinds[0]].index(clean(element))
+            return self._pose(name, kinds[0], index, attribute)
         known = [n for kind in _OBJECTS for n in self._names[kind]]
         near = nearest(element, known)
         return f"no site, body or shape is called {element!r}" + (

@@ -19,20 +19,66 @@ from scm_world._types import Floats
 from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.state import sensible, sound
-from scm_world.errors import Infeasible, UnknownOption
+from scm_world.errors import EngineFailure, Infeasible, UnknownOption
 from scm_world.models.scene import ControlMode, ParameterKey, Parameters
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides how MuJoCo goes on."""
 
-LOST = "MuJoCo produced a state that is not finite"
 FULL = (
     "MuJoCo has no memory for all contacts and constraints of this state; give it more in the file "
     "of the model, for example with <size memory='100M'/>"
 )
 
+CALLBACKS = {
+    name: getattr(mujoco, f"get_mjcb_{name}")
+    for name in ("control", "passive", "act_dyn", "act_gain", "act_bias", "contactfilter")
+}
+"""What gives the callbacks of a user that act on the physics."""
+_control, _passive, _act_dyn, _act_gain, _act_bias, _filter = CALLBACKS.values()
+
 Rows = Callable[[Any, Floats], int]
 """Reads some states of a batch, and gives a row that is not finite, or -1."""
+
+
+def callbacks() -> list[str]:
+    """Say of each callback that is in use why no model can have it; none of them is usual."""
+    if not (_control() or _passive() or _act_dyn() or _act_gain() or _act_bias() or _filter()):
+        return []
+    return [
+        f"the callback mjcb_{name} is in use: what it acts on is unknown; call "
+        f"mujoco.set_mjcb_{name}(None)"
+        for name, callback in CALLBACKS.items()
+        if callback() is not None
+    ]
+
+
+def refuse_callbacks() -> None:
+    """Refuse to step while a callback of the user acts.
+
+    Raises:
+        EngineFailure: With the callbacks.
+    """
+    found = callbacks()
+    if found:
+        raise EngineFailure("; ".join(found), "mujoco")
+
+
+def lost(structure: Any, vector: Floats, time: float) -> str:
+    """Say which states are not finite, and when.
+
+    Args:
+        structure: With the names of the states.
+        vector: The state, shape (structure.layout.size,).
+        time: Of the simulation, which begins with 0 at a reset [s].
+    """
+    places = structure.layout.slices
+    names = [name for name, where in places.items() if not np.isfinite(vector[where]).all()]
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return (
+        f"MuJoCo produced a state that is not finite at {time:g} s: {', '.join(names[:4])}{more}; "
+        "a shorter timestep, smaller forces or more damping keep it finite"
+    )
 
 
 class Realization(ABC):
@@ -132,7 +178,11 @@ class Realization(ABC):
             return ""
         full = self._counts[1] + self._counts[2] > 2
         self._counts[:] = 1
-        return FULL if full else LOST
+        if full:
+            return FULL
+        vector = self.structure.empty_state().vector
+        self.read(vector)
+        return lost(self.structure, vector, self.data.time)
 
     def recover(self) -> None:
         """Free what a step was using when it failed; the state stays as the step left it."""
@@ -247,10 +297,10 @@ class Realization(ABC):
             self.edited, self._numbers = True, None
             reason = self.followed(before)
             if reason:
-                wrong = self._culprit(before)
+                wrong = self._culprits(before)
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
-                value = [parameters[key].tolist() for key in wrong]
-                raise Infeasible(names, value[0] if len(wrong) == 1 else value, [reason])
+                values = [parameters[key] for key in wrong]
+                raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])
         except BaseException:
             self._take_back(before)
             raise
@@ -271,19 +321,16 @@ class Realization(ABC):
             return "masses and moments of inertia would not be those of something that can move"
         return ""
 
-    def _culprit(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
-        """Name those of some parameters that no body can have; all that constants follow if none.
-
-        These are moments of inertia of which one exceeds the sum of the others, and what is
-        negative.
-        """
+    def _culprits(self, keys: Iterable[ParameterKey]) -> list[ParameterKey]:
+        """Name those of some parameters that no body can have; all that count if none is wrong."""
         constant = [key for key in keys if key in self._constant]
         wrong = []
         for key in constant:
             value = self._slots[key].read()
-            if not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0):
-                wrong.append(key)
-            elif key[1] == "inertia" and 2.0 * value.max() - value.sum() > 1e-6 * value.max():
+            bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
+            if bad or (
+                key[1] == "inertia" and 2.0 * value.max() - value.sum() > 1e-6 * value.max()
+            ):
                 wrong.append(key)
         return wrong or constant
 

@@ -207,7 +207,7 @@ def _parsed(text: str, where: str, path: Path | None = None) -> mujoco.MjSpec:
             ]
         )
     with understood(where):
-        if path is not None and path.suffix.lower() in (".xml", ".urdf"):
+        if path is not None and path.suffix in (".xml", ".urdf"):
             return mujoco.MjSpec.from_file(str(path))
         included = {} if path is None else dict(_included(text, path.parent))
         return mujoco.MjSpec.from_string(text, include=included)

@@ -28,6 +28,7 @@ from scm_world.env.batched.sheet import told
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
+from scm_world.tasks import Task
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 from scm_world.world.start import whole_number
@@ -99,7 +100,8 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         self.autoreset_mode = _mode(autoreset_mode)
         self.copy = copy
         make = partial(member, **options)
-        backend = str(options.get("backend", "mujoco"))
+        usual = getattr(options.get("task"), "backend", Task.backend)
+        backend = str(options.get("backend") or usual)
         self.crew: Crew = made_crew(
             crew, make, self.num_envs, backend=backend, threads=threads, workers=workers
         )

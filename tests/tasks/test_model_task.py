@@ -1,0 +1,196 @@
+"""``ModelTask``: what it accepts, and what it says about what it does not."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from scm_world import Box, Derived, Exogenous, World
+from scm_world.errors import (
+    ActionError,
+    EngineFailure,
+    Infeasible,
+    ModelError,
+    OutOfBounds,
+    UnknownOption,
+)
+from scm_world.queries import Contact, On
+
+PENDULUM = """
+<mujoco model="pendulum">
+  <worldbody>
+    <body name="pole">
+      <joint name="hinge" axis="0 1 0" damping="0.01"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="0.1"/>
+    </body>
+  </worldbody>
+  {actuator}
+</mujoco>
+"""
+MOTOR = "<actuator><motor name='motor' joint='hinge'/></actuator>"
+DENSITY = Exogenous(name="density", unit="kg/m^3", default=1.0, bounds=Box(0.0, 10.0))
+
+
+def pendulum(actuator: str = MOTOR, **options: Any) -> World:
+    """Make a world of a pendulum."""
+    return World.from_mjcf(PENDULUM.format(actuator=actuator), **options)
+
+
+def tied(name: str, function: Any, shape: tuple[int, ...] = ()) -> World:
+    """Make one in which a parameter follows from a density."""
+    tie = Derived(name=name, shape=shape, parents=("density",), mechanism=function)
+    world = pendulum(ties=(DENSITY, tie))
+    world.reset(seed=0)
+    return world
+
+
+# --- ties ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "function", "error", "message"),
+    [
+        ("pole.mass", (), lambda d: 1.5 - d, OutOfBounds, "do(pole.mass): -0.5 is outside"),
+        (
+            "pole.inertia", (3,), lambda d: np.array([1.0, 1.0, d]), Infeasible,
+            "do(pole.inertia): array([1., 1., 4.]) is not feasible",
+        ),
+        (
+            "pole.mass", (), lambda d: 1.0 / (2.0 - float(d)), ModelError,
+            "the function of 'pole.mass' raised ZeroDivisionError",
+        ),
+        (
+            "pole.mass", (), lambda d: None if d > 1.0 else 1.0, ModelError,
+            "the function of 'pole.mass' gives array(None, dtype=object), not a number",
+        ),
+    ],
+)  # fmt: skip
+def test_a_tie_that_cannot_be_is_named_with_what_it_gave(
+    name: str, shape: tuple[int, ...], function: Any, error: Any, message: str
+) -> None:
+    """And the world is as before."""
+    world = tied(name, function, shape)
+    before = world.values()
+    with pytest.raises(error, match=re.escape(message)):
+        world.do({"density": 4.0 if shape else 2.0})
+    assert all(np.array_equal(world[name], value) for name, value in before.items())
+
+
+def test_a_tie_that_cannot_be_from_the_beginning_is_named() -> None:
+    """Not all parameters of the model are."""
+    message = r"do\(pole.inertia\): array\(\[1., 1., 3.\]\) is not feasible"
+    with pytest.raises(Infeasible, match=message):
+        tied("pole.inertia", lambda _: np.array([1.0, 1.0, 3.0]), (3,))
+    with pytest.raises(ModelError, match=r"pole.mass = -1.0 is outside \[1.e-09, inf\]"):
+        tied("pole.mass", lambda density: -density)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("hinge.damping", -1e-12), ("pole.mass", 1e-10), ("pole.inertia", [1e-12] * 3)],
+)
+def test_what_is_just_beyond_a_physical_bound_is_refused(name: str, value: Any) -> None:
+    """However small the bound is."""
+    world = pendulum()
+    world.reset(seed=0)
+    with pytest.raises(OutOfBounds):
+        world.do({name: value})
+
+
+# --- what is given ------------------------------------------------------------------------------
+
+
+def test_text_and_files_of_any_ending_are_models(tmp_path: Path) -> None:
+    """``World`` takes MJCF text as ``from_mjcf`` does, and endings in capitals."""
+    text = PENDULUM.format(actuator=MOTOR)
+    (tmp_path / "A.XML").write_text(text)
+    urdf = '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    urdf = urdf.replace('<link name="b"/>', f'<link name="b">{body}</inertial></link>')
+    (tmp_path / "B.URDF").write_text(
+        f'{urdf}<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    assert World(text).task.system == World(str(tmp_path / "A.XML")).task.system
+    assert "j.velocity" in World(str(tmp_path / "B.URDF")).model
+
+
+def test_what_is_observed_is_a_variable() -> None:
+    """Another name is refused when the world is made."""
+    with pytest.raises(UnknownOption, match=r"hinge\.position"):
+        pendulum(observe=["hinge.positon"])
+
+
+def test_a_motor_without_limit_says_so() -> None:
+    """Its bounds are an assumption, which ``spaces`` replaces."""
+    motor = pendulum().model.declared("motor.control")
+    assert motor.bounds == Box(-1.0, 1.0)
+    assert "no limit" in motor.doc
+    given = pendulum(spaces={"motor.control": {"bounds": (-3.0, 3.0)}})
+    assert given.action_high.tolist() == [3.0]
+    assert "no limit" not in given.model.declared("motor.control").doc
+
+
+def test_without_actuators_only_an_empty_action_is_one() -> None:
+    """A text is none."""
+    world = pendulum("")
+    world.reset(seed=0)
+    world.step([])
+    for wrong in ("x", [1.0], [np.nan]):
+        with pytest.raises(ActionError):
+            world.step(wrong)
+
+
+def test_an_event_names_bodies_that_there_are() -> None:
+    """A contact with something else could never happen."""
+    with pytest.raises(UnknownOption, match="did you mean 'pole'"):
+        pendulum().rollout(do={"gravity": On(Contact("pol_e", "world"), [0.0, 0.0, 0.0])}, steps=2)
+    pendulum().rollout(do={"gravity": On(Contact("pole", "world"), [0.0, 0.0, 0.0])}, steps=2)
+
+
+# --- what happens -------------------------------------------------------------------------------
+
+
+def test_a_lost_state_is_told_with_time_and_place() -> None:
+    """Which states are not finite, in which control step, and which was the largest before."""
+    world = pendulum()
+    world.reset(seed=0)
+    world.step([0.0])
+    world.do({"hinge.velocity": 1e200})
+    message = (
+        r"in control step 1: MuJoCo produced a state that is not finite at .* s: hinge\..*; before "
+        r"that step, the largest number was 1e\+200, of hinge.velocity"
+    )
+    with pytest.raises(EngineFailure, match=message):
+        world.step([1.0])
+    with pytest.raises(EngineFailure, match="reset the world"):
+        world.step([1.0])
+    world.reset(seed=0)
+    world.step([0.0])
+
+
+def test_a_callback_that_is_set_later_is_refused_in_the_step() -> None:
+    """What it acts on has no edge."""
+    world = pendulum()
+    world.reset(seed=0)
+    mujoco.set_mjcb_passive(lambda mj, data: None)
+    try:
+        with pytest.raises(EngineFailure, match=r"call mujoco.set_mjcb_passive\(None\)"):
+            world.step([0.0])
+    finally:
+        mujoco.set_mjcb_passive(None)
+    world.step([0.0])
+
+
+def test_many_bodies_share_the_declarations_of_their_causes() -> None:
+    """The edges are as many as the square of the bodies; what declares them is not."""
+    n = 12
+    bodies = "".join(f"<body pos='{i} 0 1'><freejoint/><geom size='0.1'/></body>" for i in range(n))
+    world = World.from_mjcf(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    parents = [p for v in world.model.variables for p in v.all_parents]
+    assert len(parents) > 20 * n * n
+    assert len({id(parent) for parent in parents}) < 40 * n
