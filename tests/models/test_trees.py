@@ -112,7 +112,7 @@ class Physics:
     def __init__(self, model: Model) -> None:
         self.model, self.mj = model, copy.copy(compiled(model))
         self.data, self.scratch = mujoco.MjData(self.mj), mujoco.MjData(self.mj)
-        self.slots = slots(self.mj, model, self.data)
+        self.slots = slots(compiled(model), model.default_parameters(), self.mj, self.data)
         self.places = permutation(self.mj)
         self.data.warning.number[:] = 1
         self.tree = np.empty(model.layout.size, dtype=int)

@@ -23,15 +23,16 @@ class Articulated(Realization):
     lean = True
 
     def __init__(self, structure: Model) -> None:
-        model = reading.compiled(structure)
+        compiled = reading.compiled(structure)
+        keys = [row.key for row in structure.parameters]
         super().__init__(
             structure,
-            model,
-            lambda model, data: fields.slots(model, structure, data),
-            reading.body_names(model),
-            reading.contact_bodies(model),
+            compiled,
+            lambda model, data: fields.slots(compiled, keys, model, data),
+            reading.body_names(compiled),
+            reading.contact_bodies(compiled),
         )
-        self._places = np.concatenate(reading.permutation(model)).astype(np.int64)
+        self._places = np.concatenate(reading.permutation(compiled)).astype(np.int64)
 
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (nq + nv + na,)."""

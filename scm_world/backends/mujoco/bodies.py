@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -299,7 +299,7 @@ def _odd_actuator(mj: mujoco.MjModel, actuator: int) -> str:
     return ""
 
 
-def _missing(mj: mujoco.MjModel, names: dict[str, tuple[str, ...]]) -> Iterator[str]:
+def _missing(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
     """List what acts in a model and has no words."""
     yield from (f"the flex {names['flex'][i]!r}" for i in range(mj.nflex))
     yield from (f"the pair {names['pair'][i]!r}" for i in range(mj.npair))
@@ -319,7 +319,7 @@ def _missing(mj: mujoco.MjModel, names: dict[str, tuple[str, ...]]) -> Iterator[
     yield from _missing_of_bodies(mj, names)
 
 
-def _missing_of_bodies(mj: mujoco.MjModel, names: dict[str, tuple[str, ...]]) -> Iterator[str]:
+def _missing_of_bodies(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
     """List what bodies, joints and shapes do that has no words."""
     for i in range(mj.nbody):
         if mj.body_gravcomp[i] != 0.0:
@@ -361,7 +361,7 @@ def _notes(mj: mujoco.MjModel) -> Iterator[str]:
 
 
 def _places(
-    mj: mujoco.MjModel, names: dict[str, tuple[str, ...]], rows: dict[str, dict[int, int]]
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], rows: dict[str, dict[int, int]]
 ) -> Iterator[tuple[ParameterKey, Place]]:
     """Find the place of every parameter, exposed or not, that has a meaning here."""
     for field in table(mj):

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fields import clean, element_names, slots_of, tendon_unit
+from scm_world.backends.mujoco.fields import clean, element_names, slots, tendon_unit
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.sources import Source, realized
 from scm_world.backends.mujoco.trees import disabled
@@ -44,12 +44,12 @@ def _scratch(
     source: Source, keys: tuple[ParameterKey, ...], thread: int
 ) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, dict[ParameterKey, Slot]]:
     """Give a model and data to compute on: for each thread, and for each set of parameters."""
-    mj = realized(source)[0]
-    mj = copy.copy(mj) if keys else mj
+    compiled = realized(source)[0]
+    mj = copy.copy(compiled) if keys else compiled
     data = mujoco.MjData(mj)
     for each in (data, other := mujoco.MjData(mj)):
         each.warning.number[:] = 1  # no warnings on the console
-    return mj, data, other, slots_of(mj, keys, data) if keys else {}
+    return mj, data, other, slots(compiled, keys, mj, data) if keys else {}
 
 
 @dataclass(frozen=True)

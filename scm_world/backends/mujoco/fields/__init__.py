@@ -8,8 +8,9 @@ and places, so that nothing here needs another compilation.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import lru_cache
 
 import mujoco
 
@@ -37,14 +38,14 @@ from scm_world.backends.mujoco.fields.rows import (
 from scm_world.backends.mujoco.fields.shapes import shapes
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.trees import Couplings, Effect
-from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey
 
 MEDIUM = ("density", "viscosity")
 """Options that make a medium act, and wind with it."""
 
 
-def table(mj: mujoco.MjModel, *, fluid: bool = False) -> list[Field]:
+@lru_cache(maxsize=32)
+def table(mj: mujoco.MjModel, *, fluid: bool = False) -> tuple[Field, ...]:
     """List the parameters of a compiled model, each with its own name.
 
     Where two elements have the same name and attribute, the usual one keeps the plain name; if
@@ -52,7 +53,7 @@ def table(mj: mujoco.MjModel, *, fluid: bool = False) -> list[Field]:
     has the name of a state.
 
     Args:
-        mj: The model, which is only read.
+        mj: The model, which must not be changed afterwards.
         fluid: Whether a medium may be made to act although it does not now.
     """
     fluid = fluid or mj.opt.density > 0.0 or mj.opt.viscosity > 0.0
@@ -71,7 +72,7 @@ def table(mj: mujoco.MjModel, *, fluid: bool = False) -> list[Field]:
         named.append(
             replace(field, name=field.plain_name if plain else f"{field.kind}:{field.plain_name}")
         )
-    return named
+    return tuple(named)
 
 
 def _state_names(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> set[str]:
@@ -121,30 +122,28 @@ def options(scope: Scope) -> Iterator[Field]:
     )  # fmt: skip
 
 
-def slots_of(
-    mj: mujoco.MjModel, keys: Collection[ParameterKey], data: mujoco.MjData | None = None
-) -> dict[ParameterKey, Slot]:
-    """Find the places of some parameters in a compiled model; see ``slots``."""
-    return {
-        field.key: field.slot(mj, data)
-        for field in table(mj)
-        if field.key in keys and field.slot is not None
-    }
-
-
 def slots(
-    mj: mujoco.MjModel, model: Model, data: mujoco.MjData | None = None
+    compiled: mujoco.MjModel,
+    keys: Iterable[ParameterKey],
+    mj: mujoco.MjModel,
+    data: mujoco.MjData | None = None,
 ) -> dict[ParameterKey, Slot]:
-    """Find the place of every parameter of a description in a compiled model.
+    """Find the places of some parameters in a model.
 
     What is written there with ``constant`` slots takes effect with ``mj_setConst``.
 
     Args:
-        mj: A copy of what ``compiled(model)`` gives.
-        model: Its description.
-        data: Where the model is stepped; only models with mocap bodies need it.
+        compiled: What was compiled; it is not written.
+        keys: Of the parameters.
+        mj: A copy of it.
+        data: Where the copy is stepped; only models with mocap bodies need it.
     """
-    return slots_of(mj, {row.key for row in model.parameters}, data)
+    wanted = frozenset(keys)
+    return {
+        field.key: field.slot(mj, data)
+        for field in table(compiled)
+        if field.key in wanted and field.slot is not None
+    }
 
 
 __all__ = [
@@ -155,7 +154,6 @@ __all__ = [
     "element_names",
     "servo",
     "slots",
-    "slots_of",
     "table",
     "tendon_unit",
 ]

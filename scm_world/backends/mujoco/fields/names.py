@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -35,7 +36,8 @@ _KINDS = {
 }
 
 
-def element_names(mj: mujoco.MjModel) -> dict[str, tuple[str, ...]]:
+@lru_cache(maxsize=32)
+def element_names(mj: mujoco.MjModel) -> Mapping[str, tuple[str, ...]]:
     """Name the elements of each kind: their own names, cleaned, or names made from their body."""
     found: dict[str, tuple[str, ...]] = {}
     for kind, (obj, size) in _KINDS.items():
