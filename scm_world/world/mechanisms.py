@@ -222,7 +222,6 @@ class _Python:
         found = np.asarray(value, dtype=np.float64)
         row[self._place] = found.ravel()
 
-
     def _told(self, row: Floats) -> str:
         return f"in control step {row[self._clock]:.0f}, the function of {self._variable.name!r}"
 
@@ -249,7 +248,9 @@ def wrong_value(variable: Any, value: Any) -> str:
         numbers = np.asarray(None)
     is_number = numbers.dtype.kind in "biuf" and numbers.shape == variable.shape
     if not is_number or not np.isfinite(numbers).all():
-        wanted = f"finite numbers of shape {variable.shape}" if variable.shape else "a finite number"
+        wanted = (
+            f"finite numbers of shape {variable.shape}" if variable.shape else "a finite number"
+        )
         return f"gives {value!r}, not {wanted}"
     if isinstance(variable.bounds, WholeNumbers) and not variable.bounds.contains(numbers):
         return f"gives {value!r}, not in {variable.bounds.describe(variable.shape, {})}"
