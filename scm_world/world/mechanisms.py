@@ -18,12 +18,12 @@ import numpy as np
 from numba.core.errors import NumbaError
 
 from scm_world._types import Floats, Integers, Value
-from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.errors import ModelError, ScmWorldError, in_one_line
 from scm_world.graph import SCM
 from scm_world.variables import Integers as WholeNumbers
 from scm_world.variables import Linear, Parent
 from scm_world.variables.mechanisms import PACKAGE, Stacked, Unboxed
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses, run, weighted_sum
 
 
