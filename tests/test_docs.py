@@ -131,7 +131,7 @@ def test_discovery_is_loaded_when_it_is_used() -> None:
         "heavy = {'pandas', 'pyarrow', 'scipy', 'matplotlib', 'numba', 'mujoco', 'pybullet', "
         "'gadjid', 'scm_world.world', 'scm_world.discovery.data'} & set(sys.modules); "
         "assert not heavy, heavy; "
-        "from scm_world.discovery import collect, evaluate, learners, subject; "
+        "from scm_world.discovery import collect, evaluate, learners, problem; "
         "assert learners.learners(); "
         "heavy = {'pandas', 'pyarrow', 'matplotlib', 'gadjid', 'causallearn'} & set(sys.modules); "
         "assert not heavy, heavy"

@@ -13,7 +13,7 @@ from scm_world.cli.console import RESULTS, check_writable, console, table, writt
 from scm_world.cli.questions import POLICIES
 from scm_world.cli.tasks import build, suffix
 from scm_world.cli.working import Work
-from scm_world.discovery.benchmark_report import COLUMNS, HEADS, STANDARDISED, Row, best, summary
+from scm_world.discovery.benchmark_report import COLUMNS, HEADS, STANDARDISED, Row, summary
 from scm_world.discovery.benchmarks import benchmark, slug
 from scm_world.discovery.problems import FAMILIES, GroundTruth, TaskView
 from scm_world.errors import UnknownOption
@@ -130,11 +130,10 @@ def _table(truth: GroundTruth, rows: list[Row]) -> Any:
     title = f"{truth.name}: {len(truth.names)} variables, {len(truth.edges)} true edges"
     columns = [column for column in COLUMNS if column.key in BRIEF]
     shown = table(*HEADS[1:], *(column.title for column in columns), title=title)
-    bold = best(rows)
-    for number, row in enumerate(rows):
-        means = [
-            Text(row.text(c).partition(" [")[0], "bold" if (number, c.key) in bold else "")
+    for row in rows:
+        means = (
+            Text(row.text(c).partition(" [")[0], "bold" if c.key in row.best else "")
             for c in columns
-        ]
+        )
         shown.add_row(*row.heads[1:], *means)
     return shown

@@ -6,19 +6,20 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from html import escape
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
+
+import numpy as np
 
 from scm_world.discovery.benchmarks import BenchmarkResult, Run
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.problems import GroundTruth
-from scm_world.output.canvas import FAINT, PALETTE, blank, save, small_png
+from scm_world.output.canvas import PALETTE, blank, save, small_png, styled
 from scm_world.output.durable import write_whole
 from scm_world.output.locations import Location
-from scm_world.output.pages import Entry, facts, folded, page, picture, section, table
+from scm_world.output.pages import Entry, render
 from scm_world.queries.experiments.effects import EdgeKey
 
 if TYPE_CHECKING:
@@ -79,27 +80,21 @@ class Row:
     """The runs of a learner on a problem with one kind of data and one budget.
 
     Attributes:
-        problem: Name of the problem.
-        data: Kind of data.
-        learner: Name of the learner.
-        budget: Rows, episodes or experiments.
-        standardised: Whether all numbers are of standardised data, as there are no others.
+        run: One of them; standardised if there are no others.
         statuses: How the runs ended.
         spreads: By key of a column; those that exist.
+        best: Keys of the columns in which no row of the problem is better.
     """
 
-    problem: str
-    data: str
-    learner: str
-    budget: int
-    standardised: bool
+    run: Run
     statuses: tuple[str, ...]
     spreads: dict[str, Spread]
+    best: set[str] = field(default_factory=set)
 
     @property
-    def line(self) -> str:
-        """What a line of the picture stands for."""
-        return f"{self.learner}, {self.data}" + ", standardised" * self.standardised
+    def data(self) -> str:
+        """The kind of data."""
+        return self.run.data + ", standardised" * self.run.standardised
 
     @property
     def heads(self) -> tuple[str, str, str, str, str]:
@@ -108,8 +103,8 @@ class Row:
         for status, words in (("timeout", "timed out"), ("failed", "failed")):
             if status in self.statuses:
                 ended.append(f"{self.statuses.count(status)} {words}")
-        data = self.data + ", standardised" * self.standardised
-        return (self.problem, data, self.learner, str(self.budget), ", ".join(ended))
+        run = self.run
+        return (run.problem, self.data, run.learner, str(run.budget), ", ".join(ended))
 
     def text(self, column: Column) -> str:
         """Write one number."""
@@ -133,6 +128,9 @@ def number(value: float | None, column: Column) -> str:
 def summary(result: BenchmarkResult) -> dict[str, list[Row]]:
     """Take the seeds together.
 
+    The best of a column is the best mean over all seeds that were started: without one of them,
+    the hard one may be missing. There are several if they are equally good, none if all are.
+
     Returns:
         By problem a row per kind of data, learner and budget, in this order.
     """
@@ -145,47 +143,29 @@ def summary(result: BenchmarkResult) -> dict[str, list[Row]]:
         runs = list(group)
         scaled = [run for run in runs if run.standardised]
         shown = [run for run in runs if not run.standardised] or scaled
-        spreads = {
-            STANDARDISED: _spread(run.scores.get("shd") for run in scaled if run.status == "done")
-        }
+        spreads = {}
         for column in COLUMNS:
-            if column.key != STANDARDISED:
-                values = (run.record.get(column.key) for run in shown if run.status == "done")
-                spreads[column.key] = _spread(values)
-        first = shown[0]
+            of, score = (scaled, "shd") if column.key == STANDARDISED else (shown, column.key)
+            values = [run.record.get(score) for run in of if run.status == "done"]
+            known = [float(value) for value in values if value is not None]
+            if known:
+                mean = sum(known) / len(known)
+                spreads[column.key] = Spread(mean, min(known), max(known), len(known))
         statuses = tuple(run.status for run in shown)
-        known = {name: spread for name, spread in spreads.items() if spread is not None}
-        rows[first.problem].append(
-            Row(first.problem, first.data, first.learner, first.budget, first.standardised,
-                statuses, known)
-        )  # fmt: skip
+        rows[shown[0].problem].append(Row(shown[0], statuses, spreads))
+    for column in (column for column in COLUMNS if column.better):
+        for found in rows.values():
+            whole = [
+                row
+                for row in found
+                if column.key in row.spreads and row.spreads[column.key].n == len(row.statuses)
+            ]
+            means = {row.spreads[column.key].mean for row in whole}
+            top = min(means, default=0) if column.better == "less" else max(means, default=0)
+            for row in whole if len(means) > 1 else ():
+                if row.spreads[column.key].mean == top:
+                    row.best.add(column.key)
     return rows
-
-
-def _spread(values: Iterable[float | None]) -> Spread | None:
-    known = [float(value) for value in values if value is not None]
-    return Spread(sum(known) / len(known), min(known), max(known), len(known)) if known else None
-
-
-def best(rows: Sequence[Row]) -> set[tuple[int, str]]:
-    """Find the best numbers of one problem.
-
-    A mean over fewer seeds than were started is not compared: the hard ones may be missing.
-
-    Returns:
-        Number of the row and key of the column; several if they are equally good, none if all are.
-    """
-    found: set[tuple[int, str]] = set()
-    for column in COLUMNS:
-        means = {
-            at: row.spreads[column.key].mean
-            for at, row in enumerate(rows)
-            if column.key in row.spreads and row.spreads[column.key].n == len(row.statuses)
-        }
-        if column.better and len(set(means.values())) > 1:
-            top = min(means.values()) if column.better == "less" else max(means.values())
-            found |= {(at, column.key) for at, mean in means.items() if mean == top}
-    return found
 
 
 def counted(result: BenchmarkResult) -> str:
@@ -222,21 +202,17 @@ def _csv(result: BenchmarkResult) -> str:
 
 
 def _markdown(result: BenchmarkResult) -> str:
+    titles = [*HEADS[1:], *(column.title for column in COLUMNS)]
+    rule = ["---" if title in HEADS[1:3] else "---:" for title in titles]
     lines = ["# Results of the benchmark", "", f"{counted(result)}. {NOTE}"]
     for name, rows in summary(result).items():
-        truth, bold = result.problems[name], best(rows)
+        truth = result.problems[name]
         size = f"{len(truth.names)} variables, {len(truth.edges)} edges"
         lines += ["", f"## {_safe(name)}", "", size, ""]
-        if not rows:
-            lines.append("No runs.")
-            continue
-        titles = [*HEADS[1:], *(column.title for column in COLUMNS)]
-        lines.append(f"| {' | '.join(titles)} |")
-        lines.append(f"|{'|'.join('---' if t in HEADS[1:3] else '---:' for t in titles)}|")
-        for at, row in enumerate(rows):
-            numbers = (
-                f"**{row.text(c)}**" if (at, c.key) in bold else row.text(c) for c in COLUMNS
-            )
+        lines += [f"| {' | '.join(titles)} |", f"|{'|'.join(rule)}|"] if rows else ["No runs."]
+        for row in rows:
+            marks = ["**" * (column.key in row.best) for column in COLUMNS]
+            numbers = (f"{m}{row.text(c)}{m}" for m, c in zip(marks, COLUMNS, strict=True))
             lines.append(f"| {' | '.join([*map(_safe, row.heads[1:]), *numbers])} |")
     return "\n".join(lines) + "\n"
 
@@ -252,8 +228,10 @@ def _safe(text: str) -> str:
 MARKERS = "osD^vPX*<>ph"
 DASHES = {"observational": ":", "interventional": "-", "paired": "--"}
 ACROSS = 4  # problems side by side
+SCORES = (("shd", "SHD (0 is best)"), ("f1", "F1 (1 is best)"))
 
 
+@styled
 def draw_budgets(result: BenchmarkResult) -> Figure:
     """Draw SHD and F1 against the budget, two panels per problem.
 
@@ -261,78 +239,59 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
     legend says how many were.
     """
     rows = summary(result)
-    every = [row for found in rows.values() for row in found]
-    names = sorted({row.line for row in every})
-    learners = sorted({row.learner for row in every})
+    lines: dict[tuple[str, str], list[str]] = {}
+    for row in (row for found in rows.values() for row in found):
+        lines.setdefault((row.run.learner, row.data), []).extend(row.statuses)
+    who = sorted({learner for learner, _ in lines})
     across = max(1, min(ACROSS, len(rows)))
     bands = max(1, math.ceil(len(rows) / across))
-    figure = blank()
-    figure.set_size_inches(max(8.0, 4.0 * across), 4.3 * bands + 0.4 + 0.26 * len(names) / 2)
+    figure = blank(max(8.0, 4.0 * across), 4.3 * bands + 0.4 + 0.12 * len(lines))
     figure.set_layout_engine("constrained")
     axes = figure.subplots(2 * bands, across, squeeze=False)
-    for ax in axes.flat:
-        ax.set_visible(False)
     handles: dict[str, Any] = {}
     for at, (name, found) in enumerate(rows.items()):
-        pair = axes[2 * (at // across) : 2 * (at // across) + 2, at % across]
-        pair[0].set_title(name if len(name) <= 34 else f"{name[:33]}…", parse_math=False)
-        for ax, key, label in zip(pair, ("shd", "f1"), ("SHD (0 is best)", "F1 (1 is best)"),
-                                  strict=True):  # fmt: skip
-            ax.set_visible(True)
-            for line in names:
-                mine = [row for row in found if row.line == line and key in row.spreads]
-                aside = (names.index(line) + 0.5) / len(names) - 0.5
-                style = learners.index(mine[0].learner) if mine else 0
+        for part, (key, label) in enumerate(SCORES):
+            ax = axes[2 * (at // across) + part, at % across]
+            ax.set(title="" if part else f"{name[:33]}…" if len(name) > 34 else name)
+            ax.set(xlabel="budget", ylabel=label, xscale="log")
+            for place, line in enumerate(sorted(lines)):
+                mine = [row for row in found if (row.run.learner, row.data) == line]
+                mine = [row for row in mine if key in row.spreads]
                 if mine:
-                    handles[line] = _line(ax, mine, key, 1.0 + 0.1 * aside, style)
-            _finish(ax, label, sorted({row.budget for row in found}))
+                    aside = 1.0 + 0.1 * ((place + 0.5) / len(lines) - 0.5)
+                    done, count = lines[line].count("done"), len(lines[line])
+                    some = f" ({done} of {count} runs)" if done < count else ""
+                    drawn = _line(ax, mine, key, aside, who.index(line[0]))
+                    handles[", ".join(line) + some] = drawn
+            budgets = sorted({row.run.budget for row in found})
+            shown = budgets[:: max(1, math.ceil(len(budgets) / 6))]
+            ax.minorticks_off()
+            ax.set_xticks([max(budget, 0.5) for budget in shown], list(map(str, shown)))
             top = 1.04 if key == "f1" else max(1.0, ax.get_ylim()[1])
             ax.set_ylim(-0.04 * top, top)
-    labels = [_label(line, [row for row in every if row.line == line]) for line in handles]
+            if not ax.lines:
+                middle: Any = {"ha": "center", "va": "center", "transform": ax.transAxes}
+                ax.text(0.5, 0.5, "no finished run", **middle)
+    for ax in axes.flat:
+        ax.set_visible(bool(ax.get_xlabel()))
     if handles:
-        legend = figure.legend(
-            handles.values(), labels, ncols=2, loc="outside lower center", frameon=False,
-            handlelength=3.6,
-        )  # fmt: skip
-        for text in legend.get_texts():
-            text.set_parse_math(False)
+        below: Any = {"loc": "outside lower center", "ncols": 2, "handlelength": 3.6}
+        figure.legend(handles.values(), handles.keys(), **below)
     return figure
 
 
 def _line(ax: Axes, rows: Sequence[Row], key: str, aside: float, style: int) -> Any:
     """Draw the means of one learner, a little aside so that lines do not hide one another."""
-    spreads = [row.spreads[key] for row in rows]
+    mean, low, high, _ = zip(*(row.spreads[key] for row in rows), strict=True)
     return ax.errorbar(
-        [max(row.budget, 0.5) * aside for row in rows],
-        [spread.mean for spread in spreads],
-        yerr=[
-            [max(spread.mean - spread.low, 0.0) for spread in spreads],
-            [max(spread.high - spread.mean, 0.0) for spread in spreads],
-        ],
+        [max(row.run.budget, 0.5) * aside for row in rows],
+        mean,
+        yerr=np.maximum([np.subtract(mean, low), np.subtract(high, mean)], 0.0),
         color=PALETTE[style % len(PALETTE)],
         marker=MARKERS[style % len(MARKERS)],
-        linestyle=DASHES[rows[0].data],
+        linestyle=DASHES[rows[0].run.data],
         capsize=2.5,
     )
-
-
-def _finish(ax: Axes, label: str, budgets: Sequence[int]) -> None:
-    ax.set_ylabel(label)
-    ax.grid(color=FAINT, lw=0.5)
-    ax.set_axisbelow(True)
-    ax.set_xscale("log")
-    ax.minorticks_off()
-    shown = budgets[:: max(1, math.ceil(len(budgets) / 6))]
-    ax.set_xticks([max(b, 0.5) for b in shown], [str(b) for b in shown])
-    ax.set_xlabel("budget")
-    if not ax.lines:
-        ax.text(0.5, 0.5, "no finished run", ha="center", va="center", transform=ax.transAxes)
-
-
-def _label(line: str, rows: Sequence[Row]) -> str:
-    statuses = [status for row in rows for status in row.statuses]
-    done = statuses.count("done")
-    return line + (f" ({done} of {len(statuses)} runs)" if done < len(statuses) else "")
 
 
 # --- the report -----------------------------------------------------------------------------------
@@ -346,15 +305,8 @@ VERDICTS = {
     "unscored": ("∘", "not scored", "#6B7280"),
 }
 """The sign in a matrix, what it means, and its color; each sign alone is enough."""
+BESIDE = ("shd", "f1", "precision", "recall")  # scores beside a single run
 NAMED = 25  # wrong edges of a kind that are named in words
-STYLE = (
-    "table.graph td,table.graph th{padding:0;width:14px;min-width:14px;height:14px;font-size:10px;"
-    "line-height:14px;text-align:center;border:1px solid #dde1e7;white-space:nowrap}"
-    "table.graph tbody th{text-align:right;padding:0 4px}"
-    "table.graph thead th{writing-mode:vertical-rl;text-align:left;padding:4px 0;height:auto}"
-    "table.graph td{font-size:13px;font-weight:bold;cursor:default}"
-    + "".join(f".{name}{{color:{color}}}" for name, (_, _, color) in VERDICTS.items())
-)
 
 
 class Link(NamedTuple):
@@ -422,105 +374,55 @@ def compare(truth: GroundTruth, found: Found) -> list[Link]:
 
 
 def report(result: BenchmarkResult) -> str:
-    """Write the report as one HTML page that needs no network.
+    """Return the report: one HTML page that needs no network.
 
     It has the tables, the picture of the budgets, and of each learner on each problem, at the
     largest budget with the first seed, the estimated graph compared with the true one.
     """
-    alt = (
-        "Line charts: SHD and F1 against the budget, two panels per problem, a line per learner. "
-        "The numbers are those of the summary."
-    )
-    caption = "Means; bars from the lowest to the highest seed."
-    drawn = picture(small_png(draw_budgets(result)), alt, caption)
-    parts = [_summary(result), section("budget", "Scores against the budget", drawn)]
-    contents = [("summary", "Summary"), ("budget", "Budget")]
-    for at, name in enumerate(result.problems):
-        parts.append(section(f"s{at}", name, _problem(result, name)))
-        contents.append((f"s{at}", name))
-    parts.append(section("about", "About this benchmark", facts(result.settings)))
-    lead = f"{counted(result)}."
-    return page("Benchmark of learners", parts, lead=lead, contents=contents, extra_style=STYLE)
-
-
-def _summary(result: BenchmarkResult) -> str:
-    lines: list[list[Entry]] = []
-    for rows in summary(result).values():
-        bold = best(rows)
-        for at, row in enumerate(rows):
-            done = Entry(row.heads[-1], by=str(row.statuses.count("done")))
-            line = [*map(Entry, row.heads[:-1]), done]
-            for column in COLUMNS:
-                spread = row.spreads.get(column.key)
-                value = "" if spread is None else f"{spread.mean:.6g}"
-                looks = "best" if (at, column.key) in bold else ""
-                line.append(Entry(row.text(column), by=value, looks=looks))
-            lines.append(line)
-    titles = [*HEADS, *(column.title for column in COLUMNS)]
-    whole = table(titles, lines, left=3, sortable=True)
-    return section("summary", "Summary", f"<p>{escape(NOTE)}</p>{whole}")
-
-
-def _problem(result: BenchmarkResult, name: str) -> str:
-    truth = result.problems[name]
-    size = f"{len(truth.names)} variables, {len(truth.edges)} true edges"
-    if truth.unscored:
-        size += f", {len(truth.unscored)} pairs not scored"
-    legend = "".join(
-        f'<li><b class="{verdict}">{sign}</b> {verdict}: {words}</li>'
-        for verdict, (sign, words, _) in VERDICTS.items()
-    )
-    inside = f"<p>{size}. Rows are causes, columns are effects; a digit is the lag.</p>"
-    inside += f'{facts(truth.about)}<ul class="legend">{legend}</ul>'
-    groups: dict[tuple[str, str, bool], Run] = {}
-    for run in result.runs:
-        if run.problem == name:
+    problems = []
+    for name, truth in result.problems.items():
+        groups: dict[tuple[str, str, bool], Run] = {}
+        for run in (run for run in result.runs if run.problem == name):
             key = (run.learner, run.data, run.standardised)
             groups[key] = max(groups.get(key, run), run, key=lambda r: (r.budget, -r.seed))
-    for (who, data, even), run in groups.items():
-        inside += f"<h3>{escape(f'{who}, {data}' + ', standardised' * even)}</h3>"
-        inside += _run(result.truth_of(run), run)
-    return inside
+        problems.append((truth, [_compared(result.truth_of(run), run) for run in groups.values()]))
+    rows = [row for found in summary(result).values() for row in found]
+    return render(
+        "discovery/benchmark_report.html",
+        title="Benchmark of learners",
+        lead=f"{counted(result)}.",
+        contents=[
+            ("summary", "Summary"),
+            ("budget", "Budget"),
+            *((f"s{at}", name) for at, name in enumerate(result.problems)),
+        ],
+        note=NOTE,
+        heads=[*HEADS, *(column.title for column in COLUMNS)],
+        rows=[[*row.heads, *(_entry(row, column) for column in COLUMNS)] for row in rows],
+        budgets=small_png(draw_budgets(result)),
+        problems=problems,
+        verdicts=VERDICTS,
+        settings=result.settings,
+    )
 
 
-def _run(truth: GroundTruth, run: Run) -> str:
-    said = f"budget {run.budget}, seed {run.seed}"
-    if run.found is None:
-        why = f"{run.status}: {run.message}" if run.message else run.status
-        return f"<p>{escape(f'{said}. No graph: {why}')}</p>"
-    for column in COLUMNS:
-        if column.key in ("shd", "f1", "precision", "recall"):
-            said += f", {column.title} {number(run.scores.get(column.key), column)}"
-    links = compare(truth, run.found)
-    named = {}
+def _entry(row: Row, column: Column) -> Entry:
+    by = f"{row.spreads[column.key].mean:.6g}" if column.key in row.spreads else ""
+    return Entry(row.text(column), by=by, looks="best" if column.key in row.best else "")
+
+
+def _compared(truth: GroundTruth, run: Run) -> dict[str, Any]:
+    """Compare the graph of a run with the true one, for the report."""
+    links = [] if run.found is None else compare(truth, run.found)
+    cells: dict[tuple[str, str], list[Link]] = {}
+    named: dict[str, str] = {}
+    for link in links:
+        for ends in [link[:2]] if link.directed else [link[:2], link[1::-1]]:
+            cells.setdefault(ends, []).append(link)
     for verdict in ("missing", "extra", "reversed", "undirected"):
         words = [link.words for link in links if link.verdict == verdict]
         more = f"; … and {len(words) - NAMED} more" if len(words) > NAMED else ""
         if words:
             named[f"{len(words)} {verdict}"] = "; ".join(words[:NAMED]) + more
-    listed = folded("Wrong edges in words", facts(named)) if named else ""
-    return f"<p>{escape(said)}</p>{matrix(truth.names, links)}{listed}"
-
-
-def matrix(names: Sequence[str], links: Iterable[Link]) -> str:
-    """Write compared edges as a table: a sign and the lag where a cause meets an effect."""
-    cells: dict[tuple[str, str], list[Link]] = {}
-    for link in links:
-        for cell in [link[:2]] if link.directed else [link[:2], link[1::-1]]:
-            cells.setdefault(cell, []).append(link)
-    lines = []
-    for cause in names:
-        line = [f'<tr><th scope="row">{escape(cause)}</th>']
-        for effect in names:
-            found = cells.get((cause, effect), [])
-            title = escape("; ".join(f"{link.words}: {link.verdict}" for link in found))
-            signs = "".join(
-                f'<b class="{link.verdict}">{VERDICTS[link.verdict][0]}{link.lag or ""}</b>'
-                for link in found
-            )
-            line.append(f'<td title="{title}">{signs}</td>' if found else "<td></td>")
-        lines.append("".join(line) + "</tr>")
-    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
-    head = f"<thead><tr><td></td>{heads}</tr></thead>"
-    body = f"<tbody>{''.join(lines)}</tbody>"
-    return f'<div class="wide"><table class="graph">{head}{body}</table></div>'
+    scores = {c.title: number(run.scores.get(c.key), c) for c in COLUMNS if c.key in BESIDE}
+    return {"run": run, "cells": cells, "named": named, "scores": scores}

@@ -19,9 +19,7 @@ from scm_world.discovery.benchmark_report import (
     VERDICTS,
     Row,
     Spread,
-    best,
     compare,
-    matrix,
     report,
     summary,
 )
@@ -55,7 +53,7 @@ def of(*runs: Run) -> BenchmarkResult:
 def row(result: BenchmarkResult, learner: str, budget: int) -> Row:
     """Find a row of the chain."""
     rows = summary(result)["chain"]
-    return next(r for r in rows if (r.learner, r.budget) == (learner, budget))
+    return next(r for r in rows if (r.run.learner, r.run.budget) == (learner, budget))
 
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -105,7 +103,7 @@ def test_the_best_needs_all_seeds() -> None:
     late = replace(lucky, seed=2, status="timeout", found=None, scores={})
     bad = [replace(lucky, learner="pc", seed=seed, scores={"shd": 9}) for seed in (1, 2)]
     rows = summary(of(*runs, lucky, late, *bad))["chain"]
-    assert {rows[number].learner for number, key in best(rows) if key == "shd"} == {"ours"}
+    assert [row.run.learner for row in rows if "shd" in row.best] == ["ours"]
 
 
 def test_the_csv_has_a_line_per_run(result: BenchmarkResult, folder: Path) -> None:
@@ -153,6 +151,12 @@ def test_the_budget_picture_shows_every_learner(
         assert (np.abs(picture - rgb).max(axis=-1) < 0.02).sum() > 20
 
 
+def shown(truth: GroundTruth, found: Found) -> str:
+    """Write the report of one run."""
+    run = Run(problem=truth.name, learner="mine", data="paired", budget=9, seed=0, found=found)
+    return report(BenchmarkResult({truth.name: truth}, (run,)))
+
+
 # --- edges ----------------------------------------------------------------------------------------
 
 
@@ -192,9 +196,10 @@ def test_time_is_never_turned_around() -> None:
 def test_an_extra_edge_without_direction_is_one_edge() -> None:
     """It stands in both fields of the matrix."""
     truth = GroundTruth(name="t", names=("x", "y"), edges=())
-    (link,) = compare(truth, Found.of_edges(["x", "y"], [("x", "y", 0), ("y", "x", 0)]))
+    found = Found.of_edges(["x", "y"], [("x", "y", 0), ("y", "x", 0)])
+    (link,) = compare(truth, found)
     assert (link.verdict, link.directed, link.words) == ("extra", False, "x — y")
-    assert matrix(truth.names, [link]).count('<b class="extra">+</b>') == 2
+    assert shown(truth, found).count('<td title="x — y: extra"><b class="extra">+</b>') == 2
 
 
 def test_verdicts_differ_without_color() -> None:
@@ -205,8 +210,9 @@ def test_verdicts_differ_without_color() -> None:
 def test_a_matrix_has_the_lags() -> None:
     """Beside the sign, in the row of the cause and the column of the effect."""
     truth = GroundTruth(name="t", names=("x", "y"), edges=(("x", "y", 0), ("x", "y", 2)))
-    links = compare(truth, Found.of_edges(["x", "y"], [("x", "y", 0), ("y", "y", 1)]))
-    first, second = matrix(truth.names, links).partition("<tbody>")[2].split("</tr>")[:2]
+    found = Found.of_edges(["x", "y"], [("x", "y", 0), ("y", "y", 1)])
+    graph = shown(truth, found).partition('<table class="graph">')[2]
+    first, second = graph.partition("<tbody>")[2].split("</tr>")[:2]
     assert '<b class="correct">●</b><b class="missing">−2</b>' in first
     assert '<b class="extra">+1</b>' in second
 

@@ -103,9 +103,6 @@ def write_report(
         lead=f"{', '.join(evaluation.agents)} on {', '.join(evaluation.engines)}: "
         f"{metric_words(metric)}. {len(evaluation)} episodes: {counted(evaluation)}.",
         contents=[one for one in SECTIONS.items() if missing.get(one[0], True)],
-        early_style="",
-        extra_style="",
-        extra_script="",
         metric=metric_words(metric),
         lines=lines,
         labels=[
