@@ -20,7 +20,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import protocols_of
-from scm_world.evaluation.policies.cards import OPTIONS, PolicyAbout
+from scm_world.evaluation.policies.cards import OPTIONS
 from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
 from scm_world.evaluation.protocols import chosen
 from scm_world.evaluation.recording import Recording
@@ -587,7 +587,9 @@ def clone(
                     "loss": loss,
                     "versions": made_with,
                 }
-                policy = NetworkPolicy.of(tensors, _about(lesson, card))
+                form: dict[str, Any] = {"task": lesson.task, "env": lesson.options, "card": card}
+                form["activation"] = lesson.network.activation
+                policy = NetworkPolicy.of(tensors, form)
                 scores: dict[str, float] = {}
                 if lesson.trials.protocols:
                     given_to = (lesson.task, lesson.options, lesson.trials, backend)
@@ -603,11 +605,6 @@ def clone(
         ranked = max(range(len(means)), key=lambda i: (means[i], i))
         save_policy(best, policies[ranked])
         return Cloned(folder, lesson, number, last, best, means[ranked])
-
-
-def _about(lesson: Lesson, card: Mapping[str, Any]) -> PolicyAbout:
-    activation = lesson.network.activation
-    return PolicyAbout(task=lesson.task, env=lesson.options, activation=activation, card=dict(card))
 
 
 def _checked(lesson: Lesson, backend: str, seed: int) -> str:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scm_world.errors import MissingExtra
 from scm_world.evaluation.policies.cards import KEY
 from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
+from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import write_durably
 
 OPSET, FORMAT = 17, 8
@@ -40,10 +39,7 @@ def to_onnx(policy: NetworkPolicy | Path | str, path: Path | str) -> Path:
         UnreadableFile: The file is no policy.
         UnwritableFolder: There is no room, or no permission.
     """
-    try:
-        onnx: Any = importlib.import_module("onnx")
-    except ImportError as error:
-        raise MissingExtra("onnx", "onnx") from error
+    onnx: Any = load("onnx", "onnx")
     given = policy if isinstance(policy, NetworkPolicy) else load_policy(policy)
     made = _model(onnx, given)
     made.metadata_props.add(key=KEY, value=given.about.text())
@@ -54,44 +50,40 @@ def to_onnx(policy: NetworkPolicy | Path | str, path: Path | str) -> Path:
 
 
 def _model(onnx: Any, policy: NetworkPolicy) -> Any:
-    helper, types = onnx.helper, onnx.TensorProto
-    inputs, nodes, seen = _observed(helper, types, policy)
-    weights: list[Any] = []
-    last = len(policy.layers) - 1
+    helper, single, double = onnx.helper, onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
+    nodes: list[Any] = []
+    arrays: dict[str, Any] = {}
+    inputs: dict[str, tuple[Any, int | None]]
+
+    def node(kind: str, names: list[str], output: str, **how: Any) -> str:
+        nodes.append(helper.make_node(kind, names, [output], **how))
+        return output
+
+    about = policy.about
+    if about.inputs is None:
+        inputs, seen = {"observation": (single, policy.n_observed)}, "observation"
+    else:
+        inputs = {name: (double if name in GOALS else single, None) for name in about.inputs}
+        parts = [node("Cast", [name], f"{name}_single", to=single) for name in inputs]
+        seen = node("Concat", parts, "joined", axis=1)
     for number, layer in enumerate(policy.layers):
         names = [f"weight_{number}", f"bias_{number}"]
-        arrays = (np.ascontiguousarray(layer.weight), layer.bias)
-        weights += [onnx.numpy_helper.from_array(a, n) for a, n in zip(arrays, names, strict=True)]
-        nodes.append(helper.make_node("Gemm", [seen, *names], [f"sum_{number}"]))
-        seen = f"sum_{number}"
-        if number < last:
-            kind = FUNCTIONS[policy.about.activation]
-            nodes.append(helper.make_node(kind, [seen], [f"hidden_{number}"]))
-            seen = f"hidden_{number}"
-    if policy.about.output == "tanh":
-        nodes.append(helper.make_node("Tanh", [seen], ["action"]))
+        arrays |= zip(names, (np.ascontiguousarray(layer.weight), layer.bias), strict=True)
+        seen = node("Gemm", [seen, *names], f"sum_{number}")
+        if number < len(policy.layers) - 1:
+            seen = node(FUNCTIONS[about.activation], [seen], f"hidden_{number}")
+    if about.output == "tanh":
+        node("Tanh", [seen], "action")
     else:
-        ends = {"low": np.float32(-1.0), "high": np.float32(1.0)}
-        weights += [onnx.numpy_helper.from_array(np.array(end), n) for n, end in ends.items()]
-        nodes.append(helper.make_node("Clip", [seen, *ends], ["action"]))
-    output = helper.make_tensor_value_info("action", types.FLOAT, [None, policy.n_actions])
-    graph = helper.make_graph(nodes, "policy", inputs, [output], weights)
-    opset = helper.make_opsetid("", OPSET)
-    return helper.make_model(
-        graph, opset_imports=[opset], ir_version=FORMAT, producer_name="scm_world"
+        arrays |= {"low": np.array(-1.0, np.float32), "high": np.array(1.0, np.float32)}
+        node("Clip", [seen, "low", "high"], "action")
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info(n, k, [None, size]) for n, (k, size) in inputs.items()],
+        [helper.make_tensor_value_info("action", single, [None, policy.n_actions])],
+        [onnx.numpy_helper.from_array(array, name) for name, array in arrays.items()],
     )
-
-
-def _observed(helper: Any, types: Any, policy: NetworkPolicy) -> tuple[list[Any], list[Any], str]:
-    """Give the inputs, what joins them, and the name of the joined observation."""
-    if policy.about.inputs is None:
-        shape = [None, policy.n_observed]
-        return [helper.make_tensor_value_info("observation", types.FLOAT, shape)], [], "observation"
-    inputs, nodes, parts = [], [], []
-    for name in policy.about.inputs:
-        kind = types.DOUBLE if name in GOALS else types.FLOAT
-        inputs.append(helper.make_tensor_value_info(name, kind, [None, None]))
-        nodes.append(helper.make_node("Cast", [name], [f"{name}_single"], to=types.FLOAT))
-        parts.append(f"{name}_single")
-    nodes.append(helper.make_node("Concat", parts, ["joined"], axis=1))
-    return inputs, nodes, "joined"
+    opset = [helper.make_opsetid("", OPSET)]
+    how = {"opset_imports": opset, "ir_version": FORMAT, "producer_name": "scm_world"}
+    return helper.make_model(graph, **how)

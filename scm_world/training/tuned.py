@@ -19,6 +19,14 @@ ENV: Fields = {
     "frame_skip": 10,
 }
 
+_OFF_POLICY: Fields = {
+    "worlds": 64,
+    "steps": 1_000_000,
+    "rate": {"initial": 3e-4},
+    "network": {"hidden": (256, 256), "activation": "relu"},
+    "settings": {"gamma": 0.98, "batch_size": 256, "gradient_steps": 8, "n_steps": 3},
+}
+
 COMMON: Mapping[str, Fields] = {
     "ppo": {
         "worlds": 64,
@@ -35,20 +43,8 @@ COMMON: Mapping[str, Fields] = {
             "clip_range": 0.2,
         },
     },
-    "sac": {
-        "worlds": 64,
-        "steps": 1_000_000,
-        "rate": {"initial": 3e-4},
-        "network": {"hidden": (256, 256), "activation": "relu"},
-        "settings": {"gamma": 0.98, "batch_size": 256, "gradient_steps": 8, "n_steps": 3},
-    },
-    "td3": {
-        "worlds": 64,
-        "steps": 1_000_000,
-        "rate": {"initial": 3e-4},
-        "network": {"hidden": (256, 256), "activation": "relu"},
-        "settings": {"gamma": 0.98, "batch_size": 256, "gradient_steps": 8, "n_steps": 3},
-    },
+    "sac": _OFF_POLICY,
+    "td3": _OFF_POLICY,
 }
 """What holds for every task, by algorithm."""
 
@@ -187,13 +183,11 @@ LESSONS: Mapping[str, Fields] = {
 
 
 def tuned(task: str, algo: str) -> dict[str, Any]:
-    """Give the fields of a recipe that work for a task, as far as we know."""
+    """Return the fields of a recipe that work for a task, as far as we know."""
     found: dict[str, Any] = {"env": dict(ENV), **COMMON[algo]}
-    own = TUNED.get(task, {})
-    for fields in (own.get(None, {}), own.get(algo, {})):
-        for name, value in fields.items():
-            before = found.get(name)
-            if isinstance(before, Mapping) and isinstance(value, Mapping):
-                value = {**before, **value}  # noqa: PLW2901 # of both
-            found[name] = value
+    for fields in (TUNED.get(task, {}).get(key, {}) for key in (None, algo)):
+        found |= {
+            name: {**found[name], **value} if isinstance(found.get(name), Mapping) else value
+            for name, value in fields.items()
+        }
     return found
