@@ -36,7 +36,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
-from scm_world.output.durable import draft_of, locked, made, write_whole
+from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.locations import Location, located
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
@@ -384,8 +384,8 @@ def _claim(folder: Location, settings: dict[str, Any]) -> None:
             raise UnreadableFile(str(folder), reason, "give another folder")
         return
     if folder.exists():
-        allowed = {draft_of(path).name}  # of a beginning that was interrupted
-        if not folder.is_dir() or not {there.name for there in folder.iterdir()} <= allowed:
+        names = [there.name for there in folder.iterdir()] if folder.is_dir() else [folder.name]
+        if not all(is_draft(name, path.name) for name in names):  # of an interrupted beginning
             advice = "give an empty folder, or one of an earlier benchmark"
             raise UnreadableFile(str(folder), "it holds something else", advice)
     made(folder)

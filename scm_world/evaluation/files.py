@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from hashlib import blake2b
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -16,13 +17,24 @@ from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import what_it_is
 from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
 from scm_world.graph.exchange.libraries import load as load_library
-from scm_world.output.durable import made, removed, write_durably, write_whole
+from scm_world.output.durable import locked, removed, write_durably, write_whole
 from scm_world.output.locations import Location
 
 FORMAT = "scm_world/evaluation/1"
 RESULTS = "results.json"
 TABLE = "episodes"
 ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
+DAMAGED = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
+"""What reading a damaged file raises."""
+
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
 
 
@@ -30,21 +42,28 @@ def save(evaluation: Evaluation, folder: Location, form: str) -> tuple[Location,
     """Write the table, then the summary that names it; see ``Evaluation.save``."""
     if form not in CODECS:
         raise UnknownOption("format", form, CODECS)
-    made(folder)
     table, summary = folder / f"{TABLE}.{form}", folder / RESULTS
     content = CODECS[form][0](evaluation.columns)
-    removed(summary)  # it is of the table that goes
-    for other in CODECS:
-        removed(folder / f"{TABLE}.{other}")
-    write_durably(table, content)
-    data = {
+    data: dict[str, Any] = {
         "format": FORMAT,
         "table": {"file": table.name, "rows": len(evaluation), "digest": evaluation.digest},
         "scores": summarized(evaluation),
         "about": dict(evaluation.about),
     }
-    write_whole(json.dumps(data, indent=1, allow_nan=False) + "\n", summary)
+    data["checksum"] = _checksum(data)
+    with locked(folder):
+        removed(summary)  # it is of the table that goes
+        for other in CODECS:
+            removed(folder / f"{TABLE}.{other}")
+        write_durably(table, content)
+        write_whole(json.dumps(data, indent=1, allow_nan=False) + "\n", summary)
     return summary, table
+
+
+def _checksum(data: Mapping[str, Any]) -> str:
+    """Sum up everything in a summary but the sum."""
+    rest = {name: value for name, value in data.items() if name != "checksum"}
+    return blake2b(json.dumps(rest, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
@@ -94,6 +113,8 @@ def load(path: Location) -> Evaluation:
         data = json.loads(file.read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
             raise ValueError("it is no evaluation")
+        if data.get("checksum", _checksum(data)) != _checksum(data):  # older files have none
+            raise ValueError("its content is not what was written: the checksum differs")
         for name in ABOUT:
             data["about"][name]
         table = file.parent / PurePosixPath(data["table"]["file"]).name
@@ -101,7 +122,15 @@ def load(path: Location) -> Evaluation:
         found = Evaluation(data["about"], decode(table.read_bytes()))
         if found.digest != data["table"]["digest"]:
             raise ValueError(f"{table.name} is not the table that was written with it")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
         raise UnreadableFile(str(file), _said(error), ADVICE) from None
     return found
 

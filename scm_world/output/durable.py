@@ -9,23 +9,28 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from scm_world.errors import UnreadableFile, UnwritableFolder
-from scm_world.output.leases import leased
 from scm_world.output.locations import Location, located
-from scm_world.output.remote import Remote, draft_name, said
+from scm_world.output.remote import PARTIAL, Remote, draft_name, said
 
 
-def draft_of(path: Location) -> Location:
-    """Name the hidden file that becomes another one once it is whole.
+def is_draft(name: str, of: str = "") -> bool:
+    """Tell whether a file is hidden until it is whole; a process that was killed may leave one.
+
+    Args:
+        name: Of the file.
+        of: Name of the file that it would have become; any if empty.
 
     Example:
-        >>> draft_of(Path("study.json")).name
-        '.study.json.part'
+        >>> is_draft(draft_name("study.json"), "study.json"), is_draft("study.json")
+        (True, False)
     """
-    return path.with_name(draft_name(path.name))
+    return name.startswith(f".{of}") and name.endswith(PARTIAL)
 
 
 def write_durably(path: Location | str, data: bytes) -> None:
     """Write a file, whole or not at all; it is on the disk, or in the store, when this ends.
+
+    Of several writers at once the last one decides; a reader always finds a whole file.
 
     Raises:
         UnwritableFolder: There is no room, or no permission; what was there is still there.
@@ -47,7 +52,8 @@ def _put(target: Remote, data: bytes) -> None:
 def _write(target: Path, data: bytes) -> None:
     draft = target.with_name(draft_name(target.name))
     try:
-        with draft.open("wb") as stream:
+        handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+        with open(handle, "wb") as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
@@ -108,35 +114,30 @@ def synced(folder: Path) -> None:
 def locked(folder: Location | str) -> Iterator[None]:
     """Be the only one who writes to a folder, which is made if need be.
 
-    It ends with the process, however that ends; in an object store after a while, see ``leased``.
-    In one process, too, a second one is refused.
+    It ends with the process, however that ends. In one process, too, a second one is refused.
+    Object stores know no locks: there two writers may write, each file as a whole. What they
+    write in the folders of this package is the same, whoever writes it.
 
     Raises:
         UnreadableFile: Somebody else is writing to it.
         UnwritableFolder: There is no permission, or a file in its place.
     """
-    place = located(folder)
-    with leased(place) if isinstance(place, Remote) else _flocked(place):
+    path = located(folder)
+    if isinstance(path, Remote):
+        made(path)
         yield
-
-
-@contextmanager
-def _flocked(path: Path) -> Iterator[None]:
+        return
     try:
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDONLY)
     except OSError as error:
         raise UnwritableFolder(str(path), error.strerror or str(error)) from None
     try:
-        _hold(path, handle)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            reason = "another process is writing to it"
+            raise UnreadableFile(str(path), reason, "wait, or give another folder") from None
         yield
     finally:
         os.close(handle)
-
-
-def _hold(path: Path, handle: int) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        reason = "another process is writing to it"
-        raise UnreadableFile(str(path), reason, "wait, or give another folder") from None

@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from importlib import import_module
 from typing import Any, final
+from uuid import uuid4
 
 from scm_world.errors import MissingExtra, ScmWorldError, UnknownOption, UnreadableFile
 
@@ -182,17 +183,6 @@ class Remote:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
 
-    def create(self, data: bytes) -> None:
-        """Write a small file unless it is there already; the store decides between two of us.
-
-        Raises:
-            OSError: It could not be written, be it because it is there. Whether it is ours is
-                known by reading it.
-        """
-        self.parent.mkdir(parents=True, exist_ok=True)
-        with self._store() as (store, path):
-            store.pipe_file(path, data, mode="create")
-
     def unlink(self, missing_ok: bool = False) -> None:
         """Remove the file."""
         try:
@@ -220,13 +210,13 @@ class Remote:
 
 
 def draft_name(name: str) -> str:
-    """Give the hidden name of a file until it is whole.
+    """Return a hidden name for a file until it is whole; another one each time.
 
     Example:
-        >>> draft_name("study.json")
-        '.study.json.part'
+        >>> draft_name("study.json") == draft_name("study.json")
+        False
     """
-    return f".{name}{PARTIAL}"
+    return f".{name}.{uuid4().hex[:16]}{PARTIAL}"
 
 
 def said(error: OSError) -> str:

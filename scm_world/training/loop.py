@@ -20,7 +20,7 @@ from scm_world.evaluation.policies.weights import load_policy
 from scm_world.evaluation.setups import Place
 from scm_world.evaluation.zoo.shelf import PREFIX, path_of
 from scm_world.graph.exchange.libraries import load
-from scm_world.output.durable import draft_of, locked, made, write_whole
+from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.training.recipe import Recipe
@@ -283,7 +283,7 @@ def open_folder(
             old = there.get("versions", {}).get(name, one)
             if old != one:
                 tell(f"{name} was {old} and is {one} now: the last bits may be others")
-    elif strangers := sorted({*_names(folder)} - {draft_of(path).name}):
+    elif strangers := sorted(n for n in _names(folder) if not is_draft(n, path.name)):
         reason = f"it holds something else: {', '.join(strangers[:5])}"
         raise UnreadableFile(str(folder), reason, "give an empty folder, or a new one")
     write_whole(json.dumps({"format": form, **card}, indent=2, allow_nan=False), path)

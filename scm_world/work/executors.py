@@ -1,6 +1,6 @@
-"""One door to whatever does jobs: this process, processes of this machine, or a Ray cluster.
+"""Executors of independent jobs: this process, processes of this machine, or a Ray cluster.
 
-Whoever has a bag of jobs runs it on an ``Executor``. All of them keep the same promises:
+All of them keep the same promises:
 
 - Every result comes once, in the order in which they are ready, with the place of its job.
 - The results do not depend on the engine, or on the number of workers: jobs are independent, and
@@ -11,16 +11,17 @@ Whoever has a bag of jobs runs it on an ``Executor``. All of them keep the same 
 
 from __future__ import annotations
 
+import reprlib
 from abc import ABC, abstractmethod
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 from types import TracebackType
-from typing import Any, Self, TypeVar, final
+from typing import Any, Generic, Self, TypeVar, final
 
 from scm_world.errors import EngineFailure, UnknownOption
-from scm_world.work.jobs import Bag
-from scm_world.work.pool import Pool
-from scm_world.work.processes import PROCESS, pickled
+from scm_world.work.processes import PROCESS, Ended, Worker, pickled
 from scm_world.work.threads import cores, single_threaded
 
 Job = TypeVar("Job")
@@ -28,6 +29,76 @@ Result = TypeVar("Result")
 
 SERIAL, RAY = "serial", "ray"
 ENGINES = (SERIAL, PROCESS, RAY)
+
+
+TRIES = 3  # of a job whose process ends: it may have been killed for another one's sake
+SHOWN = 5  # failed jobs that an error lists
+
+
+@final
+class Bag(Generic[Job]):
+    """Jobs, and the places of those that wait.
+
+    A job that fails, or that takes its process with it again and again, is put aside. Those that
+    were put aside are told of when nothing else is left to do: no job is in another one's way.
+
+    Args:
+        jobs: All of them.
+        engine: What does them, for errors.
+    """
+
+    def __init__(self, jobs: Sequence[Job], engine: str) -> None:
+        self.jobs = jobs
+        self.waiting = deque(range(len(jobs)))
+        self._engine = engine
+        self._lost = Counter[int]()
+        self._aside: dict[int, Exception] = {}
+
+    def put_back(self, number: int, ended: Exception) -> None:
+        """Let a job whose process has ended wait once more, behind the others.
+
+        Args:
+            number: Of the job.
+            ended: What is known of the end; after the last try it is the fault of the job.
+        """
+        self._lost[number] += 1
+        if self._lost[number] < TRIES:
+            self.waiting.append(number)
+            return
+        said = f"{self.name(number)}, was tried {TRIES} times, and then {ended}"
+        self._aside[number] = EngineFailure(said, self._engine)
+
+    def put_aside(self, number: int, error: Exception) -> None:
+        """Remember that a job failed: as it gives the same every time, it is not tried again."""
+        error.add_note(f"in {self.name(number)}")
+        self._aside[number] = error
+
+    def name(self, number: int) -> str:
+        """Say which job it is.
+
+        Example:
+            >>> Bag(["wash", "dry"], "process").name(1)
+            "job 1, 'dry'"
+        """
+        return f"job {number}, {reprlib.repr(self.jobs[number])}"
+
+    def settle(self) -> None:
+        """Say what could not be done, once all the rest is.
+
+        Raises:
+            Exception: Of the first job that was put aside; the others are notes.
+        """
+        if not self._aside:
+            return
+        first, *others = sorted(self._aside)
+        error = self._aside[first]
+        for number in others[:SHOWN]:
+            other = self._aside[number]
+            error.add_note(f"so did {self.name(number)}: {type(other).__name__}: {other}")
+        if len(others) > SHOWN:
+            error.add_note(f"and {len(others) - SHOWN} more")
+        error.add_note(f"{len(self.jobs) - len(self._aside)} of {len(self.jobs)} jobs are done")
+        raise error
 
 
 class Executor(ABC):
@@ -156,19 +227,30 @@ def _nothing() -> None:
 class Processes(Executor):
     """Does jobs in processes of this machine; one that is killed is replaced.
 
+    Each process uses one thread. It is started when it is first needed.
+
     Args:
         workers: How many.
 
     Raises:
         UnknownOption: ``workers`` is no number from 1 on.
+
+    Example:
+        >>> from functools import partial
+        >>> with Processes(1) as executor:
+        ...     sorted(executor.run(partial(partial, pow, 2), [3, 10]))
+        [(0, 8), (1, 1024)]
     """
 
     engine = PROCESS
 
     def __init__(self, workers: int) -> None:
         self.workers = _counted(workers)
-        self._pool: Pool[Any, Any] | None = None
-        self._make = b""
+        self._made = b""
+        self._workers: tuple[Worker, ...] = ()
+        self._idle: list[Worker] = []
+        self._busy: dict[Any, tuple[Worker, int]] = {}
+        self._run: object = None
 
     @property
     def where(self) -> str:
@@ -183,19 +265,79 @@ class Processes(Executor):
         self, make: Callable[[], Callable[[Job], Result]], jobs: Sequence[Job]
     ) -> Iterator[tuple[int, Result]]:
         """Do jobs; see ``Executor.run``."""
-        key = pickled("make", make)
-        if self._pool is None or key != self._make:
-            if self._pool is not None and self._pool.is_busy:
-                raise EngineFailure("the processes are at work for something else", PROCESS)
+        made = pickled("make", make)
+        for number, job in enumerate(jobs):
+            pickled(f"job {number}", job)
+        return self._results(make, made, Bag(jobs, PROCESS))
+
+    def _results(
+        self, make: Callable[[], Any], made: bytes, bag: Bag[Any]
+    ) -> Iterator[tuple[int, Any]]:
+        if self._run is not None:
+            raise EngineFailure("it is at work; read all results of it first", PROCESS)
+        if made != self._made:
             self.close()
-            self._pool, self._make = Pool(make, self.workers), key
-        return self._pool.run(jobs)
+            self._workers = tuple(Worker(make) for _ in range(self.workers))
+            self._idle, self._made = list(self._workers), made
+        mine = self._run = object()
+        try:
+            self._hand_out(bag)
+            while self._busy:
+                for pipe in wait(list(self._busy)):
+                    answered = self._answer(pipe, bag)
+                    self._hand_out(bag)
+                    yield from answered
+                    if self._run is not mine:
+                        raise EngineFailure("it was closed before its work was done", PROCESS)
+        except BaseException:
+            if self._run is mine:
+                self.close()
+            raise
+        self._run = None
+        bag.settle()
+
+    def _answer(self, pipe: Any, bag: Bag[Any]) -> tuple[tuple[int, Any], ...]:
+        """Take a result; none if the job failed, or the process has ended."""
+        worker, number = self._busy.pop(pipe)
+        self._idle.append(worker)
+        try:
+            return ((number, worker.answer()),)
+        except Ended as ended:
+            _put_back(bag, number, ended)
+        except Exception as error:
+            if not worker.is_made:
+                raise  # it is the fault of no job: there is nothing that could do one
+            bag.put_aside(number, error)
+        return ()
+
+    def _hand_out(self, bag: Bag[Any]) -> None:
+        """Give jobs to those who have none."""
+        while bag.waiting and self._idle:
+            worker, number = self._idle.pop(), bag.waiting.popleft()
+            if worker.has_ended:
+                worker.stop()
+            try:
+                pipe = worker.begin("__call__", bag.jobs[number])
+            except Ended as ended:
+                self._idle.append(worker)
+                _put_back(bag, number, ended)
+            else:
+                self._busy[pipe] = (worker, number)
 
     def close(self) -> None:
-        """End the processes."""
-        if self._pool is not None:
-            self._pool.close()
-        self._pool = None
+        """End the processes at once, whatever they are doing."""
+        for worker in self._workers:
+            worker.stop()
+        self._idle = list(self._workers)
+        self._busy.clear()
+        self._run = None
+
+
+def _put_back(bag: Bag[Any], number: int, ended: Ended) -> None:
+    """Let a job wait once more, unless no process could do it."""
+    if ended.cannot_begin:
+        raise EngineFailure(str(ended), PROCESS)
+    bag.put_back(number, ended)
 
 
 def engine_of(

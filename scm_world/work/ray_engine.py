@@ -17,8 +17,7 @@ from tempfile import gettempdir
 from typing import Any, TypeVar, final
 
 from scm_world.errors import EngineFailure, MissingExtra, UnknownOption
-from scm_world.work.executors import RAY, Executor
-from scm_world.work.jobs import Bag
+from scm_world.work.executors import RAY, Bag, Executor
 from scm_world.work.processes import DONE, UNMADE
 from scm_world.work.ray_worker import Luggage, answer, versions
 

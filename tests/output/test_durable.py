@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing
 from pathlib import Path
 
 import pytest
@@ -53,3 +54,40 @@ def test_every_text_can_be_written(tmp_path: Path) -> None:
     """Also one with half a letter."""
     write_whole("a\ud800→\n", tmp_path / "text")
     assert (tmp_path / "text").read_bytes() == "a\\ud800→\n".encode()
+
+
+def _write_often(path: Path, letter: str) -> None:
+    for _ in range(200):
+        write_durably(path, letter.encode() * 100_000)
+
+
+def test_two_writers_leave_whole_files(tmp_path: Path) -> None:
+    """Whoever reads meanwhile finds what one of them wrote, and no write fails."""
+    path = tmp_path / "results"
+    write_durably(path, b"a" * 100_000)
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_write_often, args=(path, letter)) for letter in "ab"]
+    for writer in writers:
+        writer.start()
+    reads = 0
+    while any(writer.is_alive() for writer in writers):
+        data = path.read_bytes()
+        assert len(data) == 100_000
+        assert len(set(data)) == 1
+        reads += 1
+    assert reads > 10
+    assert [writer.exitcode for writer in writers] == [0, 0]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_in_the_place_of_a_draft_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it points to stays as it is."""
+    victim, draft = tmp_path / "victim", tmp_path / ".file.part"
+    victim.write_text("mine")
+    draft.symlink_to(victim)
+    monkeypatch.setattr(durable, "draft_name", lambda name: draft.name)
+    with pytest.raises(UnwritableFolder, match="file"):
+        write_durably(tmp_path / "file", b"theirs")
+    assert victim.read_text() == "mine"

@@ -20,8 +20,7 @@ from scm_world.discovery.data import Design, collect, sweep
 from scm_world.errors import ActionError, EngineFailure, UnknownOption
 from scm_world.evaluation import evaluate
 from scm_world.queries import World
-from scm_world.work.executors import Executor, Serial, engine_of
-from scm_world.work.jobs import TRIES
+from scm_world.work.executors import TRIES, Executor, Serial, engine_of
 
 pytest.importorskip("ray")
 

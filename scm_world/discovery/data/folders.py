@@ -14,7 +14,7 @@ from scm_world.discovery.data.shards import Place, check_kind, check_names, deco
 from scm_world.discovery.data.sources import FORMAT, Part
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
-from scm_world.output.durable import draft_of, locked, removed, write_durably
+from scm_world.output.durable import is_draft, locked, removed, write_durably
 from scm_world.output.locations import Location, located
 from scm_world.output.remote import PARTIAL, said
 from scm_world.world.start import whole_number
@@ -160,8 +160,8 @@ class Folder:
 
     def _begin(self) -> None:
         sidecar = self.path / SIDECAR
-        for stale in self.path.glob(f".*.*{PARTIAL}"):  # of a process that was killed
-            if stale.name.startswith(".shard-") or stale == draft_of(sidecar):
+        for stale in self.path.glob(f".*{PARTIAL}"):  # of a process that was killed
+            if is_draft(stale.name, "shard-") or is_draft(stale.name, SIDECAR):
                 removed(stale)
         if sidecar.exists():
             self._check_same(read_sidecar(self.path))

@@ -17,8 +17,7 @@ import pytest
 from work_samples import Task, make, no_bench
 
 from scm_world.errors import ActionError, EngineFailure, UnknownOption
-from scm_world.work.jobs import TRIES
-from scm_world.work.pool import Pool
+from scm_world.work.executors import TRIES, Processes
 
 
 def wait_for(what: Callable[[], Any], seconds: float = 60.0) -> None:
@@ -53,33 +52,34 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="ne
 
 
 @pytest.fixture(scope="module")
-def pool() -> Iterator[Pool[Task, Any]]:
+def pool() -> Iterator[Processes]:
     """Two processes for all that does not end them."""
-    with Pool(make, 2) as made:
+    with Processes(2) as made:
         yield made
 
 
 # --- results --------------------------------------------------------------------------------------
 
 
-def test_the_order_of_jobs_does_not_matter(pool: Pool[Task, Any]) -> None:
+def test_the_order_of_jobs_does_not_matter(pool: Processes) -> None:
     """Each result belongs to its job, each comes once, and there may be more jobs than workers."""
     jobs = [Task(number) for number in range(40)]
     for given in (jobs, jobs[::-1]):
-        found = sorted(pool.run(given))
+        found = sorted(pool.run(make, given))
         assert found == [(place, job.number**2) for place, job in enumerate(given)]
 
 
-def test_no_job_is_no_result(pool: Pool[Task, Any]) -> None:
+def test_no_job_is_no_result(pool: Processes) -> None:
     """And no process."""
-    assert list(pool.run([])) == []
+    assert list(pool.run(make, [])) == []
 
 
 def test_each_worker_is_made_once(tmp_path: Path) -> None:
     """However many jobs and runs there are."""
-    with Pool(partial(make, tmp_path), 2) as pool:
+    maker = partial(make, tmp_path)
+    with Processes(2) as pool:
         for _ in range(2):
-            assert len(list(pool.run([Task(number) for number in range(12)]))) == 12
+            assert len(list(pool.run(maker, [Task(number) for number in range(12)]))) == 12
     made = [int(path.name.split("-")[1]) for path in tmp_path.iterdir()]
     assert len(made) == len(set(made)) == 2
     assert os.getpid() not in made
@@ -92,7 +92,7 @@ def test_a_killed_worker_is_replaced(tmp_path: Path) -> None:
     """Its job is done by another one, and is in the results once; no other is done twice."""
     jobs = [Task(number, folder=tmp_path) for number in range(8)]
     jobs[3] = Task(3, "sleep once", tmp_path)
-    with Pool(make, 2) as pool:
+    with Processes(2) as pool:
 
         def kill() -> None:
             wait_for(lambda: tries(tmp_path).get(3))
@@ -101,7 +101,7 @@ def test_a_killed_worker_is_replaced(tmp_path: Path) -> None:
 
         killer = threading.Thread(target=kill)
         killer.start()
-        found = sorted(pool.run(jobs))
+        found = sorted(pool.run(make, jobs))
         killer.join()
     assert found == [(number, number**2) for number in range(8)]
     assert tries(tmp_path) == {number: 1 + (number == 3) for number in range(8)}
@@ -109,12 +109,12 @@ def test_a_killed_worker_is_replaced(tmp_path: Path) -> None:
 
 def test_a_worker_that_was_killed_at_rest_is_replaced(tmp_path: Path) -> None:
     """The next jobs are done at the first try."""
-    with Pool(make, 1) as pool:
-        list(pool.run([Task(0, folder=tmp_path)]))
+    with Processes(1) as pool:
+        list(pool.run(make, [Task(0, folder=tmp_path)]))
         (pid,) = pids(tmp_path)
         os.kill(pid, signal.SIGKILL)
         wait_for(lambda: pool._workers[0].has_ended)
-        assert list(pool.run([Task(1, folder=tmp_path)])) == [(0, 1)]
+        assert list(pool.run(make, [Task(1, folder=tmp_path)])) == [(0, 1)]
     assert tries(tmp_path) == {0: 1, 1: 1}
 
 
@@ -122,12 +122,12 @@ def test_a_job_that_always_kills_is_put_aside(tmp_path: Path) -> None:
     """After three tries, and the others are done; the error has its number and what it is."""
     jobs = [Task(0, "die", tmp_path), *(Task(number) for number in range(1, 9))]
     found: dict[int, int] = {}
-    with Pool(make, 2) as pool:
+    with Processes(2) as pool:
         with pytest.raises(EngineFailure) as caught:
-            found.update(pool.run(jobs[:1]))
+            found.update(pool.run(make, jobs[:1]))
         with pytest.raises(EngineFailure, match="job 0"):
-            found.update(pool.run(jobs))
-        assert list(pool.run([Task(3)])) == [(0, 9)]
+            found.update(pool.run(make, jobs))
+        assert list(pool.run(make, [Task(3)])) == [(0, 9)]
     said = str(caught.value)
     assert said.startswith("job 0, Task(")
     assert said.endswith("was tried 3 times, and then its process ended with exit code -9")
@@ -142,10 +142,10 @@ def test_an_error_of_a_job_waits_for_the_others() -> None:
     """With class and attributes and the name of the job, when all that can be done is done."""
     jobs = [Task(7, "refuse"), Task(1), Task(8, "refuse"), Task(2)]
     found: dict[int, int] = {}
-    with Pool(make, 2) as pool:
+    with Processes(2) as pool:
         with pytest.raises(ActionError, match="no 7") as caught:
-            found.update(pool.run(jobs))
-        assert list(pool.run([Task(3)])) == [(0, 9)]
+            found.update(pool.run(make, jobs))
+        assert list(pool.run(make, [Task(3)])) == [(0, 9)]
     assert found == {1: 1, 3: 4}
     assert caught.value.action == 7
     first, second, last = caught.value.__notes__
@@ -158,19 +158,19 @@ def test_an_error_of_a_job_waits_for_the_others() -> None:
 def test_an_error_of_make_ends_it_at_once(tmp_path: Path) -> None:
     """As it is: nothing can do any job."""
     made: Any = no_bench
-    with Pool(made, 1) as pool, pytest.raises(ActionError, match="there is no room") as caught:
-        list(pool.run([Task(number, folder=tmp_path) for number in range(9)]))
+    with Processes(1) as pool, pytest.raises(ActionError, match="there is no room") as caught:
+        list(pool.run(made, [Task(number, folder=tmp_path) for number in range(9)]))
     assert not hasattr(caught.value, "__notes__")
 
 
 def test_what_cannot_be_sent_is_refused_before_anything_starts(tmp_path: Path) -> None:
     """What makes workers at once, a job before any is begun."""
     with pytest.raises(UnknownOption, match="make cannot be <function"):
-        Pool(lambda: len, 2)
-    with Pool(make, 2) as pool:
+        Processes(2).run(lambda: len, [])
+    with Processes(2) as pool:
         jobs: list[Any] = [Task(0, folder=tmp_path), lambda: 0]
         with pytest.raises(UnknownOption, match=r"job 1 cannot be .* a function or class of"):
-            pool.run(jobs)
+            pool.run(make, jobs)
         assert not any(worker._process for worker in pool._workers)
     assert not list(tmp_path.iterdir())
 
@@ -179,7 +179,7 @@ def test_what_cannot_be_sent_is_refused_before_anything_starts(tmp_path: Path) -
 def test_workers_are_counted(workers: Any) -> None:
     """None are too few."""
     with pytest.raises(UnknownOption, match="workers"):
-        Pool(make, workers)
+        Processes(workers)
 
 
 # --- ended ----------------------------------------------------------------------------------------
@@ -188,27 +188,27 @@ def test_workers_are_counted(workers: Any) -> None:
 def test_results_are_read_one_run_after_another(tmp_path: Path) -> None:
     """A second run is refused while the first goes on; one that was closed does not just end."""
     jobs = [Task(number, folder=tmp_path) for number in range(4)]
-    with Pool(make, 1) as pool:
-        first = pool.run(jobs)
+    with Processes(1) as pool:
+        first = pool.run(make, jobs)
         assert next(first) == (0, 0)
         with pytest.raises(EngineFailure, match="at work"):
-            next(pool.run(jobs))
+            next(pool.run(make, jobs))
         pool.close()
         with pytest.raises(EngineFailure, match="was closed"):
             next(first)
-        assert len(list(pool.run(jobs))) == 4
+        assert len(list(pool.run(make, jobs))) == 4
 
 
 @needs_proc
 def test_who_stops_reading_ends_the_processes(tmp_path: Path) -> None:
     """Those that are at work as well; so does the end of the block."""
-    with Pool(make, 2) as pool:
-        for found in pool.run([Task(0), Task(1, "sleep", tmp_path)]):
+    with Processes(2) as pool:
+        for found in pool.run(make, [Task(0), Task(1, "sleep", tmp_path)]):
             assert found == (0, 0)
             wait_for(lambda: pids(tmp_path))
             break
         wait_for(lambda: not any(map(is_alive, pids(tmp_path))))
-        list(pool.run([Task(2, folder=tmp_path)]))
+        list(pool.run(make, [Task(2, folder=tmp_path)]))
     assert len(pids(tmp_path)) == 2
     assert not any(map(is_alive, pids(tmp_path)))
 
@@ -216,11 +216,11 @@ def test_who_stops_reading_ends_the_processes(tmp_path: Path) -> None:
 SCRIPT = """
 import sys
 from pathlib import Path
-from scm_world.work.pool import Pool
+from scm_world.work.executors import Processes
 from work_samples import Task, make
 if __name__ == "__main__":
-    with Pool(make, 2) as pool:
-        list(pool.run([Task(number, "sleep", Path(sys.argv[1])) for number in range(4)]))
+    with Processes(2) as pool:
+        list(pool.run(make, [Task(number, "sleep", Path(sys.argv[1])) for number in range(4)]))
 """
 
 
