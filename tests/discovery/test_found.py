@@ -14,17 +14,11 @@ from numpy.typing import NDArray
 
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.learners import Found, Learner, learn, learner, learners, register
-from scm_world.discovery.learners.statistics import (
-    chi_square_tail,
-    discoveries,
-    normal_scores,
-    regression_tail,
-)
+from scm_world.discovery.learners.order import normal_scores, regression_tail
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 NAMES = ("x", "y", "z")
 TABLE = Dataset.of(np.arange(12.0).reshape(4, 3), NAMES)
-Shares = st.lists(st.floats(0.0, 1.0), max_size=40).map(np.array)
 
 
 def chain() -> Found:
@@ -163,16 +157,6 @@ def test_an_edge_into_the_past_is_turned() -> None:
 # --- statistics -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("m", range(1, 11))
-def test_the_tail_of_chi_square(m: int) -> None:
-    """It agrees with scipy from the middle far into the tail."""
-    stats = pytest.importorskip("scipy.stats")
-    for x in (1e-9, 0.1, 1.0, m, 10.0, 50.0, 300.0, 1200.0):
-        assert chi_square_tail(x, m) == pytest.approx(stats.chi2.sf(x, m), rel=1e-9, abs=1e-300)
-    assert chi_square_tail(0.0, m) == chi_square_tail(-1.0, m) == 1.0
-    assert chi_square_tail(1e6, m) == 0.0
-
-
 @pytest.mark.parametrize("m", [1, 2, 3, 6])
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0, 4.0])
 def test_the_tail_of_a_regression_is_nearly_that_of_f(m: int, ratio: float) -> None:
@@ -188,43 +172,6 @@ def test_a_regression_without_rows_tells_nothing() -> None:
     assert regression_tail(1.0, 0.0, 1, 0.0) == 1.0
     assert regression_tail(0.0, 1.0, 1, 10.0) == 1.0
     assert regression_tail(1.0, 0.0, 1, 10.0) < 1e-100
-
-
-@given(p=Shares, q=st.floats(0.01, 0.9), dependent=st.booleans())
-def test_discoveries_are_the_smallest(p: NDArray[np.float64], q: float, dependent: bool) -> None:
-    """All rejected ones are below all others; at most q of p counts as found by chance."""
-    chosen = discoveries(p, q, dependent=dependent)
-    assert chosen.shape == p.shape
-    if chosen.any():
-        assert p[chosen].max() <= q
-        assert not chosen.all() or p.max() <= q
-        if not chosen.all():
-            assert p[chosen].max() < p[~chosen].min()
-    assert not (chosen & ~discoveries(p, min(1.5 * q, 1.0), dependent=dependent)).any()
-    assert not (discoveries(p, q) & ~discoveries(p, q, dependent=False)).any()
-    np.testing.assert_array_equal(discoveries(p[::-1], q, dependent=dependent), chosen[::-1])
-
-
-@given(p=Shares.filter(len), q=st.floats(0.01, 0.5))
-def test_discoveries_are_those_of_scipy(p: NDArray[np.float64], q: float) -> None:
-    """Adjusted probabilities up to q are those that are rejected."""
-    stats = pytest.importorskip("scipy.stats")
-    for dependent, method in ((True, "by"), (False, "bh")):
-        adjusted = stats.false_discovery_control(p, method=method)
-        clear = np.abs(adjusted - q) > 1e-9
-        chosen = discoveries(p, q, dependent=dependent)
-        np.testing.assert_array_equal(chosen[clear], (adjusted <= q)[clear])
-
-
-def test_the_share_of_false_discoveries_is_bounded() -> None:
-    """Of 50 true hypotheses beside 50 false ones, at most a tenth of what is rejected is true."""
-    rng = np.random.default_rng(0)
-    shares = []
-    for _ in range(200):
-        p = np.concatenate([rng.random(50), 1e-3 * rng.random(50)])
-        chosen = discoveries(p, 0.1, dependent=False)
-        shares.append(chosen[:50].sum() / max(chosen.sum(), 1))
-    assert 0.01 < np.mean(shares) <= 0.06  # half of the hypotheses are true: 0.05
 
 
 @given(st.lists(st.integers(-5, 5), min_size=1, max_size=60).map(np.array))

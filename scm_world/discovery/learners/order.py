@@ -23,20 +23,17 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
+from scipy.special import chdtrc, ndtri
+from scipy.stats import false_discovery_control, rankdata
 
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools, Dataset
 from scm_world.discovery.learners.causal_order import EXACT, RIDGE, SPARE, Ints, Rows, before_each
 from scm_world.discovery.learners.found import Found
-from scm_world.discovery.learners.statistics import (
-    SMALLEST,
-    discoveries,
-    normal_scores,
-    regression_tail,
-)
 from scm_world.errors import ModelError, UnknownOption
 
 POWERS = (1, 2, 3, 4)
+SMALLEST = 1e-300  # where probabilities are cut off, so that their logarithm is a number
 SOME = 2000  # rows on which it is looked whether effects add up
 CURVED = 1e-4  # how improbable it has to be that they do
 
@@ -94,7 +91,7 @@ def do_order(
     p_values[~np.array([told[where].any(axis=0) for where in rows.blocks])] = 2.0
     tested = p_values <= 1.0
     chosen = np.zeros(p_values.shape, bool)
-    chosen[tested] = discoveries(p_values[tested], q)
+    chosen[tested] = false_discovery_control(p_values[tested], method="by") <= q
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = _columns(rows, chosen), _columns(rows, weight)
     notes = (*_notes(data, rows, causes, told), *_bent(rows, matrix, form))
@@ -288,3 +285,38 @@ def _notes(data: Dataset, rows: Rows, causes: Bools, told: Bools) -> tuple[str, 
     if watched:
         found.append(f"{watched} columns were never intervened on: they can be effects only")
     return tuple(found)
+
+
+def regression_tail(explained: float, left: float, m: int, free: float) -> float:
+    """Return the probability that some terms of a regression explain so much by chance.
+
+    Args:
+        explained: Sum of squares that m terms explain.
+        left: Sum of squares of the residuals, with these terms.
+        m: How many terms.
+        free: Residual degrees of freedom.
+
+    Source:
+        Bartlett, *Further aspects of the theory of multiple regression*, 1938, for one response.
+
+    Example:
+        >>> round(regression_tail(4.0, 30.0, 1, 30.0), 3)  # t = 2 with 30 degrees of freedom
+        0.055
+    """
+    if explained <= 0.0 or free <= 0.0:
+        return 1.0
+    statistic = (free + 0.5 * m - 1.0) * math.log1p(explained / max(left, SMALLEST))
+    return float(chdtrc(m, statistic)) if statistic > 0.0 else 1.0
+
+
+def normal_scores(values: Floats) -> Floats:
+    """Return the normal quantiles of the ranks of numbers, shape (n,); equal ones share a rank.
+
+    Source:
+        Blom, *Statistical Estimates and Transformed Beta-Variables*, 1958, for the ranks.
+
+    Example:
+        >>> [round(float(x), 2) for x in normal_scores(np.array([3.0, 100.0, 1.0]))]
+        [0.0, 0.87, -0.87]
+    """
+    return np.asarray(ndtri((rankdata(values) - 0.375) / (len(values) + 0.25)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from scm_world._types import Floats
 
@@ -34,9 +35,7 @@ def auroc(sureness: Floats, present: Bools) -> float | None:
     negatives = len(present) - positives
     if not positives or not negatives:
         return None
-    _, at, counts = np.unique(sureness, return_inverse=True, return_counts=True)
-    rank = (np.cumsum(counts) - (counts - 1) / 2.0)[at]  # ties share the mean of their ranks
-    above = rank[present].sum() - positives * (positives + 1) / 2.0
+    above = rankdata(sureness)[present].sum() - positives * (positives + 1) / 2.0
     return float(above / (positives * negatives))
 
 
