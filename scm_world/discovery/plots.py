@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DECLARED, MATCHED, EXTRA, MISSING = "#4a5568", "#1f6fb4", "#f28e2b", "#d62728"
-AT_ONCE, LAGGED = "#5f6b7a", "#9a6fb0"
+LAG_0, LAG_1 = "#5f6b7a", "#9a6fb0"
 MARKERS = {0: "o", 1: ">"}
 HUB = "one control step"
 BOX, GAP, LANE = 30.0, 8.0, 22.0  # [pixels]: height of a node, between two, of an edge that passes
@@ -40,7 +40,7 @@ BOX, GAP, LANE = 30.0, 8.0, 22.0  # [pixels]: height of a node, between two, of 
 def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
     """Draw the declared and the estimated graph side by side, as matrices.
 
-    A column is a cause, a row an effect. A dot is an edge within the instant, a triangle one
+    A column is a cause, a row an effect. A dot is a contemporaneous edge, a triangle one
     from one control step to the next; it is hollow where not every member of a family of variables
     is declared to affect every member of the other. Variables with no edge in either graph are
     left out.
@@ -64,7 +64,7 @@ def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
     for ax in axes:
         _grid(ax, causes, effects)
     axes[0].set_title(f"DECLARED: {len(declared)} edges", fontsize=13, color=INK, loc="left", pad=6)
-    axes[1].set_title(f"FOUND: {len(found)} edges", fontsize=13, color=INK, loc="left", pad=6)
+    axes[1].set_title(f"ESTIMATED: {len(found)} edges", fontsize=13, color=INK, loc="left", pad=6)
     axes[0].set_ylabel("effect", fontsize=11, color=INK)
     for (cause, effect, lag), edges in cells.items():
         both = (cause, effect, 1 - lag) in cells  # two lags of one pair stand side by side
@@ -100,12 +100,12 @@ def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
     figure.text(0.012, 0.955, f"{report.task} on {engine}", **title)
     figure.text(0.012, 0.918, numbers, fontsize=12, color=INK)
     handles = [
-        _key("o", "at once", DECLARED),
+        _key("o", "contemporaneous", DECLARED),
         _key(">", "one control step later", DECLARED),
         _key("o", "each its own", DECLARED, hollow=True),
-        _key("o", "found and declared", MATCHED),
-        _key("s", "found, not declared", EXTRA, size=11),
-        _key("X", "declared, not found", MISSING, hollow=True),
+        _key("o", "declared and estimated", MATCHED),
+        _key("s", "estimated, not declared", EXTRA, size=11),
+        _key("X", "declared, not estimated", MISSING, hollow=True),
     ]
     corner: Any = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
     figure.legend(handles=handles, ncol=2, frameon=False, fontsize=10, **corner)
@@ -287,7 +287,7 @@ def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
             line += [(x0 + bend, y0), (x1 - bend, y1), (x1, y1)]
             codes += [Line.CURVE4] * 3
         style: Any = {"arrowstyle": "<|-|>" if both else "-|>", "mutation_scale": 9, "lw": 1.1}
-        style |= {"color": LAGGED if lag else AT_ONCE, "ls": (0, (4, 2.5)) if lag else "solid"}
+        style |= {"color": LAG_1 if lag else LAG_0, "ls": (0, (4, 2.5)) if lag else "solid"}
         ax.add_patch(FancyArrowPatch(path=Line(line, codes), shrinkA=0, shrinkB=0, **style))
     width, high = drawing.box
     for name, (x, y) in drawing.places.items():
@@ -303,7 +303,7 @@ def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
         ax.text(x, y, text, fontsize=size, color=ink, **place)
         if name in drawing.loops:
             style = {"connectionstyle": "arc3,rad=-1.3", "arrowstyle": "-|>", "mutation_scale": 8}
-            style |= {"color": LAGGED, "ls": (0, (3, 2)), "shrinkA": 0, "shrinkB": 0, "zorder": 2}
+            style |= {"color": LAG_1, "ls": (0, (3, 2)), "shrinkA": 0, "shrinkB": 0, "zorder": 2}
             ends = ((x - 16, y - high / 2), (x + 16, y - high / 2))
             ax.add_patch(FancyArrowPatch(*ends, **style))
     ax.text(20, 34 - top, title or "causal model", fontsize=17, weight="bold", color=INK)
@@ -322,8 +322,8 @@ def _legend(ax: Axes, kinds: set[str]) -> None:
     handles: list[Any] = [
         Patch(fc=fill, ec="#6b7686", label=kind) for kind, fill in FILLS.items() if kind in kinds
     ]
-    handles.append(Line2D([], [], color=AT_ONCE, label="at once"))
-    handles.append(Line2D([], [], color=LAGGED, ls="--", label="one control step later"))
+    handles.append(Line2D([], [], color=LAG_0, label="contemporaneous"))
+    handles.append(Line2D([], [], color=LAG_1, ls="--", label="one control step later"))
     if "hub" in kinds:
         label = "each arrow in stands for one to every node it points at"
         handles.append(Patch(fc=INK, label=label))

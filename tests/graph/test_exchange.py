@@ -464,4 +464,4 @@ def test_a_title_says_what_is_known() -> None:
         "B: 0.045 to 0.1",
         "Mass; the inertia of the solid follows from it.",
     ]
-    assert "causes at once: " in page
+    assert "causes at the same step: " in page

@@ -196,7 +196,9 @@ def describe(graph: CausalGraph, node: Node) -> str:
     lines = [node.name, " · ".join(dict.fromkeys(filter(None, (node.kind, node.role))))]
     lines += [word + text for fact, word in FACTS.items() if (text := getattr(node, fact))]
     for lag in sorted({edge.lag for edge in graph.parents(node.name)}):
-        when = {0: "at once", 1: "one control step ago"}.get(lag, f"{lag} control steps ago")
+        when = {0: "at the same step", 1: "one control step ago"}.get(
+            lag, f"{lag} control steps ago"
+        )
         lines.append(f"causes {when}: {_causes(graph.parents(node.name), lag)}")
     return "\n".join(filter(None, lines))
 
