@@ -103,7 +103,7 @@ def draw(path: Path) -> None:
     world = World("pushing")
     acts, n = PAIRS["floor_friction 0.6 → 0.4"], 400
     columns = [
-        world.sample(do, n, first=first, outcomes=[slid], nature=SLIDING, steps=15, policy=None)[
+        world.sample(n, do, first=first, outcomes=[slid], nature=SLIDING, steps=15, policy=None)[
             "slid"
         ]
         for do, first in ((acts[0], 0), (acts[1], 0), (acts[1], n))

@@ -57,9 +57,8 @@ def graph() -> dict[str, float]:
         )
     model = sw.SCM(variables)
     return {
-        "samples per second, 20 nodes": 2e11 / median(lambda: model.sample(200_000, seed=0), 1),
-        "the same under do": 2e11
-        / median(lambda: model.do({"x5": 2.0}).sample(200_000, seed=0), 1),
+        "samples per second, 20 nodes": 2e11 / median(lambda: model.draw(200_000, seed=0), 1),
+        "the same under do": 2e11 / median(lambda: model.do({"x5": 2.0}).draw(200_000, seed=0), 1),
         "SCM.do [µs]": median(lambda: model.do({"x5": 2.0})),
     }
 

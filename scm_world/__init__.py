@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from scm_world.env import DeltaAction, MovingAverageAction, ObjectSelector, ScmWorldEnv
     from scm_world.errors import ScmWorldError
     from scm_world.geometry import load_hull
-    from scm_world.graph import SCM
     from scm_world.queries import (
+        SCM,
         At,
         Clamp,
         Contact,
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
         Reaches,
         World,
         do,
-        verify,
     )
+    from scm_world.queries.verify import verify
     from scm_world.tasks import ModelTask, StepTask, Task, TriFingerTask, make_task
     from scm_world.variables import (
         Action,
@@ -54,7 +54,6 @@ _HOMES = {
     "DeltaAction": "env",
     "MovingAverageAction": "env",
     "ObjectSelector": "env",
-    "SCM": "graph",
     "ScmWorldEnv": "env",
     "ScmWorldError": "errors",
     "ModelTask": "tasks",
@@ -85,6 +84,7 @@ _HOMES = {
     ),
     **dict.fromkeys(
         (
+            "SCM",
             "At",
             "Clamp",
             "Contact",

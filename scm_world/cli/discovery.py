@@ -18,12 +18,12 @@ from scm_world.cli.console import (
     table,
     written,
 )
-from scm_world.cli.tasks import build, suffix, tag
+from scm_world.cli.tasks import suffix, system, tag
 from scm_world.discovery import DiscoveryReport, discover
 from scm_world.discovery.names import by_entity
 from scm_world.discovery.plots import draw_graphs
 from scm_world.output.locations import Location
-from scm_world.world import World
+from scm_world.queries import SCM, World
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,24 +65,20 @@ def run(options: Options, *, out: Location | None, strict: bool) -> int:
     about += f"-{options.resolution}" if options.resolution else ""
     folder = out or RESULTS / f"discover-{tag(options.task)}-{about}"
     check_writable(folder, folder=True)
-    task = build(options.task, options.arguments)
-    world = World(
-        task, backend=options.backend, preset=options.preset, resolution=options.resolution
-    )
-    try:
-        with shown_progress(options.probes) as progress:
-            report = discover(
-                world,
-                probes=options.probes,
-                seed=options.seed,
-                progress=progress,
-                checkpoint=folder / PROGRESS,
-            )
-    finally:
-        world.close()
+    task = system(options.task, options.arguments)
+    made = {"backend": options.backend, "preset": options.preset, "resolution": options.resolution}
+    asked = task if isinstance(task, SCM) else World(task, **made)  # type: ignore[arg-type]
+    with asked, shown_progress(options.probes) as progress:
+        report = discover(
+            asked,
+            probes=options.probes,
+            seed=options.seed,
+            progress=progress,
+            checkpoint=folder / PROGRESS,
+        )
     report = replace(report, arguments=options.arguments)
     terminal = console()
-    _print(terminal, report, tuple(world.model))
+    _print(terminal, report, tuple(asked.graph))
     with staged(folder) as draft:
         report.save(draft / "report.json")
         draw_graphs(report, draft / "graphs.png")

@@ -14,10 +14,11 @@ import numpy as np
 
 from scm_world.cli.assignments import parse_assignments
 from scm_world.cli.console import RESULTS, check_writable, console, show, staged, table, written
-from scm_world.cli.tasks import build, suffix, tag
+from scm_world.cli.tasks import build, suffix, system, tag
 from scm_world.errors import UnknownOption
 from scm_world.output.locations import Location
 from scm_world.queries import (
+    SCM,
     Difference,
     Effect,
     Episode,
@@ -58,6 +59,13 @@ class Circumstances:
     def world(self) -> World:
         """Make the world."""
         task = build(self.task, self.arguments)
+        return World(task, backend=self.backend, preset=self.preset)
+
+    def system(self) -> World | SCM:
+        """Make the world, or the causal model without a backend."""
+        task = system(self.task, self.arguments)
+        if isinstance(task, SCM):
+            return task
         return World(task, backend=self.backend, preset=self.preset)
 
     def __post_init__(self) -> None:
@@ -103,26 +111,23 @@ def ask_effect(
     folder = out or where.folder("effect")
     check_writable(folder, folder=True)
     do, other, varies = (parse_assignments(texts) for texts in (assignments, versus, nature))
-    world = where.world()
-    try:
-        with shown_episodes() as progress:
-            effect = world.effect(
-                outcome,
-                do=do,
-                versus=other,
-                n=n,
-                paired=paired,
-                progress=progress,
-                nature=varies,
-                steps=where.steps,
-                seed=where.seed,
-                policy=where.acts,
-            )
-        engine = world.backend.name
-    finally:
-        world.close()
+    with where.system() as system, shown_episodes() as progress:
+        is_static = isinstance(system, SCM) and not system.is_temporal
+        effect = system.effect(
+            outcome,
+            do=do,
+            versus=other,
+            n=n,
+            paired=paired,
+            progress=progress,
+            nature=varies,
+            steps=0 if is_static else where.steps,
+            seed=where.seed,
+            policy=where.acts,
+        )
     terminal = console()
-    terminal.print(_effect_table(effect, f"{tag(where.task)} on {engine}, seed {where.seed}"))
+    about = f"{tag(where.task)} on {effect.engine}, seed {where.seed}"
+    terminal.print(_effect_table(effect, about))
     with staged(folder) as draft:
         (draft / "effect.json").write_text(effect.to_json() + "\n")
     written(terminal, folder / "effect.json")

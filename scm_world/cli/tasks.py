@@ -12,7 +12,10 @@ import typer
 
 from scm_world.cli.assignments import parse_assignments
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
+from scm_world.graph import scm as graph
+from scm_world.queries import SCM
 from scm_world.tasks import TASKS, Task, make_task
+from scm_world.tasks.factories import load_factory
 from scm_world.tasks.model import FILES
 
 _HINT = "'--option'"
@@ -50,10 +53,20 @@ def build(name: str, arguments: Sequence[str] = ()) -> Task:
         raise typer.BadParameter(f"{', '.join(arguments)}: {error}", param_hint=_HINT) from None
 
 
+<<<<<<< HEAD
 def backend_of(backend: str | None, name: str, arguments: Sequence[str] | None) -> str:
     """Give the backend that was asked for, or that of a task."""
     own = ":" in name and name not in TASKS
     return backend or (build(name, arguments or ()).backend if own else Task.backend)
+=======
+def system(name: str, arguments: Sequence[str] = ()) -> Task | SCM:
+    """Create a task, or the causal model that ``module:function`` gives; see ``build``."""
+    if ":" in name:
+        made = load_factory(name)(**parse_assignments(arguments, _HINT))
+        if isinstance(made, graph.SCM):
+            return SCM(made)
+    return build(name, arguments)
+>>>>>>> bf07801 (An SCM answers the questions of a World, with the same types)
 
 
 def tag(name: str) -> str:

@@ -11,9 +11,10 @@ from rich.text import Text
 
 from scm_world.cli.console import RESULTS, check_writable, console, staged, table, written
 from scm_world.cli.discovery import INTERRUPTED, shown_progress
-from scm_world.cli.tasks import build, suffix, tag
+from scm_world.cli.tasks import suffix, system, tag
 from scm_world.discovery.coverage import draw_verification
 from scm_world.output.locations import Location
+from scm_world.queries import SCM
 from scm_world.queries.agreement import Agreement
 from scm_world.queries.verification import Row, Verification
 from scm_world.queries.verify import LEAST, verify, verify_engines
@@ -92,13 +93,16 @@ def run(options: Options, *, out: Location | None) -> int:
 
 
 def _verified(task: str, arguments: tuple[str, ...], options: Options) -> Found:
-    made, about = build(task, arguments), {"arguments": arguments}
+    made, about = system(task, arguments), {"arguments": arguments}
     common: dict[str, Any] = {
         "probes": options.probes,
         "least": min(LEAST, options.probes),
         "seed": options.seed,
     }
     with _bars(options.probes) as bar:
+        if isinstance(made, SCM):
+            found = verify(made, progress=bar(f"{tag(task)}"), **common)
+            return found.model_copy(update=about)
         if not options.both:
             found = verify(
                 made,

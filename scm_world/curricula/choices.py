@@ -37,7 +37,7 @@ class Together(_Several):
 
     def acts(self, situation: Situation) -> Acts:
         """Put them over one another."""
-        return merged(situation.declaration, *(part.acts(situation) for part in self.of))
+        return merged(situation.declaration.model, *(part.acts(situation) for part in self.of))
 
 
 @final

@@ -12,7 +12,7 @@ from scm_world.discovery.scores import score
 from scm_world.graph import SCM
 from scm_world.output.locations import Location
 from scm_world.queries.experiments.effects import Effects
-from scm_world.queries.experiments.models import paired_effects
+from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.series import Series, checked_count
@@ -61,9 +61,10 @@ def discover(
     checked_count("number of probes", probes)
     started = time.perf_counter()
     if isinstance(system, SCM):
-        effects = paired_effects(system, probes=probes, seed=seed)
+        series = Series(PairedEquations(system, seed), probes, progress)
+        series.run(range(probes))
         about = {"task": "model", "backend": "none", "preset": "none", "engine": ""}
-        return _report(system, effects, probes, probes, seed, about, started)
+        return _report(system, series.effects, series.done, probes, seed, about, started)
     world = World(system, **options) if isinstance(system, str) else system
     try:
         effects, done = _experiments(world, probes, seed, progress, checkpoint)

@@ -333,7 +333,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         goal: dict[str, Any] = {}
         if self._random_goal:
             goal = structure.task.sample_goal(self._random_goal)
-        return merged(structure, goal, self._start, mine)
+        return merged(structure.model, goal, self._start, mine)
 
     def step(
         self, action: NDArray[np.float32]

@@ -125,6 +125,10 @@ class Evaluator:
         self._declared = declared
         self._functions: dict[str, Callable[..., Any]] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle without the functions that were looked up."""
+        return Evaluator, (self._declared,)
+
     def forced(self, name: str, act: Act, values: Values, moment: Moment | None) -> Value:
         """Compute what a hard intervention or a draw puts in the place of a variable."""
         requested = act.requested
@@ -239,13 +243,16 @@ class Evaluator:
         self, parents: Iterable[Parent], values: Values, previous: Values
     ) -> list[Value]:
         return [
-            values[parent.name] if parent.lag == 0 else self._lagged(parent.name, previous)
+            values[parent.name]
+            if parent.lag == 0
+            else previous[parent.name]
+            if parent.name in previous
+            else self.first(parent.name)
             for parent in parents
         ]
 
-    def _lagged(self, name: str, previous: Values) -> Value:
-        if name in previous:
-            return previous[name]
+    def first(self, name: str) -> Value:
+        """Give the value that lagged children see before the first step."""
         variable = self._declared[name]
         match variable:
             case Derived():

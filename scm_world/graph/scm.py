@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from itertools import chain
-from typing import Any, final
+from typing import Any, Self
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from scm_world.variables import (
     Fixed,
     Hard,
     Intervention,
+    Measured,
     Mechanism,
     Natural,
     Noise,
@@ -35,6 +37,9 @@ from scm_world.variables import (
     divided,
     whole_of,
 )
+
+BEFORE = 2**32
+"""The step whose noise is that of the instant before the first step."""
 
 
 def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
@@ -62,9 +67,8 @@ def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-@final
 class SCM:
-    """A structural causal model over typed variables.
+    """A structural causal model over typed variables; ``scm_world.SCM`` can be asked, too.
 
     It is immutable: ``do`` returns another model. Edges of lag 0 act within an instant and form
     a directed acyclic graph; edges of lag 1 reach from one control step into the next.
@@ -84,17 +88,26 @@ class SCM:
         ... ])
         >>> round(float(model.do({"mass": 0.1}).solve()["weight"]), 3)
         0.981
-        >>> model.sample(1000, seed=0)["weight"].shape
+        >>> model.draw(1000, seed=0)["weight"].shape
         (1000,)
     """
 
-    __slots__ = ("_acts", "_declared", "_evaluator", "_interventions", "_order", "_structure")
+    __slots__ = (
+        "_acts",
+        "_declared",
+        "_evaluator",
+        "_interventions",
+        "_order",
+        "_structure",
+        "_temporal",
+    )
 
     def __init__(self, variables: Iterable[Variable]) -> None:
         self._declared = checked(variables)
         self._structure: Structure | None = Structure(self._declared)
         self._order: tuple[str, ...] = self._structure.order
         self._evaluator = Evaluator(self._declared)
+        self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, Act] = {}
 
@@ -156,6 +169,15 @@ class SCM:
     def variables(self) -> tuple[Variable, ...]:
         """All variables as declared."""
         return tuple(self._declared.values())
+
+    def act_on(self, name: str) -> Act | None:
+        """Give the intervention that holds on a variable, if there is one."""
+        return self._acts.get(name)
+
+    @property
+    def is_temporal(self) -> bool:
+        """Whether it has lagged edges, so that something in it takes time."""
+        return any(edge.lag for edge in self.edges)
 
     @property
     def interventions(self) -> Mapping[str, Intervention]:
@@ -219,7 +241,7 @@ class SCM:
         """Name the variable that an intervention acts on; the first one of a bundle's parts."""
         return self.targets(name)[0]
 
-    def do(self, request: Mapping[str, Any]) -> SCM:
+    def do(self, request: Mapping[str, Any]) -> Self:
         """Intervene: return the mutilated model and leave this one as it is.
 
         A later intervention on a variable takes the place of an earlier one, so that
@@ -234,14 +256,14 @@ class SCM:
         """
         return self._do(request, any_variable=False)
 
-    def hold(self, request: Mapping[str, Any]) -> SCM:
+    def hold(self, request: Mapping[str, Any]) -> Self:
         """Like ``do``, but for readouts too.
 
         No experiment can do this in the world; it isolates a direct effect in the model.
         """
         return self._do(request, any_variable=True)
 
-    def _do(self, request: Mapping[str, Any], *, any_variable: bool) -> SCM:
+    def _do(self, request: Mapping[str, Any], *, any_variable: bool) -> Self:
         wanted: dict[str, Intervention] = {}
         problems: list[InterventionError] = []
         targets: dict[str, str] = {}
@@ -258,17 +280,14 @@ class SCM:
         raise_all(problems)
         return self.with_interventions(wanted)
 
-    def with_interventions(self, acts: Mapping[str, Intervention]) -> SCM:
+    def with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
         """Apply interventions that have been checked already; on a bundle, to its parts.
 
         Raises:
             ModelError: Draws from spaces that follow other variables, or mechanisms, close a cycle.
         """
-        model = object.__new__(SCM)
-        model._declared = self._declared
-        model._evaluator = self._evaluator
-        model._interventions = {**self._interventions}
-        model._acts = {**self._acts}
+        model = object.__new__(type(self))
+        model._copy(self)
         parts = (divided(self.declared(name), act).items() for name, act in acts.items())
         for name, intervention in chain.from_iterable(parts):
             target = self.target(name)
@@ -286,6 +305,13 @@ class SCM:
         adds = any(adds_edges(act) for act in model._acts.values())
         model._order = model.structure.order if adds else self._order
         return model
+
+    def _copy(self, other: SCM) -> None:
+        """Be what another model is."""
+        self._declared, self._temporal = other._declared, other._temporal
+        self._evaluator, self._order = other._evaluator, other._order
+        self._interventions, self._acts = {**other._interventions}, {**other._acts}
+        self._structure = other._structure
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Check one intervention: name, type, shape, finite, fixed bounds.
@@ -321,7 +347,8 @@ class SCM:
         Args:
             known: Values of exogenous and measured variables and of actions.
             previous: Values of one control step ago, for parents of lag 1. Where it is not
-                given, they are the declared ``start`` or default of the parent.
+                given, they are the declared ``start`` or default of the parent; ``begin`` gives
+                what they are under interventions.
             moment: Where to draw noise. Without it exogenous variables take their default and
                 noise terms are zero.
             only: Compute these, in the order of the model, and take the rest from ``known``.
@@ -338,6 +365,48 @@ class SCM:
             values[name] = evaluate(name, self._acts.get(name), values, previous or {}, moment)
         return values
 
+    def begin(
+        self,
+        known: Values | None = None,
+        *,
+        moment: Moment | None = None,
+        only: Iterable[str] | None = None,
+    ) -> dict[str, Value]:
+        """Compute the instant before the first step, which lagged children look back at.
+
+        What has lagged causes or effects has its ``start`` or default there, unless an intervention
+        replaces its mechanism. The rest follows from that. Nothing has been drawn yet but what
+        an intervention draws.
+
+        Args:
+            known: Values of measured variables and of actions.
+            moment: Whose noise interventions draw with.
+            only: Compute these, in the order of the model, and take the rest from ``known``.
+
+        Returns:
+            All variables, shape ``(..., *shape)`` each.
+        """
+        values: dict[str, Value] = dict(known or {})
+        if moment is not None:
+            moment = replace(moment, step=BEFORE)
+        if self._temporal is None:
+            self._temporal = frozenset(
+                end
+                for name, variable in self._declared.items()
+                for parent in variable.all_parents
+                if parent.lag
+                for end in (name, parent.name)
+            )
+        for name in self._order if only is None else only:
+            act = self._acts.get(name)
+            if act is not None and not isinstance(act.intervention, SOFT):
+                values[name] = self._evaluator.evaluate(name, act, values, {}, moment)
+            elif name in self._temporal and isinstance(self._declared[name], Derived | Measured):
+                values[name] = values.get(name, self._evaluator.first(name))
+            else:
+                values[name] = self._evaluator.evaluate(name, act, values, {}, None)
+        return values
+
     def evaluate(self, name: str, values: Values, moment: Moment | None = None) -> Value:
         """Compute one variable from the values of all its parents.
 
@@ -346,7 +415,7 @@ class SCM:
         """
         return self._evaluator.evaluate(name, self._acts.get(name), values, {}, moment)
 
-    def sample(
+    def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None
     ) -> dict[str, Value]:
         """Draw from the model.
@@ -354,7 +423,7 @@ class SCM:
         Args:
             n: How many episodes.
             seed: Of the noise.
-            first: Number of the first episode: ``sample(1, first=i)`` is row i of a larger draw.
+            first: Number of the first episode: ``draw(1, first=i)`` is row i of a larger draw.
             steps: For a model with lagged edges, how many control steps.
 
         Returns:
@@ -365,13 +434,14 @@ class SCM:
         """
         noise = Noise(seed)
         if steps is None:
-            if any(edge.lag for edge in self.edges):
+            if self.is_temporal:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])
             solved = self.solve(moment=Moment(noise, first, 0, n))
             return {name: self._spread(name, value, n) for name, value in solved.items()}
         slices: list[dict[str, Value]] = []
+        start = self.begin(moment=Moment(noise, first, 0, n)) if steps else {}
         for step in range(steps):
-            before = slices[-1] if slices else None
+            before = slices[-1] if slices else start
             solved = self.solve(previous=before, moment=Moment(noise, first, step, n))
             slices.append({name: self._spread(name, v, n) for name, v in solved.items()})
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}

@@ -18,11 +18,13 @@ from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.policies import Random
 from scm_world.queries.samples import Samples, Setting
+from scm_world.queries.scm import SCM
 from scm_world.queries.timed import At, Clamp, Contact, On, Reaches
 from scm_world.queries.verification import Verification
 from scm_world.queries.verify import verify, verify_engines
 
 __all__ = [
+    "SCM",
     "Agreement",
     "At",
     "ButFor",

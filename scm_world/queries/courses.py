@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, final
 
 from scm_world.errors import InterventionError
+from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan
 from scm_world.queries.timed import ACTS, At, Clamp, On
 from scm_world.variables import Hard, Intervention, Mechanism, Natural
-from scm_world.world import World
 
 Layer = tuple[int, Plan]
 """The control step from which a plan counts, and the plan."""
@@ -44,7 +44,7 @@ class Course:
         self._is_simple = not any(True for _, plan in self.layers for _ in plan.timed())
         self._starts = frozenset(start for start, _ in self.layers)
 
-    def due(self, world: World, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
+    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
         """Give what is to be done at the beginning of a control step.
 
         Args:
@@ -67,7 +67,7 @@ class Course:
                 found[name] = _still_held(parts, step)
         return found
 
-    def concerns(self, world: World, step: int, fired: Mapping[Key, int]) -> bool:
+    def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
         """Tell whether anything may be due at a control step, without a look at the present.
 
         Args:
@@ -85,7 +85,7 @@ class Course:
             for index, part in enumerate(parts)
         )
 
-    def _owners(self, step: int, world: World) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
+    def _owners(self, step: int, world: System) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
         """List what counts at a step: of each quantity the last plan that names it."""
         last: dict[str, tuple[int, dict[str, None]]] = {}
         for number, (start, plan) in enumerate(self.layers):
@@ -98,6 +98,23 @@ class Course:
         for number, name in owners:
             start, plan = self.layers[number]
             yield number, name, start, plan[name]
+
+
+@final
+class Courses:
+    """Courses of groups of episodes that are run together.
+
+    Args:
+        courses: Of each group.
+    """
+
+    def __init__(self, courses: Iterable[Course]) -> None:
+        self._courses = tuple(courses)
+
+    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[int, Any]:
+        """Give what is to be done in each group where something is."""
+        found = ((g, course.due(world, step, fired)) for g, course in enumerate(self._courses))
+        return {group: due for group, due in found if due}
 
 
 def _still_held(parts: tuple[Any, ...], step: int) -> Intervention:
@@ -114,7 +131,7 @@ def _concerns(
     part: Any,
     step: int,
     start: int,
-    world: World,
+    world: System,
     name: str,
     fired: Mapping[Key, int],
     key: Key,
@@ -134,7 +151,7 @@ def _concerns(
 
 
 def _due(
-    part: Any, step: int, start: int, name: str, world: World, fired: dict[Key, int], key: Key
+    part: Any, step: int, start: int, name: str, world: System, fired: dict[Key, int], key: Key
 ) -> Intervention | None:
     act: Intervention | None = None
     match part:
@@ -151,7 +168,7 @@ def _due(
     return act
 
 
-def _held(part: Clamp, step: int, name: str, world: World) -> Intervention | None:
+def _held(part: Clamp, step: int, name: str, world: System) -> Intervention | None:
     """Say what a clamp does: a state is put back at every step, a parameter is set and released."""
     if step < part.start or (part.stop is not None and step > part.stop):
         return None
@@ -166,6 +183,6 @@ def _held(part: Clamp, step: int, name: str, world: World) -> Intervention | Non
     return part.act if step != part.stop else None
 
 
-def _is_state(name: str, world: World) -> bool:
+def _is_state(name: str, world: System) -> bool:
     role: str = world.model.declared(world.model.target(name)).role
     return role == "state"

@@ -50,11 +50,15 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
         path: Of the file; it gets the ending ``.npz`` if it has another one.
 
     Raises:
+        UnknownOption: It is an episode of a causal model without a backend.
         ModelError: A plan has a function without a name, or a registered task arguments that are
             no numbers and texts. Other tasks and models are given again as a world on reading.
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
     trace = episode.trace
+    if not isinstance(episode.stage, Stage):
+        allowed = ("an episode of a World; of equations keep the model (to_json), seed and plan",)
+        raise UnknownOption("episode", episode, allowed)
     target = Path(path)
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")

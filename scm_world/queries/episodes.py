@@ -12,14 +12,14 @@ import numpy as np
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.queries.courses import Course, Layer
+from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan
 from scm_world.queries.policies import Sequence as Given
 from scm_world.queries.rollouts import Ending, lived
-from scm_world.queries.stages import Stage
+from scm_world.queries.stages import AnyStage
 from scm_world.queries.traces import ALL, EVERY, Trace, as_names, begin, run
-from scm_world.queries.units import Unit
-from scm_world.world import Audit, World
-from scm_world.world.start import whole_number
+from scm_world.queries.units import Unit, length
+from scm_world.world import Audit
 
 
 @final
@@ -39,7 +39,7 @@ class Episode:
 
     def __init__(
         self,
-        stage: Stage,
+        stage: AnyStage,
         *,
         seed: int,
         number: int,
@@ -47,7 +47,8 @@ class Episode:
         steps: int,
         trace: Trace,
     ) -> None:
-        self.stage, self.seed, self.number = stage, seed, number
+        self.stage: Any = stage
+        self.seed, self.number = seed, number
         self.layers: tuple[Layer, ...] = tuple(layers)
         self.steps = steps
         self.trace = trace
@@ -98,7 +99,7 @@ class Episode:
             return np.array(self.trace.values[name])
         declarations = self.trace.declarations
         if len(declarations) == 1 and name in declarations[0][1].slices:
-            return declarations[0][1].read(name, np.array(self.trace.vectors))
+            return np.asarray(declarations[0][1].read(name, np.array(self.trace.vectors)))
         if all(name in values for _, values in self.trace.statics):
             return self._parameter(name)
         if not any(name in declaration.model for _, declaration in declarations):
@@ -175,8 +176,9 @@ class Episode:
         return episode_of(self.stage, unit, trace)
 
     def _instant(self, at: Any) -> int:
-        if isinstance(at, bool) or not isinstance(at, int | np.integer) or not 0 <= at < self.steps:
-            raise UnknownOption("at", at, (f"a control step from 0 to {self.steps - 1}",))
+        last = max(self.steps - 1, 0)
+        if isinstance(at, bool) or not isinstance(at, int | np.integer) or not 0 <= at <= last:
+            raise UnknownOption("at", at, (f"a control step from 0 to {last}",))
         return int(at)
 
     def _unit(
@@ -197,7 +199,7 @@ class Episode:
             past=past,
         )
 
-    def _arrive(self, world: World, at: int) -> None:
+    def _arrive(self, world: System, at: int) -> None:
         """Bring a twin to an instant, before anything is done then that the past does not know."""
         if at == 0:
             world.reset(seed=self.seed, episode=self.number)
@@ -206,7 +208,7 @@ class Episode:
         world.restore(self.trace.snapshots[near])
         self._go_through(world, near, at)
 
-    def _near(self, world: World, at: int) -> int:
+    def _near(self, world: System, at: int) -> int:
         """Find the last snapshot before an instant; take those that were not taken on the way."""
         near = max((step for step in self.trace.snapshots if step < at), default=-1)
         if near < (at - 1) // EVERY * EVERY:
@@ -220,7 +222,7 @@ class Episode:
             near = max(step for step in self.trace.snapshots if step < at)
         return near
 
-    def _go_through(self, world: World, first: int, last: int) -> Trace:
+    def _go_through(self, world: System, first: int, last: int) -> Trace:
         """Let the same happen again, from after what was done at an instant."""
         again = Trace(fired=dict(self.trace.fired))
         past = Given(self.trace.actions)
@@ -267,7 +269,7 @@ class Episode:
 
 
 def rollout(
-    stage: Stage,
+    stage: AnyStage,
     policy: Any = None,
     *,
     seed: int = 0,
@@ -293,19 +295,18 @@ def rollout(
         UnknownOption: The number of steps is none.
     """
     with stage.twin() as world:
-        length = world.max_episode_length if steps is None else steps
         unit = Unit(
             seed=seed,
             number=number,
             layers=((0, Plan(do)),),
             policy=policy,
-            steps=whole_number("steps", length, least=1),
+            steps=length(world, steps),
             names=as_names(record),
         )
         return episode_of(stage, unit, unit.lived(world))
 
 
-def episode_of(stage: Stage, unit: Unit, trace: Trace) -> Episode:
+def episode_of(stage: AnyStage, unit: Unit, trace: Trace) -> Episode:
     """Give the episode that a unit has become."""
     return Episode(
         stage,

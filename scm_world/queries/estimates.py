@@ -13,12 +13,12 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.outcomes import as_outcome, label
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.samples import Samples, Setting, sample
-from scm_world.queries.stages import Stage
-from scm_world.world import World
+from scm_world.queries.stages import AnyStage
 from scm_world.world.start import whole_number
 
 CONFIDENCE = 0.95
@@ -163,8 +163,8 @@ def difference(
 
 
 def effect(
-    stage: Stage,
-    world: World,
+    stage: AnyStage,
+    world: System,
     outcome: Any,
     *,
     do: Mapping[str, Any],
@@ -181,8 +181,8 @@ def effect(
 
 
 def _both(
-    stage: Stage,
-    world: World,
+    stage: AnyStage,
+    world: System,
     outcomes: Sequence[Any],
     do: Mapping[str, Any],
     versus: Mapping[str, Any] | None,
@@ -216,7 +216,7 @@ def _both(
 
 
 def _effect(
-    world: World,
+    world: System,
     outcome: Any,
     treated: Floats,
     control: Floats,
@@ -238,15 +238,15 @@ def _effect(
         control=control.mean(axis=0),
         rollouts=2 * len(treated),
         seed=setting.seed,
-        engine=world.backend.name,
+        engine="equations" if isinstance(world, Equations) else world.backend.name,
         do=Plan(do),
         versus=Plan(versus),
     )
 
 
 def effect_over(
-    stage: Stage,
-    world: World,
+    stage: AnyStage,
+    world: System,
     outcome: Any,
     *,
     plans: Sequence[Plan],
@@ -270,8 +270,8 @@ def effect_over(
 
 
 def effect_by(
-    stage: Stage,
-    world: World,
+    stage: AnyStage,
+    world: System,
     outcome: Any,
     *,
     do: Mapping[str, Any],

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Self, final
 
 from scm_world._types import Floats
 from scm_world.backends import Backend
-from scm_world.errors import UnknownOption
-from scm_world.queries import estimates, samples
 from scm_world.queries.courses import Course, Key
-from scm_world.queries.episodes import Episode, rollout
-from scm_world.queries.estimates import Effect
-from scm_world.queries.outcomes import usual_outcomes
+from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan
-from scm_world.queries.progress import Progress
-from scm_world.queries.samples import Samples, Setting
-from scm_world.queries.stages import stage_of
+from scm_world.queries.questions import Questions
+from scm_world.queries.samples import Setting
+from scm_world.queries.stages import AnyStage, stage_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, WorldSnapshot
@@ -28,12 +24,12 @@ from scm_world.world.requests import merged
 
 
 @final
-class World(Simulated):
+class World(Simulated, Questions):
     """A causal model and an engine, to step, to intervene on, and to ask.
 
     What steps and intervenes is that of ``scm_world.world.World``: it changes this world. What
-    asks (``given``, ``rollout``, ``see``, ``sample``, ``effect``) works on twins and leaves this
-    world as it is.
+    asks (``given``, ``rollout``, ``sample``, ``effect``, …; see ``Questions``) works on twins and
+    leaves this world as it is.
 
     Example:
         >>> world = World("pushing", backend="fake")
@@ -238,193 +234,10 @@ class World(Simulated):
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given; of two names of one quantity the later one counts."""
-        return Plan(merged(self.declaration, self._standing, Plan(do)))
+        return Plan(merged(self.model, self._standing, Plan(do)))
 
-    # --- asking -------------------------------------------------------------------------------
+    def _asked(self) -> tuple[AnyStage, System]:
+        return stage_of(self), self
 
-    def rollout(
-        self,
-        policy: Any = None,
-        *,
-        seed: int = 0,
-        episode: int = 0,
-        do: Mapping[str, Any] | None = None,
-        steps: int | None = None,
-        record: Iterable[str] = (),
-    ) -> Episode:
-        """Let an episode happen, and remember it whole.
-
-        Args:
-            policy: A function of the world that gives an action, shape (n_actions,); actions of
-                shape (n_actions,) or (steps, n_actions); ``"random"``; or None: the action that
-                lets the system be. See ``as_policy`` for others that have a name.
-            seed: Of the noise.
-            episode: Number of the episode within that noise.
-            do: Interventions, with or without a time.
-            steps: How many control steps; as many as the task has if None.
-            record: Variables to write down on the way; others are found by going through again.
-
-        Raises:
-            InterventionError: An intervention was refused.
-            ActionError: The policy is none, or gave no action.
-        """
-        plan = self._with(do)
-        return rollout(
-            stage_of(self), policy, seed=seed, number=episode, do=plan, steps=steps, record=record
-        )
-
-    def see(
-        self,
-        n: int,
-        *,
-        outcomes: Iterable[Any] | None = None,
-        progress: Progress | None = None,
-        **setting: Any,
-    ) -> Samples:
-        """Watch episodes without doing anything; see ``sample``."""
-        return self.sample({}, n, outcomes=outcomes, progress=progress, **setting)
-
-    def sample(
-        self,
-        do: Mapping[str, Any],
-        n: int,
-        *,
-        outcomes: Iterable[Any] | None = None,
-        first: int = 0,
-        progress: Progress | None = None,
-        **setting: Any,
-    ) -> Samples:
-        """Let episodes happen under an intervention.
-
-        Args:
-            do: What is done in each of them.
-            n: How many.
-            outcomes: Names of variables (their final values), ``Outcome`` or functions of the
-                episode; see ``usual_outcomes`` if None.
-            first: Number of the first one; unit i is the same in every question with one seed.
-            progress: Told after each episode how many are done, and how many there will be.
-            setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
-
-        Raises:
-            InterventionError: An intervention was refused.
-        """
-        return samples.sample(
-            stage_of(self),
-            self,
-            self._with(do),
-            n,
-            outcomes=usual_outcomes(self) if outcomes is None else outcomes,
-            setting=Setting(**setting),
-            first=first,
-            progress=progress,
-        )
-
-    def effect(
-        self,
-        outcome: Any,
-        *,
-        do: Mapping[str, Any],
-        versus: Mapping[str, Any] | None = None,
-        n: int = 100,
-        paired: bool = True,
-        progress: Progress | None = None,
-        **setting: Any,
-    ) -> Effect:
-        """Estimate how much an intervention changes an outcome.
-
-        Args:
-            outcome: The name of a variable (its final value), an ``Outcome``, or a function of the
-                episode that gives numbers.
-            do: What is done.
-            versus: What it is held against; nothing if None.
-            n: How many units.
-            paired: Whether the same units live through both, with the same noise.
-            progress: Told after each episode.
-            setting: See ``sample``.
-
-        Returns:
-            Mean and 95 % interval of the difference, and by how much pairing pays.
-        """
-        return estimates.effect(
-            stage_of(self),
-            self,
-            outcome,
-            do=self._with(do),
-            versus=self._with(versus),
-            n=n,
-            paired=paired,
-            setting=Setting(**setting),
-            progress=progress,
-        )
-
-    def effect_over(
-        self,
-        outcome: Any,
-        *,
-        name: str,
-        values: Sequence[Any],
-        n: int = 100,
-        progress: Progress | None = None,
-        **setting: Any,
-    ) -> tuple[Effect, ...]:
-        """Estimate the paired effects of values of a variable, each against the first one.
-
-        Args:
-            outcome: As in ``effect``.
-            name: Of the variable.
-            values: Two or more.
-            n: How many units.
-            progress: Told after each episode.
-            setting: See ``sample``.
-        """
-        if len(values) < 2:
-            raise UnknownOption("values", values, ("two or more values of the variable",))
-        return estimates.effect_over(
-            stage_of(self),
-            self,
-            outcome,
-            plans=[self._with({name: value}) for value in values],
-            n=n,
-            setting=Setting(**setting),
-            progress=progress,
-        )
-
-    def effect_by(
-        self,
-        outcome: Any,
-        *,
-        do: Mapping[str, Any],
-        versus: Mapping[str, Any] | None = None,
-        by: Any,
-        bins: int = 4,
-        n: int = 200,
-        progress: Progress | None = None,
-        **setting: Any,
-    ) -> tuple[tuple[tuple[float, float], Effect], ...]:
-        """Estimate paired effects among units that differ in a covariate.
-
-        Args:
-            outcome: As in ``effect``.
-            do: What is done.
-            versus: What it is held against; nothing if None.
-            by: The covariate: like an outcome, one number; read off the world of ``versus``.
-            bins: Into how many groups of equal size the units are sorted.
-            n: How many units, over all groups.
-            progress: Told after each episode.
-            setting: See ``sample``.
-
-        Returns:
-            For each group the ends of the covariate, and the effect.
-        """
-        return estimates.effect_by(
-            stage_of(self),
-            self,
-            outcome,
-            do=self._with(do),
-            versus=self._with(versus),
-            by=by,
-            bins=bins,
-            n=n,
-            setting=Setting(**setting),
-            progress=progress,
-        )
+    def _setting(self, given: Mapping[str, Any]) -> Setting:
+        return Setting(**given)

@@ -198,7 +198,7 @@ class Laboratory:
         return {name: values.copy() for name, values in columns.items()}
 
     def _with(self, request: Mapping[str, Any]) -> Plan:
-        return Plan(merged(self._world.declaration, self._given, Plan(request)))
+        return Plan(merged(self._world.model, self._given, Plan(request)))
 
     def _nothing(self, units: Sequence[int], request: Mapping[str, Any]) -> Samples:
         return Samples({}, tuple(units), self._setting.seed, Plan(request))

@@ -6,14 +6,14 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
+from scm_world.queries.equations import Equations, System
 from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
-from scm_world.world import World
 
-HOWS = ("final", "mean", "max", "min", "sum", "first", "change")
+HOWS = ("final", "mean", "max", "min", "sum", "first", "change", "path")
 Given = "str | Outcome | Callable[[Episode], Any]"
 
 
@@ -24,8 +24,9 @@ class Outcome(Frozen):
     Attributes:
         name: Of the variable.
         how: Over the instants after the first action: its ``"final"`` value, its ``"mean"``,
-            ``"max"``, ``"min"`` or ``"sum"``; its ``"first"`` value at the beginning; or the
-            ``"change"`` from the beginning to the end.
+            ``"max"``, ``"min"`` or ``"sum"``; its ``"first"`` value at the beginning; the
+            ``"change"`` from the beginning to the end; or its ``"path"``, the values at all
+            instants. Where there is one instant, it counts for all of these.
         component: Which number of it; all of them if None.
 
     Example:
@@ -34,7 +35,7 @@ class Outcome(Frozen):
     """
 
     name: str
-    how: Literal["final", "mean", "max", "min", "sum", "first", "change"] = "final"
+    how: Literal["final", "mean", "max", "min", "sum", "first", "change", "path"] = "final"
     component: int | None = None
 
     def __init__(self, name: str, how: str = "final", component: int | None = None) -> None:
@@ -44,23 +45,38 @@ class Outcome(Frozen):
 
     def of(self, episode: Episode) -> Floats:
         """Read it off an episode."""
-        values = np.asarray(episode[self.name], dtype=np.float64)
+        return np.asarray(self.of_many(np.asarray(episode[self.name])[None])[0])
+
+    def of_many(self, values: Value) -> Floats:
+        """Read it off the values of the variable in several episodes.
+
+        Args:
+            values: Shape (n, instants, *shape).
+
+        Returns:
+            Shape (n, ...).
+        """
+        values = np.asarray(values, dtype=np.float64)
+        n, instants = values.shape[:2]
         if self.component is not None:
-            flat = values.reshape(len(values), -1)
-            if not 0 <= self.component < flat.shape[1]:
-                allowed = (f"0 to {flat.shape[1] - 1}",)
+            flat = values.reshape(n, instants, -1)
+            if not 0 <= self.component < flat.shape[2]:
+                allowed = (f"0 to {flat.shape[2] - 1}",)
                 raise UnknownOption(f"component of {self.name}", self.component, allowed)
-            values = flat[:, self.component]
-        if not len(values):
+            values = np.ascontiguousarray(flat[..., self.component])
+        if not instants:
             raise UnknownOption("outcome", self.name, ("a variable that is there",))
         match self.how:
             case "final":
-                return np.asarray(values[-1])
+                return np.asarray(values[:, -1])
             case "first":
-                return np.asarray(values[0])
+                return np.asarray(values[:, 0])
             case "change":
-                return np.asarray(values[-1] - values[0])
-        return np.asarray(getattr(values[1:], self.how)(axis=0))
+                return np.asarray(values[:, -1] - values[:, 0])
+            case "path":
+                return values
+        later = np.ascontiguousarray(values[:, 1:] if instants > 1 else values)
+        return np.asarray(getattr(later, self.how)(axis=1))
 
     def __str__(self) -> str:
         part = "" if self.component is None else f"[{self.component}]"
@@ -84,15 +100,17 @@ def as_outcome(given: Any) -> Any:
     )
 
 
-def usual_outcomes(world: World) -> tuple[str, ...]:
+def usual_outcomes(world: System) -> tuple[str, ...]:
     """Name what is read off episodes if nothing else is asked for.
 
-    That is the fractional success of the robot's tasks, and of any other system everything that
-    is computed from its states: readouts, outcomes, reward and success.
+    That is the fractional success of the robot's tasks, and of any other world everything that
+    is computed from its states: readouts, outcomes, reward and success; of equations everything.
 
     Raises:
         UnknownOption: Nothing is computed from the states.
     """
+    if isinstance(world, Equations):
+        return tuple(name for name in world.model if name not in world.declaration.actions)
     if FRACTION in world.model:
         return (FRACTION,)
     declaration = world.declaration
@@ -114,7 +132,15 @@ def read(outcome: Any, episode: Episode) -> Floats:
     Raises:
         UnknownOption: A function gave no finite numbers.
     """
-    value = outcome.of(episode) if isinstance(outcome, Outcome) else outcome(episode)
+    return as_numbers(outcome.of(episode) if isinstance(outcome, Outcome) else outcome(episode))
+
+
+def as_numbers(value: Any) -> Floats:
+    """Check the value of an outcome.
+
+    Raises:
+        UnknownOption: It is no finite numbers.
+    """
     try:
         number = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -11,14 +11,14 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.planning import CrossEntropy
 from scm_world.queries.ranges import action_range
-from scm_world.tasks import TASKS, Task
+from scm_world.tasks import TASKS
 from scm_world.tasks.policies import Blind, kept_rows
-from scm_world.world import World
 from scm_world.world.start import whole_number
 
-Policy = Callable[[World], Any]
+Policy = Callable[[Any], Any]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
 
 
@@ -42,7 +42,7 @@ class Random(Blind):
         if not np.isfinite(self.share):
             raise UnknownOption("share", self.share, ("a finite number",))
 
-    def ahead(self, world: World, first: int, count: int) -> Floats:
+    def ahead(self, world: System, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""
         n, noise, episode = world.declaration.n_actions, world.noise, world.episode
         drawn = np.empty((count, n))
@@ -77,7 +77,7 @@ class Sequence(Blind):
             raise ActionError("actions must be finite", actions)
         self.actions: Floats = given
 
-    def ahead(self, world: World, first: int, count: int) -> Floats:
+    def ahead(self, world: System, first: int, count: int) -> Floats:
         """Give the actions of some control steps."""
         n = world.declaration.n_actions
         if self.actions.shape[1] != n:
@@ -97,7 +97,7 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 """Policies that have a name, those of the tasks of this package included."""
 
 
-def as_policy(given: Any, task: Task | None = None) -> Policy:
+def as_policy(given: Any, world: System | None = None) -> Policy:
     """Turn what a user gives into a policy for one rollout.
 
     Args:
@@ -105,7 +105,7 @@ def as_policy(given: Any, task: Task | None = None) -> Policy:
             the system be, as it was in the first step. Of the block-building robot also
             ``"sweep"`` (to the middle), ``"across"`` (one finger), ``"grasp"`` (blocks, to their
             goals), ``"hold"`` (likewise, but the last block is not let go of).
-        task: In which it acts, if that is known already.
+        world: In which it acts, if that is known already.
 
     Raises:
         ActionError: It is none of these.
@@ -113,10 +113,12 @@ def as_policy(given: Any, task: Task | None = None) -> Policy:
     if given is None:
         return _Idle()
     if isinstance(given, str):
-        known = [*NAMED] if task is None else [*ANY, *task.policies]
+        known = {"random": Random} if isinstance(world, Equations) else NAMED
+        if world is not None and not isinstance(world, Equations):
+            known = {**ANY, **world.task.policies}
         if given in known:
-            return (NAMED if task is None else {**ANY, **task.policies})[given]()
-        raise ActionError(f"a policy is a function, actions, None, or one of {known}", given)
+            return known[given]()
+        raise ActionError(f"a policy is a function, actions, None, or one of {[*known]}", given)
     return given if callable(given) else Sequence(given)
 
 
@@ -126,8 +128,11 @@ class _Idle(Blind):
     def __init__(self) -> None:
         self._action: Floats | None = None
 
-    def ahead(self, world: World, first: int, count: int) -> Floats:
+    def ahead(self, world: System, first: int, count: int) -> Floats:
         """Give the action of the first step, again and again."""
         if self._action is None:
-            self._action = world.task.idle(world)
+            if isinstance(world, Equations):
+                self._action = world.idle()
+            else:
+                self._action = world.task.idle(world)
         return np.tile(self._action, (count, 1))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.world import World
+from scm_world.queries.equations import System
 
 
-def action_range(world: World) -> tuple[Floats, Floats]:
+def action_range(world: System) -> tuple[Floats, Floats]:
     """Give the lower and upper end of all actions, shape (n_actions,) each.
 
     An action without an end is drawn from [-1, 1], or as far beyond the end that it has.

@@ -8,15 +8,22 @@ from __future__ import annotations
 import math
 import multiprocessing
 from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import TypeVar
 
+import numpy as np
+
+from scm_world._types import Floats
 from scm_world.errors import EngineFailure
+from scm_world.queries.courses import Course, Courses
 from scm_world.queries.crews import crew, sent
+from scm_world.queries.equations import Equations
 from scm_world.queries.lockstep import advanced, is_known
-from scm_world.queries.stages import Stage, threaded
-from scm_world.queries.traces import Trace
+from scm_world.queries.stages import AnyStage, EquationStage, Stage, threaded
+from scm_world.queries.timed import On
+from scm_world.queries.traces import Trace, begin, run
 from scm_world.queries.units import Unit
+from scm_world.tasks.policies import Blind
 from scm_world.work.threads import cores
 from scm_world.world.start import whole_number
 
@@ -36,7 +43,7 @@ PRICE = 32
 
 
 def lived(
-    stage: Stage,
+    stage: AnyStage,
     units: Sequence[Unit],
     finish: Callable[[int, Ending], R],
     workers: int | None = None,
@@ -53,6 +60,8 @@ def lived(
     Returns:
         What ``finish`` gave, in the order of the units.
     """
+    if isinstance(stage, EquationStage):
+        return [finish(place, ending) for place, ending in enumerate(_solved(stage, units))]
     given = None if workers is None else whole_number("workers", workers, least=1)
     endings = _elsewhere(stage, units, given)
     if endings is None:
@@ -110,3 +119,74 @@ def _apart(
         return finish(place, ending)
 
     return threaded(one, range(len(units)), workers)
+
+
+def _solved(stage: EquationStage, units: Sequence[Unit]) -> list[Trace | Exception]:
+    """Run units: together where they can be, else one by one.
+
+    Returns:
+        What each leaves behind, or what stopped it.
+    """
+    try:
+        together = _solved_together(stage, units)
+    except Exception:  # alone, it ends nothing but the unit in which it happens
+        together = None
+    if together is None:
+        return [unit.ended(Equations(stage.layout)) for unit in units]
+    return [
+        Trace(
+            vectors=list(vectors),
+            statics=[(0, {})],
+            declarations=[(0, stage.layout)],
+            actions=list(actions),
+        )
+        for vectors, actions in zip(*together, strict=True)
+    ]
+
+
+def paths(stage: EquationStage, units: Sequence[Unit]) -> Floats:
+    """Run units, and give all values at all instants, shape (n, steps + 1, size).
+
+    Raises:
+        Exception: What stopped a unit.
+    """
+    with suppress(Exception):  # the unit raises it again
+        together = _solved_together(stage, units)
+        if together is not None:
+            return together[0]
+    return np.array([unit.lived(Equations(stage.layout)).vectors for unit in units])
+
+
+def _solved_together(stage: EquationStage, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
+    """Run units as one, if nothing in them depends on the course of one of them."""
+    first, one = units[0], Equations(stage.layout)
+    policies = [unit.acts(one) for unit in units] if stage.layout.n_actions else []
+    numbers = range(first.number, first.number + len(units))
+    if (
+        not stage.layout.is_vectorised
+        or any(unit.first or unit.number != i for unit, i in zip(units, numbers, strict=True))
+        or any((unit.seed, unit.steps) != (first.seed, first.steps) for unit in units)
+        or not all(isinstance(policy, Blind) for policy in policies)
+    ):
+        return None
+    keys = [tuple((at, id(plan)) for at, plan in unit.layers) for unit in units]
+    kinds = {key: unit.layers for key, unit in zip(keys, units, strict=True)}
+    plans = (plan for layers in kinds.values() for _, plan in layers)
+    if any(isinstance(part, On) for plan in plans for _, part in plan.timed()):
+        return None
+    places = {kind: group for group, kind in enumerate(kinds)}
+    groups = [places[key] for key in keys]
+    actions = np.empty((len(units), first.steps, stage.layout.n_actions))
+    for row, policy in enumerate(policies):
+        one.reset(seed=first.seed, episode=numbers[row])
+        actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined]
+    courses, trace = Courses(map(Course, kinds.values())), Trace()
+    together = Equations(stage.layout, groups)
+    begin(together, first.seed, first.number, courses, trace)
+
+    def acts(system: Equations) -> Floats:
+        found: Floats = actions[:, system.index]
+        return found
+
+    run(together, trace, courses, acts, first=0, steps=first.steps, begun=True)
+    return np.stack(trace.vectors, axis=1), actions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -14,14 +14,14 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode, episode_of
-from scm_world.queries.outcomes import Outcome, as_outcome, column, read, watched
+from scm_world.queries.equations import System
+from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read, watched
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.rollouts import Ending, lived
-from scm_world.queries.stages import Stage
+from scm_world.queries.rollouts import Ending, lived, paths
+from scm_world.queries.stages import AnyStage, EquationStage
 from scm_world.queries.traces import as_names
-from scm_world.queries.units import Unit
-from scm_world.world import World
+from scm_world.queries.units import Unit, length
 from scm_world.world.requests import merged
 from scm_world.world.start import whole_number
 
@@ -54,7 +54,7 @@ class Setting:
     seed: int = 0
     workers: int | None = None
 
-    def plan(self, world: World, do: Mapping[str, Any] | None) -> Plan:
+    def plan(self, world: System, do: Mapping[str, Any] | None) -> Plan:
         """Say what happens to a unit: what is done to it, and what varies by itself.
 
         Args:
@@ -65,9 +65,9 @@ class Setting:
         for name in acts:
             if name in nature and name not in acts.at_first():
                 acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
-        return Plan(merged(world.declaration, nature, acts))
+        return Plan(merged(world.model, nature, acts))
 
-    def unit(self, world: World, plan: Plan, number: int, names: Iterable[str] = ()) -> Unit:
+    def unit(self, world: System, plan: Plan, number: int, names: Iterable[str] = ()) -> Unit:
         """Say what is to happen in an episode.
 
         Args:
@@ -79,18 +79,17 @@ class Setting:
         Raises:
             UnknownOption: The number of steps is none.
         """
-        steps = world.max_episode_length if self.steps is None else self.steps
         return Unit(
             seed=self.seed,
             number=number,
             layers=((0, plan),),
             policy=self.policy,
-            steps=whole_number("steps", steps, least=1),
+            steps=length(world, self.steps),
             names=as_names(names),
         )
 
     def episode(
-        self, stage: Stage, world: World, do: Mapping[str, Any] | None, number: int, names: Any
+        self, stage: AnyStage, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
         """Let one unit happen.
 
@@ -170,8 +169,8 @@ class Samples(Mapping[str, Floats]):
 
 
 def sample(
-    stage: Stage,
-    world: World,
+    stage: AnyStage,
+    world: System,
     do: Mapping[str, Any] | None,
     n: int,
     *,
@@ -210,13 +209,21 @@ def sample(
         return found
 
     numbers, plan = range(first, first + count), setting.plan(world, do)
-    units = [setting.unit(world, plan, number, names) for number in numbers]
-    rows = lived(stage, units, finish, setting.workers)
-    try:
-        found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
-    except ValueError:
-        allowed = ("numbers of one shape in every episode",)
-        raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
+    unit = setting.unit(world, plan, first, names)
+    units = [replace(unit, number=number) for number in numbers]
+    if isinstance(stage, EquationStage) and all(isinstance(one, Outcome) for one in wanted):
+        vectors = paths(stage, units)
+        each = (one.of_many(stage.layout.read(one.name, vectors)) for one in wanted)
+        found = [as_numbers(values) for values in each]
+        if progress is not None:
+            progress(count, count)
+    else:
+        rows = lived(stage, units, finish, setting.workers)
+        try:
+            found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
+        except ValueError:
+            allowed = ("numbers of one shape in every episode",)
+            raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
     columns: dict[str, Floats] = {}
     for outcome, values in zip(wanted, found, strict=True):
         columns[_column(outcome, columns)] = values

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from typing import Any, TypeVar, final
 from weakref import WeakKeyDictionary
 
+from scm_world.graph import SCM
+from scm_world.queries.equations import Equations, Layout
 from scm_world.work.executors import Executor, Processes
 from scm_world.world import World
 from scm_world.world.batch import Batch
@@ -126,6 +128,25 @@ def threaded(work: Callable[[T], R], items: Iterable[T], workers: int) -> list[R
     with ThreadPoolExecutor(min(workers, len(todo))) as pool:
         return list(pool.map(work, todo))
 
+
+@final
+class EquationStage:
+    """Where questions to a causal model without a backend are tried out.
+
+    Args:
+        model: With the interventions that hold in every episode.
+    """
+
+    def __init__(self, model: SCM) -> None:
+        self.layout = Layout(model)
+
+    @contextmanager
+    def twin(self) -> Iterator[Equations]:
+        """Give equations to step."""
+        yield Equations(self.layout)
+
+
+AnyStage = Stage | EquationStage
 
 _STAGES: WeakKeyDictionary[World, Stage] = WeakKeyDictionary()
 

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from scm_world.errors import UnknownOption
 from scm_world.models import Model
+from scm_world.queries.equations import System
 from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Null, Scale, Shift
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
@@ -116,12 +117,14 @@ class Contact(Frozen):
         """Both names."""
         return self.first, self.second
 
-    def happens(self, world: World) -> bool:
+    def happens(self, world: System) -> bool:
         """Tell whether they touch now: in the last physics step, with a force.
 
         Raises:
-            UnknownOption: The model has no such body.
+            UnknownOption: The model has no such body; equations have none at all.
         """
+        if not isinstance(world, World):
+            raise UnknownOption("event of equations", self, ("Reaches(name, above=…)",))
         known = world.structure.body_names if isinstance(world.structure, Model) else ()
         for body in self.bodies if known else ():
             if not any(name.startswith(body) for name in known):
@@ -162,7 +165,7 @@ class Reaches(Frozen):
         _step("component of Reaches", fields.get("component", 0))
         super().__init__(name=name, **fields)  # type: ignore[call-arg]
 
-    def happens(self, world: World) -> bool:
+    def happens(self, world: System) -> bool:
         """Tell whether it is there now."""
         numbers = np.ravel(world[self.name])
         if self.component >= len(numbers):

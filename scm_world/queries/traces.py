@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import ActionError
-from scm_world.queries.courses import Course, Key
+from scm_world.queries.courses import Course, Courses, Key
+from scm_world.queries.equations import System
 from scm_world.queries.policies import Policy
-from scm_world.world import Audit, World, WorldSnapshot
-from scm_world.world.declaration import Declaration
+from scm_world.world import Audit, World
 
 EVERY = 10
 """Control steps from one snapshot to the next."""
@@ -41,9 +41,9 @@ class Trace:
 
     vectors: list[Floats] = field(default_factory=list)
     statics: list[tuple[int, dict[str, Value]]] = field(default_factory=list)
-    declarations: list[tuple[int, Declaration]] = field(default_factory=list)
+    declarations: list[tuple[int, Any]] = field(default_factory=list)
     actions: list[Floats] = field(default_factory=list)
-    snapshots: dict[int, WorldSnapshot] = field(default_factory=dict)
+    snapshots: dict[int, Any] = field(default_factory=dict)
     fired: dict[Key, int] = field(default_factory=dict)
     audits: dict[int, Audit] = field(default_factory=dict)
     values: dict[str, list[Value]] = field(default_factory=dict)
@@ -63,9 +63,9 @@ class Trace:
 
 
 def run(
-    world: World,
+    world: System,
     trace: Trace,
-    course: Course,
+    course: Course | Courses,
     policy: Policy,
     *,
     first: int,
@@ -84,7 +84,7 @@ def run(
         first: Number of the first instant.
         steps: Number of the last one.
         names: Variables to write down at every instant; ``ALL`` for all.
-        contacts: Whether to write down which bodies touch.
+        contacts: Whether to write down which bodies touch, where there are bodies.
         begun: Whether what is due at ``first`` has been done already.
     """
     wanted = tuple(names)
@@ -109,7 +109,7 @@ def as_names(record: Iterable[str]) -> tuple[str, ...]:
     return (record,) if isinstance(record, str) else tuple(record)
 
 
-def _chosen(policy: Policy, world: World) -> Floats:
+def _chosen(policy: Policy, world: System) -> Floats:
     """Ask a policy for an action.
 
     Raises:
@@ -125,7 +125,7 @@ def _chosen(policy: Policy, world: World) -> Floats:
         raise ActionError("an action is finite numbers", given) from None
 
 
-def begin(world: World, seed: int, number: int, course: Course, trace: Trace) -> None:
+def begin(world: System, seed: int, number: int, course: Course | Courses, trace: Trace) -> None:
     """Begin an episode, with what is due at its first instant.
 
     Args:
@@ -139,30 +139,30 @@ def begin(world: World, seed: int, number: int, course: Course, trace: Trace) ->
     intervene(world, course, 0, trace)
 
 
-def intervene(world: World, course: Course, step: int, trace: Trace) -> None:
+def intervene(world: System, course: Course | Courses, step: int, trace: Trace) -> None:
     """Do what is due at an instant."""
-    due = course.due(world, step, trace.fired)
+    due: Any = course.due(world, step, trace.fired)
     if due:
         trace.audits[step] = world.do(due)
 
 
-def note_parameters(world: World, trace: Trace, step: int) -> None:
+def note_parameters(world: System, trace: Trace, step: int) -> None:
     """Write down the values of parameters, and the structure if it is another one."""
-    now = world.current()[0]
+    now = world.current()[0] if isinstance(world, World) else {}
     values = {name: np.array(now[name]) for name in world.static_names}
     trace.statics.append((step, values))
     if not trace.declarations or trace.declarations[-1][1].plan != world.declaration.plan:
         trace.declarations.append((step, world.declaration))
 
 
-def write(world: World, trace: Trace, names: tuple[str, ...], contacts: bool = False) -> None:
+def write(world: System, trace: Trace, names: tuple[str, ...], contacts: bool = False) -> None:
     """Write down an instant, with what else was asked for."""
-    trace.vectors.append(world.current()[1].vector.copy())
+    trace.vectors.append(world.vector.copy())
     if names:
         there = names if names == (ALL,) else tuple(name for name in names if name in world.model)
         found = world.values() if names == (ALL,) else world.evaluate(there)
         for name in found if names == (ALL,) else there:
             trace.values.setdefault(name, []).append(np.array(found[name]))
-    if contacts:
+    if contacts and isinstance(world, World):
         pairs = (tuple(sorted(c.bodies)) for c in world.backend.contacts() if c.force > 0.0)
         trace.touching.append(frozenset((one, other) for one, other in pairs))

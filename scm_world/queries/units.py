@@ -7,9 +7,22 @@ from dataclasses import dataclass, field
 from typing import Any, final
 
 from scm_world.queries.courses import Course, Layer
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.policies import Policy, as_policy
 from scm_world.queries.traces import Trace, intervene, run
-from scm_world.world import World, WorldSnapshot
+from scm_world.world.start import whole_number
+
+
+def length(system: System, steps: int | None) -> int:
+    """Give the number of control steps of an episode; that of the task if None.
+
+    Raises:
+        UnknownOption: It is no possible number.
+        ModelError: The system has no number of its own.
+    """
+    if isinstance(system, Equations):
+        return system.length(steps)
+    return whole_number("steps", system.max_episode_length if steps is None else steps, least=1)
 
 
 @final
@@ -37,7 +50,7 @@ class Unit:
     names: tuple[str, ...] = ()
     first: int = 0
     past: Trace = field(default_factory=Trace)
-    start: WorldSnapshot | None = None
+    start: Any = None
 
     def goes_on(self) -> Trace:
         """Give the past, to be gone on with."""
@@ -45,14 +58,14 @@ class Unit:
         trace.values = {name: list(values) for name, values in self.past.values.items()}
         return trace
 
-    def arrive(self, world: World) -> None:
+    def arrive(self, world: System) -> None:
         """Bring a world to the instant at which it goes on."""
         if self.start is None:
             world.reset(seed=self.seed, episode=self.number)
         else:
             world.restore(self.start)
 
-    def lived(self, world: World, arrive: Callable[[World], None] | None = None) -> Trace:
+    def lived(self, world: System, arrive: Callable[[System], None] | None = None) -> Trace:
         """Let it happen in a world by itself.
 
         Args:
@@ -78,13 +91,13 @@ class Unit:
         )
         return trace
 
-    def ended(self, world: World) -> Trace | Exception:
+    def ended(self, world: System) -> Trace | Exception:
         """Let it happen in a world by itself; give what stopped it, if something did."""
         try:
             return self.lived(world)
         except Exception as error:
             return error
 
-    def acts(self, world: World | None = None) -> Policy:
+    def acts(self, world: System | None = None) -> Policy:
         """Make the policy, for one life, in a world if it is known."""
-        return as_policy(self.policy, None if world is None else world.task)
+        return as_policy(self.policy, world)

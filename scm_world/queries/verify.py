@@ -8,8 +8,10 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Any, final
 
 from scm_world.errors import UnknownOption
+from scm_world.graph import SCM
 from scm_world.queries.agreement import Agreement, Sign
 from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.series import Series, checked_count
@@ -44,7 +46,7 @@ OTHER = 1_000_003
 
 
 def verify(
-    system: World | Task | str,
+    system: World | SCM | Task | str,
     *,
     probes: int = MOST,
     least: int = LEAST,
@@ -52,7 +54,7 @@ def verify(
     progress: Progress | None = None,
     **options: Any,
 ) -> Verification:
-    """Check the declared graph of a world against the physics that realises it.
+    """Check a declared graph against the physics or the equations that realise it.
 
     From many probe states one variable at a time is changed, everything else kept, and whatever
     differs afterwards is held against the declared edges. It ends when every declared edge was
@@ -63,8 +65,12 @@ def verify(
     show. So it ends when nothing new is seen any more, and what was never seen, or seen without
     an edge, is looked for again in probe states of another seed.
 
+    A causal model without a backend is its own physics: each mechanism is evaluated with one
+    variable changed. A declared parent that its mechanism ignores never shows. An effect without
+    an edge cannot be, since a mechanism is given its declared parents only.
+
     Args:
-        system: A world, a task, the name of one, or a model file.
+        system: A world, a causal model, a task, the name of one, or a model file.
         probes: How many states to experiment in at most.
         least: How many even if every declared edge has been seen before.
         seed: Of states and values.
@@ -82,7 +88,7 @@ def verify(
     """
     checked_count("number of probes", probes)
     checked_count("least number of probes", least)
-    if isinstance(system, World):
+    if isinstance(system, World | SCM):
         if options:
             raise UnknownOption("option for a world that is made", next(iter(options)), ())
         return _verified(system, probes, least, seed, progress)
@@ -180,22 +186,24 @@ class _Watch:
 
 
 def _verified(
-    world: World, probes: int, least: int, seed: int, progress: Progress | None
+    system: World | SCM, probes: int, least: int, seed: int, progress: Progress | None
 ) -> Verification:
     started = time.perf_counter()
-    generated = world.task.generated_graph
-    declared = tuple(edge.key for edge in world.model.edges)
-    measured = {v.name for v in world.model.variables if isinstance(v, Measured)}
+    world = system if isinstance(system, World) else None
+    model: SCM = system.model if isinstance(system, World) else system
+    generated = world is not None and world.task.generated_graph
+    declared = tuple(edge.key for edge in model.edges)
+    measured = {v.name for v in model.variables if isinstance(v, Measured)}
     watch = _Watch(declared, least, QUIET if generated else None)
-    paired = Paired(world, seed)
+    paired = Paired(world, seed) if world else PairedEquations(model, seed)
     series = Series(paired, probes, progress)
-    series.run(probe_states(world, probes, seed), watch)
+    series.run(probe_states(world, probes, seed) if world else range(probes), watch)
     effects, done = series.effects, series.done
     found = effects.edges(set(declared))
     interrupted = done < probes and not watch.ended
     open_ = found.symmetric_difference(declared)
     held_out: Series | None = None
-    if generated and open_ and not interrupted:
+    if world and generated and open_ and not interrupted:
         causes = {cause for cause, _, _ in open_}
         held_out = _held_out(world, causes, seed, lambda new, more: watch(new, done + more))
         interrupted = held_out.done < HELD_OUT
@@ -203,11 +211,10 @@ def _verified(
         found = effects.edges(set(declared))
     again = None if held_out is None else held_out.effects.edges(set(declared))
     colors = {edge for edge in {*found, *declared} if _is_color(edge[0]) and edge[1] in measured}
-    local = None if interrupted else _local(world, seed)
     return Verification(
-        task=world.task.name,
-        backend=world.backend.name,
-        preset=world.options.preset,
+        task=world.task.name if world else "model",
+        backend=world.backend.name if world else "equations",
+        preset=world.options.preset if world else "none",
         seed=seed,
         generated=generated,
         probes=done,
@@ -218,7 +225,7 @@ def _verified(
         floor=effects.floor,
         threshold=effects.threshold,
         settable=len(paired.targets),
-        untried=tuple(sorted(set(paired.targets) - effects.undone)),
+        untried=tuple(sorted(set(paired.targets) - effects.undone)) if world else (),
         fired=tuple(_fired(key, effects, watch) for key in sorted(found & set(declared))),
         never_fired=tuple(sorted(set(declared) - found)),
         undeclared=tuple(
@@ -226,9 +233,9 @@ def _verified(
             for key in sorted(found - set(declared))
         ),
         colors=tuple(sorted(colors)),
-        local=local,
+        local=_local(world, seed) if world and not interrupted else None,
         seconds=time.perf_counter() - started,
-        versions=versions(world.engine),
+        versions=versions(world.engine if world else ""),
     )
 
 

@@ -15,6 +15,7 @@ from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry import chains
+from scm_world.graph import SCM
 from scm_world.models import Model, ParameterKey, Readout, Row
 from scm_world.tasks.base import Task, Timing
 from scm_world.tasks.composition import Clock, Composition
@@ -527,5 +528,8 @@ def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iter
         with blamed(source):
             made = factory(**options)
         made = getattr(made, "task", made)  # of a world
+        if isinstance(made, SCM):
+            allowed = ("a function that gives a task, a model or a world", "discover", "verify")
+            raise UnknownOption("command for a causal model without a backend", source, allowed)
         return made if isinstance(made, Task) else ModelTask(made)
     raise UnknownOption("task", source, (*known(), "file.xml", "file.urdf", "module:function"))

@@ -369,6 +369,11 @@ class World(Stepped):
         """The present as one row of numbers, shape (1, width); see ``Mechanisms.where``."""
         return self._matrix
 
+    @property
+    def vector(self) -> Floats:
+        """The live state, flat, shape (size,)."""
+        return self._state.vector
+
     def current(self) -> tuple[Values, State]:
         """Give the live values and the live state, for the parts of a ``do``."""
         return self._now, self._state

@@ -119,7 +119,7 @@ def test_every_point_has_the_same_units(world: World) -> None:
     found = sweep(world, OVER, [SPEED, "gravity"], n=3, **HOW)
     for place, point in enumerate(found.points):
         assert found.units(place).tolist() == [0, 1, 2]
-        told = world.sample(point, 3, outcomes=[SPEED], steps=2, seed=5, nature=HOW["nature"])
+        told = world.sample(3, point, outcomes=[SPEED], steps=2, seed=5, nature=HOW["nature"])
         name = found.measured[0].name
         assert found.values(place, name).tolist() == next(iter(told.values())).tolist()
         falls = [found.values(at, "gravity[2]").tolist() for at in (place, 0)]

@@ -58,9 +58,9 @@ def test_a_draw_needs_a_moment() -> None:
 def test_a_row_of_a_sample_can_be_drawn_alone(act: dict[str, Any]) -> None:
     """sample(1, first=i) is row i: results do not depend on how many are drawn."""
     model = small().do(act)
-    rows = model.sample(20, seed=9)
+    rows = model.draw(20, seed=9)
     for i in (0, 7, 19):
-        alone = model.sample(1, seed=9, first=i)
+        alone = model.draw(1, seed=9, first=i)
         for name in model:
             np.testing.assert_array_equal(alone[name][0], rows[name][i])
 
@@ -84,26 +84,26 @@ def lagged() -> SCM:
 
 def test_a_process_is_sampled_step_by_step() -> None:
     """Lagged parents are those of the step before, and the declared start before the first."""
-    values = lagged().sample(50, seed=0, steps=6)
+    values = lagged().draw(50, seed=0, steps=6)
     assert values["x"].shape == (50, 6)
     np.testing.assert_array_equal(values["y"][:, 1:], 2.0 * values["x"][:, :-1])
     np.testing.assert_array_equal(values["y"][:, 0], 16.0)
     residual = values["x"][:, 1:] - 0.5 * values["x"][:, :-1] - values["push"][:, 1:]
     assert residual.std() == pytest.approx(0.1, abs=0.02)
     with pytest.raises(ModelError, match="how many steps"):
-        lagged().sample(2, seed=0)
+        lagged().draw(2, seed=0)
 
 
 def test_longer_processes_begin_like_shorter_ones() -> None:
     """Neither the number of steps nor that of episodes shifts the noise."""
-    short, long = lagged().sample(2, seed=0, steps=3), lagged().sample(5, seed=0, steps=9)
+    short, long = lagged().draw(2, seed=0, steps=3), lagged().draw(5, seed=0, steps=9)
     for name in lagged():
         np.testing.assert_array_equal(short[name], long[name][:2, :3])
 
 
 def test_do_on_a_process_does_not_shift_its_noise() -> None:
     """What does not follow the target keeps its value at every step."""
-    before = lagged().sample(4, seed=0, steps=5)
-    after = lagged().do({"x": 0.0}).sample(4, seed=0, steps=5)
+    before = lagged().draw(4, seed=0, steps=5)
+    after = lagged().do({"x": 0.0}).draw(4, seed=0, steps=5)
     np.testing.assert_array_equal(before["push"], after["push"])
     np.testing.assert_array_equal(after["y"][:, 1:], np.zeros((4, 4)))

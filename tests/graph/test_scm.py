@@ -145,7 +145,7 @@ def test_a_draw_cuts_the_edges_into_its_target() -> None:
     model = small().do({"weight": Draw(Normal(1.0, 0.1))})
     assert model.parents("weight") == ()
     assert isinstance(model["weight"], Exogenous)
-    values = model.sample(4_000, seed=0)
+    values = model.draw(4_000, seed=0)
     assert values["weight"].mean() == pytest.approx(1.0, abs=0.01)
     assert abs(np.corrcoef(values["weight"], values["block.mass"])[0, 1]) < 0.05
 
@@ -164,9 +164,9 @@ def test_a_draw_from_a_space_that_follows_a_variable_adds_the_edge() -> None:
     """What bounds the draw is a parent of what is drawn, and is computed first."""
     model = small().do({"weight": Draw("A")})
     assert model.parents("weight") == ("friction",)
-    values = model.sample(500, seed=1)
+    values = model.draw(500, seed=1)
     assert (values["weight"] <= values["friction"]).all()
-    fixed = model.do({"friction": 0.001}).sample(100, seed=1)
+    fixed = model.do({"friction": 0.001}).draw(100, seed=1)
     assert (fixed["weight"] <= 0.001).all()
 
 
@@ -294,7 +294,7 @@ def test_two_dos_are_one(a: dict[str, Any], b: dict[str, Any]) -> None:
     split, joint = small().do(a).do(b), small().do({**a, **b})
     assert split == joint
     assert set(split.edges) == set(joint.edges)
-    one, other = split.sample(3, seed=0), joint.sample(3, seed=0)
+    one, other = split.draw(3, seed=0), joint.draw(3, seed=0)
     assert all(np.array_equal(one[name], other[name]) for name in small())
 
 
@@ -304,6 +304,6 @@ def test_do_moves_descendants_only(a: dict[str, Any]) -> None:
     """With the same noise everything else keeps its value, bit for bit."""
     model = small()
     moved = {d for name in a for d in model.descendants(name)} | set(a)
-    before, after = model.sample(5, seed=3), model.do(a).sample(5, seed=3)
+    before, after = model.draw(5, seed=3), model.do(a).draw(5, seed=3)
     for name in set(model) - moved:
         np.testing.assert_array_equal(before[name], after[name])

@@ -132,7 +132,7 @@ def test_plans_happen_in_time(world: World) -> None:
 
 def test_samples_have_what_counts(world: World) -> None:
     """Unless told otherwise, everything that is computed from the states is read off."""
-    found = world.sample({"pole.mass": 0.2}, 5, steps=4)
+    found = world.sample(5, {"pole.mass": 0.2}, steps=4)
     assert {name: found[name].shape for name in found} == {"tip.position": (5, 3), "reward": (5,)}
     bare = World.from_mjcf(CART_POLE)
     with pytest.raises(UnknownOption, match=r"outcomes cannot be None.*slider\.position"):
@@ -144,7 +144,7 @@ def test_many_together_are_as_many_alone(world: World) -> None:
     """A batch of 16 on two threads gives the bits of 16 episodes by themselves."""
     alone = Random()
     sets = [
-        world.sample({"pole.mass": 0.2}, 16, steps=60, workers=workers, policy=policy)
+        world.sample(16, {"pole.mass": 0.2}, steps=60, workers=workers, policy=policy)
         for workers, policy in ((2, "random"), (None, alone.__call__))
     ]
     for name in sets[0]:

@@ -84,7 +84,7 @@ def test_units_are_the_same_in_every_question() -> None:
     world = World("pushing", backend="fake")
     outcomes = ["tool_block.mass", Outcome("reward", "sum"), slid]
     ten = world.see(10, outcomes=outcomes, nature=NATURE, steps=3)
-    last = world.sample({}, 3, first=7, outcomes=outcomes, nature=NATURE, steps=3, workers=3)
+    last = world.sample(3, first=7, outcomes=outcomes, nature=NATURE, steps=3, workers=3)
     assert [*ten] == ["tool_block.mass", "sum reward", "slid"]
     for name in ten:
         np.testing.assert_array_equal(ten[name][7:], last[name])
@@ -94,7 +94,7 @@ def test_units_are_the_same_in_every_question() -> None:
 def test_a_table_goes_to_a_file(tmp_path: Path) -> None:
     """Numbers without loss, and what was done beside them."""
     found = World("pushing", backend="fake").sample(
-        {"tool_block.mass": "B"}, 3, outcomes=["tool_block.mass", "joint_positions"], steps=2
+        3, {"tool_block.mass": "B"}, outcomes=["tool_block.mass", "joint_positions"], steps=2
     )
     found.to_csv(tmp_path / "table.csv")
     table = np.loadtxt(tmp_path / "table.csv", delimiter=",", skiprows=1)

@@ -199,7 +199,7 @@ def test_nature_counts_until_something_is_done(world: World) -> None:
     """The treatment does not change the past of its units."""
     options: dict[str, Any] = {"nature": {FLOOR: "A"}, "steps": 3}
     first = Outcome(FLOOR, "first")
-    done = world.sample({FLOOR: At(1, 0.3)}, 3, outcomes=[first, FLOOR], **options)
+    done = world.sample(3, {FLOOR: At(1, 0.3)}, outcomes=[first, FLOOR], **options)
     seen = world.see(3, outcomes=[first], **options)
     np.testing.assert_array_equal(done["first floor_friction"], seen["first floor_friction"])
     assert done[FLOOR].tolist() == [0.3] * 3

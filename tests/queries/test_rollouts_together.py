@@ -174,8 +174,8 @@ def sampled(world: World, n: int = 48, **setting: Any) -> Any:
     told: list[tuple[int, int]] = []
     outcomes = ("reward", Outcome("reward", "sum"), "tool_block.mass", lambda e: e.final("action"))
     found = world.sample(
-        {"floor_friction": 0.4},
         n,
+        {"floor_friction": 0.4},
         outcomes=outcomes,
         nature={"tool_block.mass": "A"},
         progress=lambda *at: told.append(at),

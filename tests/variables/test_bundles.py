@@ -46,7 +46,7 @@ def model(**fields: Any) -> SCM:
 def test_a_bundle_is_computed_from_its_parts() -> None:
     """Its numbers are theirs, one after another, also for many episodes at once."""
     assert model().solve()["both"].tolist() == [1.0, 2.0, 3.0]
-    drawn = model().do({"left": Draw(Box(0.0, 1.0))}).sample(4, seed=0)
+    drawn = model().do({"left": Draw(Box(0.0, 1.0))}).draw(4, seed=0)
     np.testing.assert_array_equal(drawn["both"][:, :2], drawn["left"])
     np.testing.assert_array_equal(drawn["both"][:, 2], 3.0)
 
@@ -72,8 +72,8 @@ def test_a_draw_is_one_of_the_whole_bundle() -> None:
     """It has the numbers that a variable of the bundle's name and shape would have had."""
     vector = Exogenous(name="both", shape=(3,), default=(0.0,) * 3, a=Box(0.0, 1.0))
     for act in (Draw("A"), Draw(Box(1.0, 2.0)), Draw("A", stream="mine")):
-        finer = model(a=Box(0.0, 1.0)).do({"both": act}).sample(5, seed=7)
-        whole = SCM([vector]).do({"both": act}).sample(5, seed=7)
+        finer = model(a=Box(0.0, 1.0)).do({"both": act}).draw(5, seed=7)
+        whole = SCM([vector]).do({"both": act}).draw(5, seed=7)
         np.testing.assert_array_equal(finer["both"], whole["both"])
 
 
@@ -92,8 +92,8 @@ def test_a_mechanism_gives_the_whole_bundle() -> None:
 def test_parts_can_be_set_after_the_bundle() -> None:
     """A later intervention on a part, or its release, leaves the other parts as they are held."""
     held = model(a=Box(0.0, 1.0)).do({"both": Draw("A")})
-    drawn = held.sample(3, seed=1)["both"]
-    again = held.do({"right": 4.0}).sample(3, seed=1)["both"]
+    drawn = held.draw(3, seed=1)["both"]
+    again = held.do({"right": 4.0}).draw(3, seed=1)["both"]
     np.testing.assert_array_equal(again[:, :2], drawn[:, :2])
     np.testing.assert_array_equal(again[:, 2], 4.0)
     assert held.do({"left": Natural()}).interventions.keys() == {"right"}
@@ -128,7 +128,7 @@ def test_what_a_bundle_was_given_survives_json() -> None:
     held = model(a=Box(0.0, 1.0)).do({"both": Draw("A")})
     read = from_json(to_json(held))
     assert read == held
-    np.testing.assert_array_equal(read.sample(2, seed=0)["both"], held.sample(2, seed=0)["both"])
+    np.testing.assert_array_equal(read.draw(2, seed=0)["both"], held.draw(2, seed=0)["both"])
 
 
 def test_what_is_no_bundle_is_written_as_before() -> None:

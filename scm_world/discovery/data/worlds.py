@@ -134,7 +134,7 @@ class Episodes:
         return self._part(list(zip(numbers, regimes, found, strict=True)))
 
     def _unit(self, number: int, regime: Regime) -> Unit:
-        given = Plan(merged(self._world.declaration, self._given, regime.plan))
+        given = Plan(merged(self._world.model, self._given, regime.plan))
         plan = self._setting.plan(self._world, given)
         return self._setting.unit(self._world, plan, number, self._written)
 

@@ -185,7 +185,8 @@ def _differences(one: Episode, other: Episode) -> dict[str, _Apart]:
 
 def _declaration_at(episode: Episode, step: int) -> Declaration:
     declared = reversed(episode.trace.declarations)
-    return next(one for start, one in declared if start <= step)
+    found: Declaration = next(one for start, one in declared if start <= step)
+    return found
 
 
 def _apart(mine: _Body, its: _Body) -> tuple[float, float]:

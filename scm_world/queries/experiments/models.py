@@ -2,33 +2,47 @@
 
 from __future__ import annotations
 
+from typing import Any, final
+
 import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.graph import SCM, Moment
+from scm_world.queries.equations import Layout
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.variables import Box, Categories, Integers, Noise, Variable
 
 
-def paired_effects(model: SCM, *, probes: int, seed: int) -> Effects:
-    """Find the direct effects in a structural causal model.
+@final
+class PairedEquations:
+    """Paired experiments with a structural causal model.
 
-    From each drawn unit, one variable at a time is set to another value while every other
-    variable keeps its old one; what a mechanism then says differently is a direct effect. The
-    noise is the same throughout.
+    From a drawn unit, one variable at a time is set to another value while every other variable
+    keeps its old one; what a mechanism then says differently is a direct effect. The noise is the
+    same throughout.
 
     Args:
-        model: Every variable of it can be set.
-        probes: How many units to draw.
+        model: Every variable of it can be computed; actions have the value that is nearest to zero.
         seed: Of the units and of the values.
+
+    Attributes:
+        effects: What was seen.
+        targets: The variables that are set.
     """
-    effects = Effects()
-    noise = Noise(seed)
-    for number in range(probes):
-        first = model.solve(moment=Moment(noise, number, 0))
+
+    def __init__(self, model: SCM, seed: int) -> None:
+        self._model, self._noise = model, Noise(seed)
+        self._actions = Layout(model).idle()
+        self.effects = Effects()
+        self.targets = tuple(model)
+
+    def run(self, number: int, probe: Any = None) -> None:
+        """Do all experiments with one unit."""
+        model, effects, noise = self._model, self.effects, self._noise
+        first = model.solve(self._actions, moment=Moment(noise, number, 0))
         at = Moment(noise, number, 1)
-        unit = model.solve(previous=first, moment=at)
-        again = model.solve(previous=first, moment=at)
+        unit = model.solve(self._actions, previous=first, moment=at)
+        again = model.solve(self._actions, previous=first, moment=at)
         effects.rollouts += 2
         effects.floor = max(effects.floor, *(gap(unit[n], again[n]) for n in unit))
         for cause in model:
@@ -37,7 +51,21 @@ def paired_effects(model: SCM, *, probes: int, seed: int) -> Effects:
             memory = {**first, cause: _another(model[cause], first[cause], first, noise, number)}
             _compare(model, cause, unit, memory, unit, at, effects, lag=1)
             effects.rollouts += 1
-    return effects
+        effects.end_of_probe()
+
+
+def paired_effects(model: SCM, *, probes: int, seed: int) -> Effects:
+    """Find the direct effects in a structural causal model; see ``PairedEquations``.
+
+    Args:
+        model: Every variable of it can be computed.
+        probes: How many units to draw.
+        seed: Of the units and of the values.
+    """
+    paired = PairedEquations(model, seed)
+    for number in range(probes):
+        paired.run(number)
+    return paired.effects
 
 
 def _compare(

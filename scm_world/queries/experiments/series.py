@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import final
+from typing import Any, final
 
 from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.effects import Effects
+from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
-from scm_world.queries.experiments.probes import Probe
 from scm_world.queries.progress import Progress
 
 
@@ -28,13 +28,18 @@ class Series:
     """
 
     def __init__(
-        self, paired: Paired, planned: int, progress: Progress | None = None, *, done: int = 0
+        self,
+        paired: Paired | PairedEquations,
+        planned: int,
+        progress: Progress | None = None,
+        *,
+        done: int = 0,
     ) -> None:
         self._paired, self._planned, self._progress = paired, planned, progress
         self.effects, self.done = paired.effects, done
 
     def run(
-        self, probes: Iterable[Probe], enough: Callable[[Effects, int], bool] | None = None
+        self, probes: Iterable[Any], enough: Callable[[Effects, int], bool] | None = None
     ) -> None:
         """Do all experiments.
 

@@ -1,0 +1,385 @@
+"""Equations that are stepped without a backend: what a world is, for a causal model alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
+from scm_world.graph import SCM, Moment, flatten
+from scm_world.variables import Action, Noise
+from scm_world.world import Audit, World
+from scm_world.world.audit import Applied
+from scm_world.world.commands import clipped
+from scm_world.world.compare import same
+from scm_world.world.start import whole_number
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where the variables of a model stand in one row of numbers.
+
+    Attributes:
+        model: With the interventions that hold in every episode.
+    """
+
+    model: SCM
+    plan = None
+
+    @cached_property
+    def slices(self) -> Mapping[str, slice]:
+        """Place of each variable."""
+        return _places(self.model, self.model)
+
+    @cached_property
+    def size(self) -> int:
+        """How many numbers there are."""
+        return max((where.stop for where in self.slices.values()), default=0)
+
+    @cached_property
+    def actions(self) -> Mapping[str, slice]:
+        """Place of each action in the vector of all actions."""
+        declared = self.model.variables
+        return _places(self.model, [v.name for v in declared if isinstance(v, Action)])
+
+    @property
+    def n_actions(self) -> int:
+        """How many numbers all actions have together."""
+        return max((where.stop for where in self.actions.values()), default=0)
+
+    @cached_property
+    def action_bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper end of all actions, shape (n_actions,) each."""
+        low, high = np.full(self.n_actions, -np.inf), np.full(self.n_actions, np.inf)
+        for name, where in self.actions.items():
+            variable: Any = self.model.declared(name)
+            if variable.bounds is not None:
+                ends = variable.bounds.bounds(variable.shape, {})
+                low[where], high[where] = (np.ravel(end) for end in ends)
+        return low, high
+
+    def idle(self) -> dict[str, Value]:
+        """Give the value of each action that is nearest to zero."""
+        found = np.clip(np.zeros(self.n_actions), *self.action_bounds)
+        shapes = {name: self.model.declared(name).shape for name in self.actions}
+        return {name: found[where].reshape(shapes[name]) for name, where in self.actions.items()}
+
+    @cached_property
+    def is_vectorised(self) -> bool:
+        """Whether the functions of the model take values with a leading axis, one row each."""
+        try:
+            alone = [Equations(self, vectorised=False) for _ in range(2)]
+            both = Equations(self, [0, 0], vectorised=True)
+            for episode, one in enumerate(alone):
+                one.reset(seed=0, episode=episode)
+            both.reset(seed=0)
+            for _ in range(2 if self.model.is_temporal else 0):
+                for system in (*alone, both):
+                    system.step(system.idle())
+            wanted = np.array([one.vector for one in alone])
+            return np.allclose(both.vector, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
+        except Exception:  # whatever a function says to a shape that it does not know
+            return False
+
+    def read(self, name: str, vectors: Floats) -> Value:
+        """Give a variable in many rows, shape (..., size): an array of shape (..., *shape)."""
+        variable = self.model.declared(name)
+        found = vectors[..., self.slices[name]].reshape(*vectors.shape[:-1], *variable.shape)
+        return found if variable.dtype == "real" else found.astype(np.int64)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"model": self.model}
+
+
+def _places(model: SCM, names: Any) -> dict[str, slice]:
+    found, end = dict[str, slice](), 0
+    for name in names:
+        start, end = end, end + int(np.prod(model.declared(name).shape, dtype=int))
+        found[name] = slice(start, end)
+    return found
+
+
+@final
+@dataclass(frozen=True)
+class Saved:
+    """An instant of ``Equations``; it decides how they go on."""
+
+    models: tuple[SCM, ...]
+    values: Values
+    before: Values
+    action: Values
+    index: int
+    seed: int
+    episode: int
+
+
+@final
+class Equations:
+    """A causal model that is stepped: it has the methods of a ``World`` that queries use.
+
+    Instant 0 of a model with lagged edges is the one that its first step looks back at (see
+    ``SCM.begin``); instant t + 1 is drawn with the noise of step t. A model without lagged edges
+    has one instant only, drawn with the noise of step 0. An intervention replaces a mechanism from
+    its instant on, and the instant is solved again with the same noise.
+
+    Several episodes can be solved together, each under its own interventions; then every value
+    has a leading axis.
+
+    Args:
+        layout: Of the model.
+        groups: For each of several episodes the number of its group; those of a group have the
+            same interventions. None for one episode.
+        vectorised: Whether to solve one episode as a batch of one, so that it has the bits that
+            it has among others; what ``layout`` says if None.
+    """
+
+    static_names: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        layout: Layout,
+        groups: Sequence[int] | None = None,
+        *,
+        vectorised: bool | None = None,
+    ) -> None:
+        self.declaration, self.model = layout, layout.model
+        vectorised = layout.is_vectorised if vectorised is None else vectorised
+        self._groups = np.zeros(1, dtype=int) if groups is None else np.asarray(groups)
+        self._is_one = groups is None
+        self._count = len(self._groups) if vectorised else None
+        self.version, self.index = 0, 0
+        self.noise, self.episode = Noise(0), 0
+        self._models: list[SCM] = []
+        self._before: Values = {}
+        self._action: Values = {}
+        self._solved: dict[str, Value] | None = None
+
+    # --- what a world tells -------------------------------------------------------------------
+
+    @property
+    def action_low(self) -> Floats:
+        """Lower end of all actions, shape (n_actions,)."""
+        return self.declaration.action_bounds[0]
+
+    @property
+    def action_high(self) -> Floats:
+        """Upper end of all actions, shape (n_actions,)."""
+        return self.declaration.action_bounds[1]
+
+    def idle(self) -> Floats:
+        """Give the action that is nearest to zero, shape (n_actions,)."""
+        return np.clip(np.zeros(self.declaration.n_actions), *self.declaration.action_bounds)
+
+    def length(self, steps: int | None) -> int:
+        """Check the number of control steps of an episode.
+
+        Raises:
+            ModelError: It is None, and the model has lagged edges.
+            UnknownOption: It is no whole number, or the model has no lagged edges and it is not 0.
+        """
+        if self.model.is_temporal:
+            if steps is None:
+                raise ModelError(["the model has lagged edges: say how many steps an episode has"])
+            return whole_number("steps", steps, least=1)
+        if steps not in (None, 0):
+            raise UnknownOption("steps", steps, ("0: the model has no lagged edges",))
+        return 0
+
+    @property
+    def graph(self) -> SCM:
+        """The model with the interventions that hold now."""
+        return self._models[0]
+
+    @property
+    def vector(self) -> Floats:
+        """All values, flat, shape (size,), or (n, size) of several episodes."""
+        values = self._now()
+        lead = () if self._count is None else (self._count,)
+        parts = [np.reshape(values[name], (*lead, -1)) for name in self.model]
+        flat: Floats = np.concatenate(parts, axis=-1).astype(np.float64)
+        return flat[0] if self._is_one and lead else flat
+
+    def __getitem__(self, name: str) -> Value:
+        self.model.declared(name)
+        return np.array(self._shown(self._now()[name]))
+
+    def values(self) -> dict[str, Value]:
+        """Give the present value of every variable, as copies."""
+        return {name: self[name] for name in self.model}
+
+    def evaluate(self, names: Sequence[str]) -> dict[str, Value]:
+        """Give all present values."""
+        return {name: self._shown(value) for name, value in self._now().items()}
+
+    def _shown(self, value: Value) -> Value:
+        """Take the leading axis off where there is one episode."""
+        return value[0] if self._is_one and self._count is not None else value
+
+    # --- what a world does --------------------------------------------------------------------
+
+    def reset(self, *, seed: int, episode: int = 0) -> None:
+        """Begin an episode, or several: ``episode`` is then the number of the first one."""
+        self.noise = Noise(whole_number("seed", seed, least=0))
+        self.episode = whole_number("episode", episode, least=0)
+        self._models = [self.model] * (int(self._groups.max()) + 1)
+        self.index, self._before = 0, {}
+        self._action = self._split(self.idle())
+        self._changed()
+
+    def do(self, request: Mapping[Any, Any]) -> Audit:
+        """Intervene now.
+
+        Args:
+            request: Interventions by name; of several episodes, such requests by group.
+
+        Returns:
+            What was requested and applied, and what followed at once.
+
+        Raises:
+            InterventionError: The request was refused; everything is as before.
+        """
+        by_group = {0: request} if self._is_one else request
+        models = {group: self._models[group].do(acts) for group, acts in by_group.items()}
+        earlier = self._now() if self._is_one else {}
+        for group, model in models.items():
+            self._models[group] = model
+        self._changed()
+        if not self._is_one:
+            return Audit({}, {}, {})
+        flat, now = flatten(request), self._now()
+        targets = {
+            name: Applied(name, act, None if name in self._action else self[name], None)
+            for name, act in flat.items()
+        }
+        moved = {
+            name: (self._shown(earlier[name]), self._shown(now[name]))
+            for name in self.model
+            if name not in targets and not same(earlier[name], now[name])
+        }
+        return Audit(targets, moved, {})
+
+    def step(self, action: ArrayLike) -> None:
+        """Take a step.
+
+        Args:
+            action: All actions, shape (n_actions,), or (n, n_actions) of several episodes; clipped
+                to their range.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite.
+        """
+        low, high = self.declaration.action_bounds
+        rows = np.asarray(action, dtype=np.float64) if not self._is_one else None
+        if rows is not None and rows.ndim == 2:
+            given = np.clip(rows, low, high)
+        else:
+            given = clipped(action, low, high, "1")
+        now = {**self._now(), **self._split(given)}
+        for name, where in self.declaration.actions.items():
+            shape = self.model.declared(name).shape
+            ends = (low[where].reshape(shape), high[where].reshape(shape))
+            now[name] = np.clip(self._computed(name, now, self.index), *ends)
+        self._before, self._action = now, {name: now[name] for name in self.declaration.actions}
+        self.index += 1
+        self._solved = None
+
+    def snapshot(self) -> Saved:
+        """Save everything that decides how it goes on."""
+        models, noise = tuple(self._models), self.noise
+        return Saved(
+            models, self._now(), self._before, self._action, self.index, noise.seed, self.episode
+        )
+
+    def restore(self, saved: Any) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Raises:
+            SnapshotMismatch: It is none of equations.
+        """
+        if not isinstance(saved, Saved):
+            raise SnapshotMismatch(f"{saved!r} is no snapshot of equations")
+        self._models, self._before, self._action = list(saved.models), saved.before, saved.action
+        self.index, self.noise, self.episode = saved.index, Noise(saved.seed), saved.episode
+        self._changed()
+        self._solved = dict(saved.values)
+
+    # --- solving ------------------------------------------------------------------------------
+
+    def _changed(self) -> None:
+        self.version += 1
+        self._solved = None
+        self._order: tuple[str, ...] | None = None
+
+    def _split(self, action: Floats) -> dict[str, Value]:
+        """Give every action variable its part of a vector of all, for each episode."""
+        lead, found = () if self._count is None else (self._count,), dict[str, Value]()
+        for name, where in self.declaration.actions.items():
+            shape = self.model.declared(name).shape
+            part = action[..., where].reshape((*action.shape[:-1], *shape))
+            found[name] = np.broadcast_to(part, (*lead, *shape))
+        return found
+
+    def _now(self) -> dict[str, Value]:
+        """Solve the present instant, if that has not been done."""
+        if self._solved is None:
+            values: dict[str, Value] = dict(self._action)
+            starts = self.index == 0 and self.model.is_temporal
+            for name in self._in_order():
+                if name not in values:
+                    values[name] = self._computed(
+                        name, values, self.index - (self.index > 0), starts
+                    )
+            self._solved = values
+        return self._solved
+
+    def _computed(self, name: str, values: Values, step: int, starts: bool = False) -> Value:
+        """Compute one variable: by the declared model, and by that of groups that differ."""
+        moment = Moment(self.noise, self.episode, step, self._count)
+        lead = () if self._count is None else (self._count,)
+        shape = (*lead, *self.model.declared(name).shape)
+
+        def by(model: SCM) -> Value:
+            if starts:
+                found = model.begin(values, moment=moment, only=(name,))
+            else:
+                before = self._before
+                found = model.solve(values, previous=before, moment=moment, only=(name,))
+            return np.broadcast_to(found[name], shape)
+
+        if len(self._models) == 1:
+            return by(self._models[0])
+        value = by(self.model)
+        for group, model in enumerate(self._models):
+            if model is not self.model and model.act_on(name) != self.model.act_on(name):
+                here = (self._groups == group).reshape(-1, *(1,) * (len(shape) - 1))
+                value = np.where(here, by(model), value)
+        return value
+
+    def _in_order(self) -> tuple[str, ...]:
+        """Give an order in which everything can be computed, whatever is done in each group."""
+        if self._order is None:
+            models = dict.fromkeys(map(id, (self.model, *self._models)))
+            kept = [m for m in (self.model, *self._models) if models.pop(id(m), 0) is None]
+            if len(self._models) == 1:
+                self._order = self._models[0].structure.order
+                return self._order
+            sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(self.model, ()))
+            for edge in (edge for model in kept for edge in model.edges if not edge.lag):
+                sorter.add(edge.effect, edge.cause)
+            try:
+                self._order = tuple(sorter.static_order())
+            except CycleError as error:
+                cycle = " -> ".join(error.args[1])
+                raise ModelError([f"interventions close a cycle: {cycle}"]) from None
+        return self._order
+
+
+System = World | Equations
+"""What runs an episode."""

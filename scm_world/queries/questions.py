@@ -1,0 +1,258 @@
+"""The questions that every causal model answers, with a backend or without one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from scm_world.errors import UnknownOption
+from scm_world.queries import estimates, samples
+from scm_world.queries.episodes import Episode, rollout
+from scm_world.queries.equations import System
+from scm_world.queries.estimates import Effect
+from scm_world.queries.outcomes import usual_outcomes
+from scm_world.queries.plans import Plan
+from scm_world.queries.progress import Progress
+from scm_world.queries.samples import Samples, Setting
+from scm_world.queries.stages import AnyStage
+
+
+class Questions(ABC):
+    """What a ``World`` and an ``SCM`` can be asked; none of it changes them."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def _asked(self) -> tuple[AnyStage, System]:
+        """Give where episodes are run, and a system that says what is declared."""
+
+    @abstractmethod
+    def _with(self, do: Mapping[str, Any] | None) -> Plan:
+        """Add something to what is given in every episode."""
+
+    @abstractmethod
+    def _setting(self, given: Mapping[str, Any]) -> Setting:
+        """Complete the circumstances of episodes."""
+
+    def rollout(
+        self,
+        policy: Any = None,
+        *,
+        seed: int = 0,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        steps: int | None = None,
+        record: Iterable[str] = (),
+    ) -> Episode:
+        """Let an episode happen, and remember it whole.
+
+        Args:
+            policy: A function of the world that gives an action, shape (n_actions,); actions of
+                shape (n_actions,) or (steps, n_actions); ``"random"``; or None: the action that
+                lets the system be. See ``as_policy`` for others that have a name.
+            seed: Of the noise.
+            episode: Number of the episode within that noise.
+            do: Interventions, with or without a time.
+            steps: How many control steps; as many as the task has if None.
+            record: Variables to write down on the way; others are found by going through again.
+
+        Raises:
+            InterventionError: An intervention was refused.
+            ActionError: The policy is none, or gave no action.
+        """
+        plan = self._with(do)
+        return rollout(
+            self._asked()[0],
+            policy,
+            seed=seed,
+            number=episode,
+            do=plan,
+            steps=steps,
+            record=record,
+        )
+
+    def counterfactual(
+        self,
+        do: Mapping[str, Any] | None = None,
+        *,
+        at: int = 0,
+        actions: Any = "replay",
+        policy: Any = None,
+        seed: int = 0,
+        episode: int = 0,
+        steps: int | None = None,
+        record: Iterable[str] = (),
+    ) -> Episode:
+        """Run an episode, go back, intervene, and let the same noise happen again.
+
+        Args:
+            do: What is done; without a time it is done at the instant ``at``.
+            at: Number of the control step.
+            actions: ``"replay"`` for the same actions, or a policy that chooses anew from there.
+            policy: Of the episode; see ``rollout``, also for what follows.
+            seed: Of the noise.
+            episode: Number of the episode within that noise.
+            steps: How many control steps.
+            record: Variables to write down on the way.
+
+        Returns:
+            The episode as it would have been; compare it with ``rollout`` of the same seed.
+        """
+        factual = self.rollout(policy, seed=seed, episode=episode, steps=steps, record=record)
+        return factual.counterfactual(do, at=at, actions=actions, record=record)
+
+    def see(
+        self,
+        n: int,
+        *,
+        outcomes: Iterable[Any] | None = None,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> Samples:
+        """Watch episodes without doing anything; see ``sample``."""
+        return self.sample(n, outcomes=outcomes, progress=progress, **setting)
+
+    def sample(
+        self,
+        n: int,
+        do: Mapping[str, Any] | None = None,
+        *,
+        outcomes: Iterable[Any] | None = None,
+        first: int = 0,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> Samples:
+        """Run episodes, under an intervention or none, and read outcomes off them.
+
+        Args:
+            n: How many.
+            do: What is done in each of them; nothing if None.
+            outcomes: Names of variables (their final values), ``Outcome`` or functions of the
+                episode; see ``usual_outcomes`` if None.
+            first: Number of the first one; unit i is the same in every question with one seed.
+            progress: Told after each episode how many are done, and how many there will be.
+            setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
+                By default the actions of a world are random, those of an SCM zero.
+
+        Raises:
+            InterventionError: An intervention was refused.
+        """
+        stage, system = self._asked()
+        return samples.sample(
+            stage,
+            system,
+            self._with(do),
+            n,
+            outcomes=usual_outcomes(system) if outcomes is None else outcomes,
+            setting=self._setting(setting),
+            first=first,
+            progress=progress,
+        )
+
+    def effect(
+        self,
+        outcome: Any,
+        *,
+        do: Mapping[str, Any],
+        versus: Mapping[str, Any] | None = None,
+        n: int = 100,
+        paired: bool = True,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> Effect:
+        """Estimate how much an intervention changes an outcome.
+
+        Args:
+            outcome: The name of a variable (its final value), an ``Outcome``, or a function of the
+                episode that gives numbers.
+            do: What is done.
+            versus: What it is held against; nothing if None.
+            n: How many units.
+            paired: Whether the same units live through both, with the same noise.
+            progress: Told after each episode.
+            setting: See ``sample``.
+
+        Returns:
+            Mean and 95 % interval of the difference, and by how much pairing pays.
+        """
+        return estimates.effect(
+            *self._asked(),
+            outcome,
+            do=self._with(do),
+            versus=self._with(versus),
+            n=n,
+            paired=paired,
+            setting=self._setting(setting),
+            progress=progress,
+        )
+
+    def effect_over(
+        self,
+        outcome: Any,
+        *,
+        name: str,
+        values: Sequence[Any],
+        n: int = 100,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> tuple[Effect, ...]:
+        """Estimate the paired effects of values of a variable, each against the first one.
+
+        Args:
+            outcome: As in ``effect``.
+            name: Of the variable.
+            values: Two or more.
+            n: How many units.
+            progress: Told after each episode.
+            setting: See ``sample``.
+        """
+        if len(values) < 2:
+            raise UnknownOption("values", values, ("two or more values of the variable",))
+        return estimates.effect_over(
+            *self._asked(),
+            outcome,
+            plans=[self._with({name: value}) for value in values],
+            n=n,
+            setting=self._setting(setting),
+            progress=progress,
+        )
+
+    def effect_by(
+        self,
+        outcome: Any,
+        *,
+        do: Mapping[str, Any],
+        versus: Mapping[str, Any] | None = None,
+        by: Any,
+        bins: int = 4,
+        n: int = 200,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> tuple[tuple[tuple[float, float], Effect], ...]:
+        """Estimate paired effects among units that differ in a covariate.
+
+        Args:
+            outcome: As in ``effect``.
+            do: What is done.
+            versus: What it is held against; nothing if None.
+            by: The covariate: like an outcome, one number; read off the world of ``versus``.
+            bins: Into how many groups of equal size the units are sorted.
+            n: How many units, over all groups.
+            progress: Told after each episode.
+            setting: See ``sample``.
+
+        Returns:
+            For each group the ends of the covariate, and the effect.
+        """
+        return estimates.effect_by(
+            *self._asked(),
+            outcome,
+            do=self._with(do),
+            versus=self._with(versus),
+            by=by,
+            bins=bins,
+            n=n,
+            setting=self._setting(setting),
+            progress=progress,
+        )

@@ -1,0 +1,381 @@
+"""The same questions to a causal model without a backend, and to a world of the same equations."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scm_world import (
+    SCM,
+    Action,
+    At,
+    Box,
+    Clamp,
+    Derived,
+    Draw,
+    Exogenous,
+    Linear,
+    Mechanism,
+    On,
+    Outcome,
+    Parent,
+    Reaches,
+    Scale,
+    Shift,
+    World,
+    discover,
+    graph,
+    verify,
+)
+from scm_world.errors import InterventionError, ModelError, ScmWorldError, UnknownOption
+from scm_world.graph import from_json, to_json
+from scm_world.queries import Effect, Episode, Samples, Verification, save_episode
+from scm_world.tasks import StepTask
+from scm_world.variables import Measured, Normal
+
+RATE = Exogenous(name="rate", default=0.3, bounds=Box(0.0, 2.0), a=Box(0.2, 0.4))
+PUSH = Action(name="push", bounds=Box(-1.0, 1.0))
+CAUSES = ("rate", "prey", "predator", "push")
+
+
+def prey(rate: Any, prey: Any, predator: Any, push: Any) -> Any:
+    """Grow, and be eaten."""
+    return prey + rate * prey * (1.0 - prey) - 0.2 * prey * predator + 0.1 * push
+
+
+def predator(prey: Any, predator: Any) -> Any:
+    """Eat, and die."""
+    return predator * (0.9 + 0.2 * prey)
+
+
+def total(prey: Any, predator: Any) -> Any:
+    """Count all."""
+    return prey + predator
+
+
+def equations() -> SCM:
+    """Declare them as mechanisms."""
+    lagged = [Parent(name, 1) for name in CAUSES]
+    return SCM(
+        [
+            RATE,
+            PUSH,
+            Derived(name="prey", parents=lagged, mechanism=prey, start=0.5),
+            Derived(
+                name="predator",
+                parents=(Parent("prey", 1), Parent("predator", 1)),
+                mechanism=predator,
+                start=0.4,
+            ),
+            Derived(name="total", parents=("prey", "predator"), mechanism=total),
+        ]
+    )
+
+
+def stepped(
+    parameters: dict[str, Any], state: dict[str, Any], action: dict[str, Any], noise: Any
+) -> dict[str, Any]:
+    """Take one step of all equations."""
+    return {
+        "prey": prey(parameters["rate"], state["prey"], state["predator"], action["push"]),
+        "predator": predator(state["prey"], state["predator"]),
+    }
+
+
+def world() -> World:
+    """Declare them as a step function."""
+    return World.from_step(
+        stepped,
+        parameters=[RATE],
+        actions=[PUSH],
+        states=[
+            Measured(name="prey", default=0.5, parents=CAUSES),
+            Measured(name="predator", default=0.4, parents=("prey", "predator")),
+        ],
+        outcomes=[Derived(name="total", parents=("prey", "predator"), mechanism=total)],
+    )
+
+
+NAMES = ("rate", "prey", "predator", "total")
+PLANS: tuple[dict[str, Any], ...] = (
+    {},
+    {"rate": 1.5},
+    {"rate": Scale(2.0)},
+    {"rate": At(3, 1.5)},
+    {"rate": Clamp(1.5, 2, 5)},
+    {"rate": On(Reaches("prey", above=0.55), 0.0)},
+    {"rate": (At(2, 1.0), At(4, Shift(0.5)))},
+    {"push": 1.0},
+    {"push": At(2, Mechanism(np.negative, parents=("prey",)))},
+)
+
+
+@pytest.fixture(params=[equations, world], ids=["SCM", "World"])
+def system(request: pytest.FixtureRequest) -> Any:
+    """Ask each of them."""
+    return request.param()
+
+
+def alike(one: Episode, other: Episode) -> bool:
+    """Tell whether two episodes have the same values, bit for bit."""
+    return all(one[name].tobytes() == other[name].tobytes() for name in NAMES)
+
+
+@pytest.mark.parametrize("plan", PLANS, ids=repr)
+@pytest.mark.parametrize("policy", [None, "random", [0.5]], ids=str)
+def test_episodes_are_the_same_with_and_without_a_backend(plan: Any, policy: Any) -> None:
+    """A rollout and its counterfactual agree bit for bit."""
+    one, other = (
+        asked.rollout(policy, seed=3, episode=2, steps=8, do=plan)
+        for asked in (equations(), world())
+    )
+    assert len(one) == len(other) == 8
+    np.testing.assert_array_equal(one.actions, other.actions)
+    assert alike(one, other)
+    assert one.events == other.events
+    wish = {"rate": 0.9}
+    assert alike(one.counterfactual(wish, at=4), other.counterfactual(wish, at=4))
+
+
+def test_a_question_has_one_form_and_one_answer(system: Any) -> None:
+    """Every question is taken by both, and gives the result of the other one."""
+    reference = equations()
+    episode = system.rollout("random", seed=1, steps=6)
+    assert isinstance(episode, Episode)
+    assert episode.counterfactual({}) == episode
+    assert alike(episode, reference.rollout("random", seed=1, steps=6))
+    branch = system.counterfactual({"rate": 1.0}, at=2, policy="random", seed=1, steps=6)
+    assert alike(branch, episode.counterfactual({"rate": 1.0}, at=2))
+    assert branch["prey"][:3].tobytes() == episode["prey"][:3].tobytes()
+    assert branch.final("prey") != episode.final("prey")
+    several = episode.worlds([{}, {"rate": 1.0}], at=2)
+    assert several[0] == episode
+    assert alike(several[1], branch)
+    outcomes = ["prey", Outcome("total", "mean"), Outcome("total", "path")]
+    how: dict[str, Any] = {"seed": 5, "steps": 6, "policy": "random", "outcomes": outcomes}
+    seen, done = system.sample(7, **how), system.sample(7, {"rate": 1.0}, **how)
+    assert isinstance(seen, Samples)
+    assert seen["path total"].shape == (7, 7)
+    for name, values in reference.sample(7, {"rate": 1.0}, **how).items():
+        assert values.tobytes() == done[name].tobytes()
+    assert system.see(7, **how)["prey"].tobytes() == seen["prey"].tobytes()
+    asked: dict[str, Any] = {"n": 5, "seed": 2, "steps": 6, "policy": "random"}
+    effect = system.effect("prey", do={"rate": 1.0}, **asked)
+    assert isinstance(effect, Effect)
+    assert effect.mean == reference.effect("prey", do={"rate": 1.0}, **asked).mean
+    curve = system.effect_over("prey", name="rate", values=[0.1, 0.5, 1.0], **asked)
+    assert [e.mean for e in curve] == [
+        e.mean for e in reference.effect_over("prey", name="rate", values=[0.1, 0.5, 1.0], **asked)
+    ]
+    groups = system.effect_by("prey", do={"rate": 1.0}, by="predator", bins=2, **asked)
+    assert sum(found.n for _, found in groups) == 5
+    with system.given({"rate": 1.0}) as faster:
+        assert alike(
+            faster.rollout(seed=1, steps=3), system.rollout(seed=1, steps=3, do={"rate": 1.0})
+        )
+    assert set(system.graph) >= set(NAMES)
+
+
+def test_both_are_verified_and_discovered(system: Any) -> None:
+    """Their edges are those that were declared, with the results of the same types."""
+    found = verify(system, probes=20)
+    assert isinstance(found, Verification)
+    assert found.passed
+    assert {("prey", "predator", 1), ("prey", "total", 0)} <= set(found.declared)
+    assert discover(system, probes=8).score.shd == 0
+
+
+def test_a_callable_policy_looks_at_the_equations() -> None:
+    """It is given something to read present values from, as in a world."""
+
+    def policy(now: Any) -> Any:
+        return [1.0 - 2.0 * now["prey"]]
+
+    one, other = (asked.rollout(policy, seed=0, steps=6) for asked in (equations(), world()))
+    np.testing.assert_array_equal(one.actions, other.actions)
+    assert alike(one, other)
+
+
+def chain() -> SCM:
+    """Declare a model without time."""
+    return SCM(
+        [
+            Exogenous(name="x", distribution=Normal(), a=Box(1.0, 2.0)),
+            Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,)), noise=Normal()),
+            Derived(name="z", parents=("x", "y"), mechanism=np.add),
+        ]
+    )
+
+
+def test_a_model_without_lags_has_episodes_of_one_instant() -> None:
+    """Their values are those that are drawn from the model."""
+    model, drawn = chain(), chain().draw(50, seed=4)
+    found = model.sample(50, seed=4)
+    for name in model:
+        np.testing.assert_array_equal(found[name], drawn[name])
+    episode = model.rollout(seed=4, episode=17)
+    assert len(episode) == 0
+    assert episode["z"].tolist() == [drawn["z"][17]]
+    assert model.sample(1, seed=4, first=17)["z"] == drawn["z"][17]
+    with pytest.raises(UnknownOption, match="no lagged edges"):
+        model.rollout(steps=3)
+
+
+def test_counterfactuals_of_a_model_keep_its_noise() -> None:
+    """What is not intervened on answers with the noise that it had."""
+    episode = chain().rollout(seed=0)
+    x, y, z = (float(episode.final(name)) for name in "xyz")
+    moved = episode.counterfactual({"x": x + 1.0})
+    assert float(moved.final("y")) == pytest.approx(y + 2.0, abs=1e-12)
+    assert float(moved.final("z")) == pytest.approx(z + 3.0, abs=1e-12)
+    assert episode.counterfactual({"y": 5.0}).final("x") == x
+    assert set(moved.audits[0].targets) == {"x"}
+    assert set(moved.audits[0].followed) == {"y", "z"}
+
+
+def test_effects_of_a_linear_model_are_its_weights() -> None:
+    """Paired units have the total effect without any error of sampling."""
+    found = chain().effect("z", do={"x": 1.0}, versus={"x": 0.0}, n=20)
+    assert float(found.mean) == pytest.approx(3.0, abs=1e-12)
+    assert float(found.high - found.low) < 1e-9
+    assert chain().effect("x", do={"z": 1.0}, n=20).mean == 0.0
+
+
+def test_an_intervention_counts_from_the_beginning() -> None:
+    """The first step of a model sees the value that was set, not the start that was declared."""
+    done = equations().do({"prey": 2.0})
+    assert done.rollout(steps=2)["predator"].tolist()[:2] == [0.4, 0.4 * (0.9 + 0.2 * 2.0)]
+    assert done.rollout(steps=2)["prey"].tolist() == [2.0, 2.0, 2.0]
+    paths = noisy().do({"x": Draw(Normal())}).draw(3, seed=0, steps=4)
+    found = noisy().do({"x": Draw(Normal())}).sample(3, outcomes=[Outcome("y", "path")], steps=4)
+    np.testing.assert_array_equal(found["path y"][:, 1:], paths["y"])
+
+
+def noisy() -> SCM:
+    """Declare a process with noise."""
+    return SCM(
+        [
+            Derived(
+                name="x",
+                parents=(Parent("x", 1),),
+                mechanism=Linear(weights=(0.5,)),
+                noise=Normal(),
+            ),
+            Derived(
+                name="y",
+                parents=(Parent("x", 1),),
+                mechanism=Linear(weights=(1.0,)),
+                noise=Normal(),
+            ),
+        ]
+    )
+
+
+def test_a_later_intervention_leaves_the_noise_as_it_is() -> None:
+    """Before it everything is the same, after it all that does not follow."""
+    episode = noisy().rollout(seed=3, steps=30)
+    branch = episode.counterfactual({"x": At(20, 9.0)}, at=12)
+    assert branch["y"][:21].tobytes() == episode["y"][:21].tobytes()
+    shifted = (branch["y"] - branch["x"][[0, *range(30)]]) - (
+        episode["y"] - episode["x"][[0, *range(30)]]
+    )
+    assert np.abs(shifted).max() < 1e-12
+    assert (branch["x"][20:] == 9.0).all()
+    assert branch.counterfactual({}, at=25) == branch
+
+
+@pytest.mark.parametrize("how", ["mean", "sum", "max", "change", "final", "path"])
+def test_a_unit_alone_has_the_bits_that_it_has_among_others(how: str) -> None:
+    """Outcomes of many units are those of each one."""
+    model, outcome = noisy(), Outcome("y", how)
+    many = model.sample(9, outcomes=[outcome], steps=37, seed=1)[
+        str(outcome).removeprefix("final ")
+    ]
+    for number in range(9):
+        episode = model.rollout(seed=1, episode=number, steps=37)
+        assert outcome.of(episode).tobytes() == many[number].tobytes()
+
+
+def test_functions_that_take_one_value_are_called_for_each_unit() -> None:
+    """A mechanism with a branch gives the same as its vectorised form."""
+
+    def larger(a: Any, b: Any) -> Any:
+        return a if a > b else b
+
+    def model(function: Any) -> SCM:
+        roots = [Exogenous(name=name, distribution=Normal()) for name in "ab"]
+        return SCM([*roots, Derived(name="c", parents=("a", "b"), mechanism=function)])
+
+    one, other = (model(f).sample(8, seed=0)["c"] for f in (larger, np.maximum))
+    np.testing.assert_array_equal(one, other)
+
+
+def broken(x: Any) -> Any:
+    """Fail for some units."""
+    if np.any(x > 1.0):
+        raise ValueError("too large")
+    return x
+
+
+def test_errors_of_a_model_are_those_of_its_unit() -> None:
+    """Refusals name the variable, and what a function raises comes through."""
+    with pytest.raises(InterventionError, match="rate"):
+        equations().rollout(steps=2, do={"rate": 7.0})
+    with pytest.raises(ModelError, match="how many steps"):
+        equations().rollout()
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="y", parents=("x",), mechanism=broken),
+        ]
+    )
+    with pytest.raises(ValueError, match="too large"):
+        model.sample(100, seed=0)
+    with pytest.raises(ScmWorldError, match="component of y"):
+        noisy().rollout(steps=2, do={"x": On(Reaches("y", above=0.0, component=4), 1.0)})
+
+
+def copied(model: SCM) -> Any:
+    """Send a model through a pickle."""
+    return pickle.loads(pickle.dumps(model))  # noqa: S301 # it is ours
+
+
+def test_a_model_that_can_be_asked_is_a_model() -> None:
+    """It compares, pickles, intervenes and is written like any other one."""
+    model = chain().do({"x": 1.0})
+    assert isinstance(model, SCM)
+    assert copied(model) == model
+    assert SCM(graph.SCM(chain().variables)).do({"x": 1.0}) == model
+    assert SCM(from_json(to_json(chain()), trusted=("numpy",))) == chain()
+    assert SCM(model) == model
+    model.sample(3)
+    assert copied(model).sample(3)["z"].tolist() == model.sample(3)["z"].tolist()
+
+
+def test_a_parent_that_a_mechanism_ignores_never_fires() -> None:
+    """The report names the edge, and does not pass."""
+    model = SCM(
+        [
+            Exogenous(name="a", distribution=Normal()),
+            Exogenous(name="b", distribution=Normal()),
+            Derived(name="c", parents=("a", "b"), mechanism=Linear(weights=(1.0, 0.0))),
+        ]
+    )
+    found = verify(model, probes=20)
+    assert found.never_fired == (("b", "c", 0),)
+    assert found.undeclared == ()
+    assert not found.passed
+
+
+def test_an_episode_of_equations_goes_to_no_file(tmp_path: Any) -> None:
+    """The error says what to keep instead."""
+    with pytest.raises(UnknownOption, match="to_json"):
+        save_episode(chain().rollout(), tmp_path / "episode.npz")
+
+
+def test_the_world_is_one_of_a_step_function() -> None:
+    """Both sides of the comparison are what they are said to be."""
+    assert isinstance(world().task, StepTask)
