@@ -35,7 +35,7 @@ def reference(tmp_path: Path) -> str:
     ("command", "report"),
     [
         (["discover", "--probes", "2"], "report.json"),
-        (["verify", "--probes", "16"], "verification.json"),
+        (["verify", "--probes", "16"], "report.json"),
         (["effect", "y", "x=1", "--versus", "x=0", "-n", "5"], "effect.json"),
     ],
 )
