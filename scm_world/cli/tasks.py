@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -53,20 +54,22 @@ def build(name: str, arguments: Sequence[str] = ()) -> Task:
         raise typer.BadParameter(f"{', '.join(arguments)}: {error}", param_hint=_HINT) from None
 
 
-<<<<<<< HEAD
+def system(name: str, arguments: Sequence[str] = ()) -> Task | SCM:
+    """Create a task, or the causal model that ``module:function`` gives; see ``build``."""
+    made = None
+    if ":" in name:
+        with suppress(Exception):  # ``build`` raises it again, and says what is wrong
+            made = load_factory(name)(**parse_assignments(arguments, _HINT))
+    return SCM(made) if isinstance(made, graph.SCM) else build(name, arguments)
+
+
 def backend_of(backend: str | None, name: str, arguments: Sequence[str] | None) -> str:
     """Give the backend that was asked for, or that of a task."""
     own = ":" in name and name not in TASKS
-    return backend or (build(name, arguments or ()).backend if own else Task.backend)
-=======
-def system(name: str, arguments: Sequence[str] = ()) -> Task | SCM:
-    """Create a task, or the causal model that ``module:function`` gives; see ``build``."""
-    if ":" in name:
-        made = load_factory(name)(**parse_assignments(arguments, _HINT))
-        if isinstance(made, graph.SCM):
-            return SCM(made)
-    return build(name, arguments)
->>>>>>> bf07801 (An SCM answers the questions of a World, with the same types)
+    if backend or not own:
+        return backend or Task.backend
+    made = system(name, arguments or ())
+    return "equations" if isinstance(made, SCM) else made.backend
 
 
 def tag(name: str) -> str:
