@@ -10,9 +10,11 @@ import pytest
 
 import scm_world  # noqa: F401 # registers the environments
 from scm_world.errors import UnknownOption
-from scm_world.training.sb3 import make_sb3, sb3_vec_env
 
 sb3 = pytest.importorskip("stable_baselines3")
+
+from scm_world.training.sb3 import make_sb3, sb3_vec_env  # noqa: E402 # needs the library
+
 PUSHING = "scm_world/Pushing-v0"
 GOALS: dict[str, Any] = {"goal_env": True, "task_options": {"weights": "sparse"}}
 
