@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.backends.base import EngineSnapshot
+from scm_world.backends.step import StepModel
+from scm_world.errors import SnapshotMismatch
+from scm_world.models import Model
 from scm_world.variables import Intervention
 from scm_world.world.family import Family
 from scm_world.world.proposal import Instant, Requests
@@ -62,8 +67,10 @@ class SavedInstant:
 class WorldSnapshot:
     """All that decides how a world goes on: physics, causes, noise, clock and memory.
 
+    A pickled snapshot leaves the model out: the world that goes back to it has the same one.
+
     Attributes:
-        engine: The engine's part.
+        engine: The engine's part; bytes that ``unpacked`` reads once it was pickled.
         static: Values of everything that physics does not move.
         interventions: What ``do`` holds.
         previous: Values of one control step ago.
@@ -77,7 +84,7 @@ class WorldSnapshot:
         memory: What a world of another kind remembers besides.
     """
 
-    engine: EngineSnapshot
+    engine: EngineSnapshot | bytes
     static: Mapping[str, Value]
     interventions: Mapping[str, Intervention] = field(default_factory=dict)
     previous: Mapping[str, Value] = field(default_factory=dict)
@@ -89,3 +96,56 @@ class WorldSnapshot:
     instant: SavedInstant | None = None
     plan: Hashable = None
     memory: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        if isinstance(self.engine, bytes):
+            return vars(self)
+        file = BytesIO()
+        _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(self.engine)
+        return {**vars(self), "engine": file.getvalue()}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> WorldSnapshot:
+        return self  # nothing writes into it
+
+    def unpacked(self, structure: Any) -> EngineSnapshot:
+        """Give the engine's part.
+
+        Args:
+            structure: What the world compiles.
+
+        Raises:
+            SnapshotMismatch: It was taken of another model.
+        """
+        if not isinstance(self.engine, bytes):
+            return self.engine
+        found: EngineSnapshot = _Unpickler(BytesIO(self.engine), structure).load()
+        return found
+
+
+def _reference(structure: Any) -> str | None:
+    """Say which model something is, if it is one."""
+    if isinstance(structure, StepModel):
+        return f"step function {structure.name}"
+    return structure.digest if isinstance(structure, Model) else None
+
+
+class _Pickler(pickle.Pickler):
+    """Writes references in the place of models."""
+
+    def persistent_id(self, obj: Any) -> str | None:
+        """Give the reference that is written."""
+        return _reference(obj)
+
+
+class _Unpickler(pickle.Unpickler):
+    """Puts a model in the place of references to it."""
+
+    def __init__(self, file: BytesIO, structure: Any) -> None:
+        super().__init__(file)
+        self._structure = structure
+
+    def persistent_load(self, pid: Any) -> Any:
+        """Give the model."""
+        if pid != _reference(self._structure):
+            raise SnapshotMismatch("the snapshot is one of another model")
+        return self._structure

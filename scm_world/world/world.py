@@ -10,7 +10,6 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
-from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import NotReset, SnapshotMismatch
 from scm_world.graph import SCM, Moment
 from scm_world.models import Scene, State
@@ -207,7 +206,7 @@ class World(Stepped):
         self._lost = ""
         origin = self.family.natural(None)
         if self._started:
-            self.backend.restore(self._origin.engine)
+            self.backend.restore(self._origin.unpacked(self.structure))
         else:
             self._build(origin)
         self._action[:] = 0.0
@@ -407,8 +406,7 @@ class World(Stepped):
             raise SnapshotMismatch("the snapshot is one of another task, or of other options")
         if not self._started:
             self._begin()
-        engine: EngineSnapshot = snapshot.engine
-        self.backend.restore(engine)
+        self.backend.restore(snapshot.unpacked(self.structure))
         self._lost = ""
         self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
         declaration = self.family.declaration(snapshot.plan)
