@@ -235,7 +235,8 @@ class World(Stepped):
         model = declaration.model
         drawn = Proposal(declaration, model, static, state, 0, {}, declaration.random[:1])
         change = difference(self, drawn)
-        refuse_overlaps(self, self._present(), drawn, change, declaration.random[0])
+        if declaration.composition.solid:
+            refuse_overlaps(self, self._present(), drawn, change, declaration.random[0])
         if change:
             self.backend.apply(change)
         self.adopt(declaration, model, static, 0)
@@ -316,9 +317,11 @@ class World(Stepped):
             if self._action.shape == action.shape:
                 self._action[:] = action
         row, where = self._matrix[0], declaration.mechanisms.where
-        for name, value in static.items():
-            if value is not self._static.get(name):
-                row[where[name]] = np.ravel(value)
+        if static is not self._static:
+            for name, value in static.items():
+                if value is not self._static.get(name):
+                    row[where[name]] = np.ravel(value)
+            self._now.update(static)
         self._held, self._static = model, static
         held = model.interventions
         self._held_actions = tuple(name for name in declaration.actions if name in held)
@@ -328,7 +331,6 @@ class World(Stepped):
         self.structure = declaration.structure(static)
         timestep = declaration.composition.timestep(static)
         self._substeps = max(1, round(self.control_period / timestep))
-        self._now.update(static)
         self.version += 1
         if state is None:
             self.backend.read(self._state)

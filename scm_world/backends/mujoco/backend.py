@@ -208,7 +208,10 @@ class MujocoBackend(Backend):
         if snapshot.engine != here:
             raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
         payload: Payload = snapshot.payload
-        now = self._realized(payload.structure, payload.parameters)
+        now: Realization | None = vars(self).get("_now")
+        if now is None or now.applied is not payload.parameters:
+            now = self._realized(payload.structure, payload.parameters)
+            now.applied = payload.parameters
         now.recall(payload.numbers, payload.memory)
         now.replay, now.began = payload.again
         self._now, self.seat, self._touches = now, None, payload.touches

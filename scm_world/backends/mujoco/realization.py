@@ -96,6 +96,7 @@ class Realization(ABC):
         model: With the present parameters.
         data: With the present state.
         kept: The parameters in force; at first, none has been written.
+        applied: The parameters of a snapshot, while they are those in force.
         mode: What a command means.
         command: Where it is written, shape (n_commands,).
         edited: Whether the model has changed since someone last cleared this.
@@ -125,6 +126,7 @@ class Realization(ABC):
         self._constant = frozenset(key for key, slot in self._slots.items() if slot.constant)
         self._bodies, self._owners = bodies, owners
         self.kept: dict[ParameterKey, Floats] = {}
+        self.applied: Parameters | None = None
         self._numbers: bytes | None = None  # of what is kept, if nothing was written since
         self.mode = self.modes[0]
         self.edited = True
@@ -289,7 +291,7 @@ class Realization(ABC):
                     continue
                 given = np.array(value, dtype=np.float64)
                 if present is None or given.tobytes() != present.tobytes():
-                    before[key] = present
+                    before[key], self.applied = present, None
                     slots[key].write(given)
                 kept[key] = given
             if not before:
