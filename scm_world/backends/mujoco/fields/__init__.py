@@ -23,7 +23,6 @@ from scm_world.backends.mujoco.fields.drives import (
     tendon_unit,
     tendons,
 )
-from scm_world.backends.mujoco.fields.kinds import Option, Place
 from scm_world.backends.mujoco.fields.names import clean, element_names
 from scm_world.backends.mujoco.fields.rows import (
     FREE,
@@ -36,7 +35,7 @@ from scm_world.backends.mujoco.fields.rows import (
     least,
 )
 from scm_world.backends.mujoco.fields.shapes import shapes
-from scm_world.backends.mujoco.slots import Slot
+from scm_world.backends.mujoco.slots import Option, Place, Slot
 from scm_world.backends.mujoco.trees import Couplings, Effect
 from scm_world.models.scene import ParameterKey
 

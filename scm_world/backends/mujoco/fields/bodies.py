@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 
-from scm_world.backends.mujoco.fields.kinds import Direction, Place, Turn
 from scm_world.backends.mujoco.fields.rows import (
     BALL,
     FREE,
@@ -22,6 +21,7 @@ from scm_world.backends.mujoco.fields.rows import (
     solver_rows,
     turn_at,
 )
+from scm_world.backends.mujoco.slots import Direction, Place, Turn
 
 _SIMPLE = "is fixed by the compiler; write simple='false' at the body"
 

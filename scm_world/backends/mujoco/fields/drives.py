@@ -7,7 +7,6 @@ from typing import Any
 
 import mujoco
 
-from scm_world.backends.mujoco.fields.kinds import Gain
 from scm_world.backends.mujoco.fields.rows import (
     BALL,
     FREE,
@@ -21,6 +20,7 @@ from scm_world.backends.mujoco.fields.rows import (
     least,
     solver_rows,
 )
+from scm_world.backends.mujoco.slots import Gain
 
 _TRN, _WRAP = mujoco.mjtTrn, mujoco.mjtWrap
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn

@@ -11,8 +11,7 @@ from typing import Any, Literal, final
 import mujoco
 import numpy as np
 
-from scm_world.backends.mujoco.fields.kinds import Place, Repeated, Turn
-from scm_world.backends.mujoco.slots import Slot
+from scm_world.backends.mujoco.slots import Place, Repeated, Slot, Turn
 from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect, disabled
 from scm_world.models.model import Numbers
 from scm_world.models.scene import ParameterKey

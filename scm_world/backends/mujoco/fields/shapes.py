@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 
-from scm_world.backends.mujoco.fields.kinds import Color
 from scm_world.backends.mujoco.fields.rows import (
     OFF,
     Field,
@@ -17,6 +16,7 @@ from scm_world.backends.mujoco.fields.rows import (
     solver_rows,
     turn_at,
 )
+from scm_world.backends.mujoco.slots import Color
 from scm_world.backends.mujoco.trees import NOTHING, Effect
 
 _GEOM = mujoco.mjtGeom

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.mujoco.slots import Slot, Vector
+from scm_world.backends.mujoco.slots import Place, Slot
 from scm_world.geometry.hulls import Hull
 from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
@@ -244,7 +244,7 @@ def slots(model: mujoco.MjModel, structure: Structure) -> dict[ParameterKey, Slo
     """Find the place of every parameter of this structure in this model."""
     hanging = [name(finger) for finger in hardware.FINGERS for name in (base_name, _fixed_link)]
     found: dict[ParameterKey, Slot] = {
-        ("world", "gravity"): Vector(model.opt.gravity),
+        ("world", "gravity"): Place(model.opt.gravity),
         ("world", "restitution"): _Restitution(
             model.pair_solref, settings(structure.preset).contact
         ),
@@ -293,7 +293,7 @@ def _add_block(
 def _add_obstacle(found: dict[ParameterKey, Slot], model: mujoco.MjModel, name: str) -> None:
     shape = model.geom(name).id
     found[name, "size"] = _FixedSize(model.geom_size[shape])
-    found[name, "position"] = Vector(model.geom_pos[shape], constant=True)
+    found[name, "position"] = Place(model.geom_pos[shape], constant=True)
     found[name, "orientation"] = _Orientation(model.geom_quat[shape])
     _add_surface(found, model, name, [name])
 
