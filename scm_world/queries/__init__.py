@@ -5,7 +5,6 @@ from scm_world.queries.differences import ButFor, Difference, Divergence, but_fo
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
-from scm_world.queries.face import World
 from scm_world.queries.identification import (
     Check,
     Identification,
@@ -17,11 +16,12 @@ from scm_world.queries.laboratory import Laboratory, intervention_data
 from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.policies import Random
+from scm_world.queries.questions import SCM
 from scm_world.queries.samples import Samples, Setting
-from scm_world.queries.scm import SCM
 from scm_world.queries.timed import At, Clamp, Contact, On, Reaches
 from scm_world.queries.verification import Verification
 from scm_world.queries.verify import verify, verify_engines
+from scm_world.queries.world import World
 
 __all__ = [
     "SCM",

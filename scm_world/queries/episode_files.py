@@ -14,13 +14,12 @@ import numpy as np
 
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_durably
-from scm_world.queries.courses import Course
 from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.queries.policies import Sequence as Given
-from scm_world.queries.stages import Stage, stage_of
-from scm_world.queries.traces import Trace, begin, run
+from scm_world.queries.rollouts import Schedule, Trace, begin, run
+from scm_world.queries.twins import Twins, twins_of
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import World
@@ -56,7 +55,7 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
     trace = episode.trace
-    if not isinstance(episode.stage, Stage):
+    if not isinstance(episode.twins, Twins):
         allowed = ("an episode of a World; of equations keep the model (to_json), seed and plan",)
         raise UnknownOption("episode", episode, allowed)
     target = Path(path)
@@ -75,10 +74,10 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
 
 
 def _about(episode: Episode) -> dict[str, Any]:
-    task, options = episode.stage.task, dict(episode.stage.options)
+    task, options = episode.twins.task, dict(episode.twins.options)
     if isinstance(options.get("variables_space"), Subset):
         options["variables_space"] = options["variables_space"].model_dump(mode="json")
-    with episode.stage.twin() as world:
+    with episode.twins.twin() as world:
         engine = world.engine
     return {
         "format": FORMAT,
@@ -154,22 +153,22 @@ def load_episode(
     """
     file = Path(path)
     about, actions, states, lengths = _read(file)
-    stage = stage_of(world) if world is not None else _stage(about)
-    model = stage.task.system.digest if isinstance(stage.task, ModelTask) else None
+    twins = twins_of(world) if world is not None else _twins(about)
+    model = twins.task.system.digest if isinstance(twins.task, ModelTask) else None
     if about.get("model") != model:
         raise SnapshotMismatch(f"{file} happened in another model, or one that was changed since")
     layers = [
         (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
     ]
-    trace, course = Trace(), Course(layers)
-    with stage.twin() as twin:
-        begin(twin, about["seed"], about["number"], course, trace)
-        run(twin, trace, course, Given(actions), first=0, steps=about["steps"], begun=True)
+    trace, schedule = Trace(), Schedule(layers)
+    with twins.twin() as twin:
+        begin(twin, about["seed"], about["number"], schedule, trace)
+        run(twin, trace, schedule, Given(actions), first=0, steps=about["steps"])
     if _digest(trace) != about["parameters"]:
         raise SnapshotMismatch(f"{file} happens with other parameters than it did")
     _compare(trace, np.split(states, np.cumsum(lengths)[:-1]), file, about["versions"])
     return Episode(
-        stage,
+        twins,
         seed=about["seed"],
         number=about["number"],
         layers=layers,
@@ -191,7 +190,7 @@ def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
     return about, *found
 
 
-def _stage(about: dict[str, Any]) -> Stage:
+def _twins(about: dict[str, Any]) -> Twins:
     given = about["arguments"] or {}
     if about["task"] in tasks():
         task = make_task(about["task"], **given)
@@ -199,7 +198,7 @@ def _stage(about: dict[str, Any]) -> Stage:
         task = ModelTask(**given)
     else:
         raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))
-    return Stage(World(task, **about["options"]))
+    return Twins(World(task, **about["options"]))
 
 
 def _compare(trace: Trace, states: list[Any], file: Path, made: dict[str, str]) -> None:

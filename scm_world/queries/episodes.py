@@ -11,14 +11,23 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption, UnknownVariable
-from scm_world.queries.courses import Course, Layer
 from scm_world.queries.equations import System
+from scm_world.queries.parallel import Ending, lived
 from scm_world.queries.plans import Plan
 from scm_world.queries.policies import Sequence as Given
-from scm_world.queries.rollouts import Ending, lived
-from scm_world.queries.stages import AnyStage
-from scm_world.queries.traces import ALL, EVERY, Trace, as_names, begin, run
-from scm_world.queries.units import Unit, length
+from scm_world.queries.rollouts import (
+    ALL,
+    EVERY,
+    Layer,
+    Schedule,
+    Trace,
+    Unit,
+    as_names,
+    begin,
+    length,
+    run,
+)
+from scm_world.queries.twins import AnyTwins
 from scm_world.world import Audit
 
 
@@ -29,7 +38,7 @@ class Episode:
     Everything is exact: an episode can be gone through again, and branched off, bit for bit.
 
     Attributes:
-        stage: Twins of the world that it happened in.
+        twins: Twins of the world that it happened in.
         seed: Of the noise.
         number: Of the episode within that noise.
         layers: Plans, each with the control step from which it counts.
@@ -39,7 +48,7 @@ class Episode:
 
     def __init__(
         self,
-        stage: AnyStage,
+        twins: AnyTwins,
         *,
         seed: int,
         number: int,
@@ -47,7 +56,7 @@ class Episode:
         steps: int,
         trace: Trace,
     ) -> None:
-        self.stage: Any = stage
+        self.twins: Any = twins
         self.seed, self.number = seed, number
         self.layers: tuple[Layer, ...] = tuple(layers)
         self.steps = steps
@@ -119,18 +128,17 @@ class Episode:
         """Go through the episode again, with every variable and every contact written down."""
         if self._all is None:
             trace = Trace()
-            with self.stage.twin() as world:
-                begin(world, self.seed, self.number, Course(self.layers), trace)
+            with self.twins.twin() as world:
+                begin(world, self.seed, self.number, Schedule(self.layers), trace)
                 run(
                     world,
                     trace,
-                    Course(self.layers),
+                    Schedule(self.layers),
                     Given(self.trace.actions),
                     first=0,
                     steps=self.steps,
                     names=(ALL,),
                     contacts=True,
-                    begun=True,
                 )
             self._all = trace
         return self._all
@@ -171,9 +179,9 @@ class Episode:
             UnknownOption: There is no such control step.
         """
         unit = self._unit(do, self._instant(at), actions, as_names(record))
-        with self.stage.twin() as world:
+        with self.twins.twin() as world:
             trace = unit.lived(world, lambda twin: self._arrive(twin, unit.first))
-        return episode_of(self.stage, unit, trace)
+        return episode_of(self.twins, unit, trace)
 
     def _instant(self, at: Any) -> int:
         last = max(self.steps - 1, 0)
@@ -214,7 +222,7 @@ class Episode:
         if near < (at - 1) // EVERY * EVERY:
             if near < 0:
                 near = 0
-                begin(world, self.seed, self.number, Course(self.layers), Trace())
+                begin(world, self.seed, self.number, Schedule(self.layers), Trace())
             else:
                 world.restore(self.trace.snapshots[near])
             found = self._go_through(world, near, at).snapshots
@@ -226,7 +234,7 @@ class Episode:
         """Let the same happen again, from after what was done at an instant."""
         again = Trace(fired=dict(self.trace.fired))
         past = Given(self.trace.actions)
-        run(world, again, Course(self.layers), past, first=first, steps=last, begun=True)
+        run(world, again, Schedule(self.layers), past, first=first, steps=last)
         return again
 
     def _is_whole(self, name: str, at: int) -> bool:
@@ -256,20 +264,20 @@ class Episode:
         given = list(dos)
         start = None
         if at > 0 and given:
-            with self.stage.twin() as world:
+            with self.twins.twin() as world:
                 self._arrive(world, at)
                 start = world.snapshot()
         units = [replace(self._unit(do, at, actions, names), start=start) for do in given]
-        return tuple(lived(self.stage, units, partial(self._ended, units), workers))
+        return tuple(lived(self.twins, units, partial(self._ended, units), workers))
 
     def _ended(self, units: Sequence[Unit], place: int, ending: Ending) -> Episode:
         if isinstance(ending, Exception):
             raise ending
-        return episode_of(self.stage, units[place], ending)
+        return episode_of(self.twins, units[place], ending)
 
 
 def rollout(
-    stage: AnyStage,
+    twins: AnyTwins,
     policy: Any = None,
     *,
     seed: int = 0,
@@ -281,7 +289,7 @@ def rollout(
     """Let an episode happen on a twin of a world.
 
     Args:
-        stage: Of the world.
+        twins: Of the world.
         policy: A function of the world, actions of shape (n_actions,) or (steps, n_actions),
             ``"random"``, or None: the action that lets the system be.
         seed: Of the noise.
@@ -294,7 +302,7 @@ def rollout(
         InterventionError: An intervention was refused.
         UnknownOption: The number of steps is none.
     """
-    with stage.twin() as world:
+    with twins.twin() as world:
         unit = Unit(
             seed=seed,
             number=number,
@@ -303,13 +311,13 @@ def rollout(
             steps=length(world, steps),
             names=as_names(record),
         )
-        return episode_of(stage, unit, unit.lived(world))
+        return episode_of(twins, unit, unit.lived(world))
 
 
-def episode_of(stage: AnyStage, unit: Unit, trace: Trace) -> Episode:
+def episode_of(twins: AnyTwins, unit: Unit, trace: Trace) -> Episode:
     """Give the episode that a unit has become."""
     return Episode(
-        stage,
+        twins,
         seed=unit.seed,
         number=unit.number,
         layers=unit.layers,

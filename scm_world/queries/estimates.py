@@ -18,7 +18,7 @@ from scm_world.queries.outcomes import as_outcome, label
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.samples import Samples, Setting, sample
-from scm_world.queries.stages import AnyStage
+from scm_world.queries.twins import AnyTwins
 from scm_world.world.start import whole_number
 
 CONFIDENCE = 0.95
@@ -163,7 +163,7 @@ def difference(
 
 
 def effect(
-    stage: AnyStage,
+    twins: AnyTwins,
     world: System,
     outcome: Any,
     *,
@@ -175,13 +175,13 @@ def effect(
     progress: Progress | None = None,
 ) -> Effect:
     """Estimate an effect; see ``World.effect``."""
-    treated, control = _both(stage, world, (outcome,), do, versus, n, paired, setting, progress)
+    treated, control = _both(twins, world, (outcome,), do, versus, n, paired, setting, progress)
     one, other = (next(iter(samples.values())) for samples in (treated, control))
     return _effect(world, as_outcome(outcome), one, other, do, versus, paired, setting)
 
 
 def _both(
-    stage: AnyStage,
+    twins: AnyTwins,
     world: System,
     outcomes: Sequence[Any],
     do: Mapping[str, Any],
@@ -194,7 +194,7 @@ def _both(
     count = whole_number("n", n, least=2)
 
     treated = sample(
-        stage,
+        twins,
         world,
         do,
         count,
@@ -203,7 +203,7 @@ def _both(
         progress=part(progress, 0, 2 * count),
     )
     control = sample(
-        stage,
+        twins,
         world,
         versus,
         count,
@@ -245,7 +245,7 @@ def _effect(
 
 
 def effect_over(
-    stage: AnyStage,
+    twins: AnyTwins,
     world: System,
     outcome: Any,
     *,
@@ -260,7 +260,7 @@ def effect_over(
     for index, plan in enumerate(plans):
         told = part(progress, index * count, len(plans) * count)
         found = sample(
-            stage, world, plan, count, outcomes=(wanted,), setting=setting, progress=told
+            twins, world, plan, count, outcomes=(wanted,), setting=setting, progress=told
         )
         columns.append(next(iter(found.values())))
     return tuple(
@@ -270,7 +270,7 @@ def effect_over(
 
 
 def effect_by(
-    stage: AnyStage,
+    twins: AnyTwins,
     world: System,
     outcome: Any,
     *,
@@ -293,7 +293,7 @@ def effect_by(
     count = whole_number("n", n, least=2 * whole_number("bins", bins, least=1))
     wanted, covariate = as_outcome(outcome), as_outcome(by)
     both = (wanted, covariate)
-    treated, control = _both(stage, world, both, do, versus, count, True, setting, progress)
+    treated, control = _both(twins, world, both, do, versus, count, True, setting, progress)
     (one, _), (other, place) = (list(samples.values()) for samples in (treated, control))
     if place.ndim != 1:
         raise UnknownOption(

@@ -11,9 +11,8 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.equations import Equations, System, action_range
 from scm_world.queries.planning import CrossEntropy
-from scm_world.queries.ranges import action_range
 from scm_world.tasks import TASKS
 from scm_world.tasks.policies import Blind, kept_rows
 from scm_world.world.start import whole_number

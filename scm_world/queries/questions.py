@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Self, final
 
 from scm_world.errors import UnknownOption
+from scm_world.graph import scm as graph
 from scm_world.queries import estimates, samples
 from scm_world.queries.episodes import Episode, rollout
-from scm_world.queries.equations import System
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect
 from scm_world.queries.outcomes import usual_outcomes
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.samples import Samples, Setting
-from scm_world.queries.stages import AnyStage
+from scm_world.queries.samples import STEPS, Samples, Setting
+from scm_world.queries.twins import AnyTwins, EquationTwins
+from scm_world.variables import Variable
 
 
 class Questions(ABC):
@@ -24,7 +26,7 @@ class Questions(ABC):
     __slots__ = ()
 
     @abstractmethod
-    def _asked(self) -> tuple[AnyStage, System]:
+    def _asked(self) -> tuple[AnyTwins, System]:
         """Give where episodes are run, and a system that says what is declared."""
 
     @abstractmethod
@@ -138,9 +140,9 @@ class Questions(ABC):
         Raises:
             InterventionError: An intervention was refused.
         """
-        stage, system = self._asked()
+        twins, system = self._asked()
         return samples.sample(
-            stage,
+            twins,
             system,
             self._with(do),
             n,
@@ -256,3 +258,72 @@ class Questions(ABC):
             setting=self._setting(setting),
             progress=progress,
         )
+
+
+@final
+class SCM(Questions, graph.SCM):
+    """A structural causal model over typed variables, which answers the questions of a ``World``.
+
+    It is immutable: ``do`` returns another model. Edges of lag 0 act within an instant and form
+    a directed acyclic graph; edges of lag 1 reach from one control step into the next.
+
+    A model without lagged edges has episodes of one instant. One with lagged edges begins where
+    its variables have their ``start`` or default, and takes as many control steps as it is told; a
+    variable with noise, or a distribution, is drawn anew in each of them.
+
+    Args:
+        variables: The declarations, or a model of ``scm_world.graph``.
+
+    Raises:
+        ModelError: With every problem: duplicate names, unknown parents, cycles.
+
+    Example:
+        >>> from scm_world.variables import Box, Derived, Exogenous, Linear
+        >>> model = SCM([
+        ...     Exogenous(name="mass", unit="kg", default=0.02, distribution=Box(0.015, 0.045)),
+        ...     Derived(name="weight", unit="N", parents=("mass",),
+        ...             mechanism=Linear(weights=(9.81,))),
+        ... ])
+        >>> model.sample(1000, seed=0)["weight"].shape
+        (1000,)
+        >>> heavy = model.rollout(seed=1).counterfactual({"mass": 0.1})
+        >>> round(float(heavy.final("weight")), 3)
+        0.981
+        >>> model.effect("weight", do={"mass": 0.1}, versus={"mass": 0.0}, n=10).mean.round(3)
+        np.float64(0.981)
+    """
+
+    __slots__ = ("_twins",)
+    _twins: EquationTwins
+
+    def __init__(self, variables: Iterable[Variable] | graph.SCM) -> None:
+        if isinstance(variables, graph.SCM):
+            self._copy(variables)
+        else:
+            super().__init__(variables)
+
+    @property
+    def graph(self) -> Self:
+        """The causal model, which is this one; of a ``World`` it is told from the backend."""
+        return self
+
+    def given(self, do: Mapping[str, Any]) -> Self:
+        """Give the model in which this is done too: the same as ``do``."""
+        return self.do(do)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def _asked(self) -> tuple[AnyTwins, System]:
+        if not hasattr(self, "_twins"):
+            self._twins = EquationTwins(self)
+        return self._twins, Equations(self._twins.layout)
+
+    def _with(self, do: Mapping[str, Any] | None) -> Plan:
+        return Plan(do)
+
+    def _setting(self, given: Mapping[str, Any]) -> Setting:
+        return Setting(**{"steps": STEPS if self.is_temporal else 0, "policy": None, **given})

@@ -16,12 +16,11 @@ from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode, episode_of
 from scm_world.queries.equations import System
 from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read, watched
+from scm_world.queries.parallel import Ending, lived, paths
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.rollouts import Ending, lived, paths
-from scm_world.queries.stages import AnyStage, EquationStage
-from scm_world.queries.traces import as_names
-from scm_world.queries.units import Unit, length
+from scm_world.queries.rollouts import Unit, as_names, length
+from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.world.requests import merged
 from scm_world.world.start import whole_number
 
@@ -89,20 +88,20 @@ class Setting:
         )
 
     def episode(
-        self, stage: AnyStage, world: System, do: Mapping[str, Any] | None, number: int, names: Any
+        self, twins: AnyTwins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
         """Let one unit happen.
 
         Args:
-            stage: Of the world.
+            twins: Of the world.
             world: Knows which names are coordinates of one quantity.
             do: What is done to it.
             number: Which unit.
             names: Variables to write down.
         """
         unit = self.unit(world, self.plan(world, do), number, names)
-        with stage.twin() as twin:
-            return episode_of(stage, unit, unit.lived(twin))
+        with twins.twin() as twin:
+            return episode_of(twins, unit, unit.lived(twin))
 
 
 @final
@@ -169,7 +168,7 @@ class Samples(Mapping[str, Floats]):
 
 
 def sample(
-    stage: AnyStage,
+    twins: AnyTwins,
     world: System,
     do: Mapping[str, Any] | None,
     n: int,
@@ -182,7 +181,7 @@ def sample(
     """Let episodes happen under an intervention, and read outcomes off them.
 
     Args:
-        stage: Of the world.
+        twins: Of the world.
         world: Is not touched.
         do: What is done in all of them; None to see only.
         n: How many.
@@ -201,7 +200,7 @@ def sample(
         nonlocal done
         if isinstance(ending, Exception):
             raise ending
-        episode = episode_of(stage, units[place], ending)
+        episode = episode_of(twins, units[place], ending)
         found = [read(outcome, episode) for outcome in wanted]
         done += 1
         if progress is not None:
@@ -211,14 +210,14 @@ def sample(
     numbers, plan = range(first, first + count), setting.plan(world, do)
     unit = setting.unit(world, plan, first, names)
     units = [replace(unit, number=number) for number in numbers]
-    if isinstance(stage, EquationStage) and all(isinstance(one, Outcome) for one in wanted):
-        vectors = paths(stage, units)
-        each = (one.of_many(stage.layout.read(one.name, vectors)) for one in wanted)
+    if isinstance(twins, EquationTwins) and all(isinstance(one, Outcome) for one in wanted):
+        vectors = paths(twins, units)
+        each = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)
         found = [as_numbers(values) for values in each]
         if progress is not None:
             progress(count, count)
     else:
-        rows = lived(stage, units, finish, setting.workers)
+        rows = lived(twins, units, finish, setting.workers)
         try:
             found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
         except ValueError:

@@ -177,7 +177,7 @@ def test_an_episode_in_a_file_happens_again(tmp_path: Path, backend: str) -> Non
     assert again == branch
     assert again != episode
     assert again.counterfactual({}, at=6) == branch
-    assert again.stage.options["frame_skip"] == 5
+    assert again.twins.options["frame_skip"] == 5
     ask = (
         "import sys; from scm_world.queries import load_episode; "
         "print(load_episode(sys.argv[1]).trace.vectors[-1].tobytes().hex())"

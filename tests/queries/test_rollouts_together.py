@@ -15,13 +15,12 @@ from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
 from scm_world.discovery.data.collect import source_of
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
-from scm_world.queries import At, Clamp, Contact, On, Outcome, Reaches, World, crews, rollouts
+from scm_world.queries import At, Clamp, Contact, On, Outcome, Reaches, World, parallel
 from scm_world.queries.episodes import episode_of
-from scm_world.queries.lockstep import advanced, is_known
+from scm_world.queries.parallel import advanced, is_known
+from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.stages import Stage, stage_of
-from scm_world.queries.traces import Trace
-from scm_world.queries.units import Unit
+from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Mechanism, Null
 
 BULLET = pytest.mark.skipif(
@@ -63,15 +62,15 @@ def units_of(world: World, plans: Sequence[Mapping[str, Any]], **setting: Any) -
     return [made.unit(world, made.plan(world, plan), i, names) for i, plan in enumerate(plans)]
 
 
-def alone(stage: Stage, units: Sequence[Unit]) -> list[Trace | Exception]:
+def alone(twins: Twins, units: Sequence[Unit]) -> list[Trace | Exception]:
     """Let units happen one after another."""
-    with stage.twin() as world:
+    with twins.twin() as world:
         return [unit.ended(world) for unit in units]
 
 
-def together(stage: Stage, units: Sequence[Unit], threads: int = 2) -> list[Trace | Exception]:
+def together(twins: Twins, units: Sequence[Unit], threads: int = 2) -> list[Trace | Exception]:
     """Let units happen at the same time."""
-    with stage.together(len(units), units[0].names, threads) as batch:
+    with twins.together(len(units), units[0].names, threads) as batch:
         return advanced(batch, units)
 
 
@@ -124,8 +123,8 @@ def test_lives_together_are_those_alone(backend: str, setting: dict[str, Any]) -
     how = {"policy": setting["policy"]} if "policy" in setting else {}
     world = World("pushing", backend=backend, **options)
     plans = PLANS if backend != "bullet" else PLANS[1:8]  # making a world of Bullet takes long
-    units, stage = units_of(world, plans, **how), stage_of(world)
-    for one, other in zip(alone(stage, units), together(stage, units), strict=True):
+    units, twins = units_of(world, plans, **how), twins_of(world)
+    for one, other in zip(alone(twins, units), together(twins, units), strict=True):
         assert_same(one, other)
 
 
@@ -133,11 +132,11 @@ def test_lives_together_are_those_alone(backend: str, setting: dict[str, Any]) -
 def test_lives_do_not_depend_on_threads_or_company(threads: int) -> None:
     """One, two or four threads; five worlds at once, or seven."""
     world = World("stacking2")
-    stage = stage_of(world)
+    twins = twins_of(world)
     units = units_of(world, [{}, {"gravity": [0, 0, -3.0]}] * 4, names=("reward",), steps=5)
-    expected = alone(stage, units)
+    expected = alone(twins, units)
     for n in (5, 7, 8):
-        for one, other in zip(expected, together(stage, units[:n], threads), strict=False):
+        for one, other in zip(expected, together(twins, units[:n], threads), strict=False):
             assert_same(one, other)
 
 
@@ -145,15 +144,15 @@ def test_lives_do_not_depend_on_threads_or_company(threads: int) -> None:
 def test_branches_together_are_those_alone(at: int) -> None:
     """From any instant, with events before and after it, of an episode that had no snapshots."""
     world = World("pushing")
-    stage = stage_of(world)
+    twins = twins_of(world)
     event = {
         "floor_friction": On(Contact("robot", "tool_block"), 0.3),
         "gravity": At(12, [0, 0, -5]),
     }
     (unit,) = units_of(world, [event], steps=24, policy="across")
-    (ending,) = together(stage, [unit])
+    (ending,) = together(twins, [unit])
     assert isinstance(ending, Trace)
-    episode = episode_of(stage, unit, ending)
+    episode = episode_of(twins, unit, ending)
     lived = world.rollout("across", seed=0, do=event, steps=24)
     assert episode == lived
     assert not episode.trace.snapshots
@@ -189,11 +188,11 @@ def test_samples_are_the_same_together_and_alone(monkeypatch: pytest.MonkeyPatch
     """Numbers, order and progress; and a batch was used for one of them only."""
     world = World("pushing")
     found = [sampled(world, workers=workers) for workers in (None, 1, 2)]
-    assert stage_of(world).at_hand >= rollouts.LEAST
+    assert twins_of(world).at_hand >= parallel.LEAST
     other = World("pushing")
-    monkeypatch.setattr(rollouts, "LEAST", 10**9)
+    monkeypatch.setattr(parallel, "LEAST", 10**9)
     found.append(sampled(other))
-    assert stage_of(other).at_hand == 0
+    assert twins_of(other).at_hand == 0
     for samples in found[1:]:
         assert all(same_values(samples[name], found[0][name]) for name in found[0])
 
@@ -208,7 +207,7 @@ def test_a_policy_that_looks_at_the_world_is_not_known() -> None:
 
 
 def test_one_refusal_among_many_is_the_one_that_is_told() -> None:
-    """Of several, the first; afterwards the stage has its worlds again, and they are sound."""
+    """Of several, the first; afterwards the twins are there again, and they are sound."""
     world = World("pushing")
     episode = world.rollout("random", steps=30)
     dos: list[dict[str, Any]] = [{"tool_block.mass": 0.03}] * 22
@@ -217,12 +216,12 @@ def test_one_refusal_among_many_is_the_one_that_is_told() -> None:
         episode.worlds(dos)
     with pytest.raises(UnknownVariable, match="nothing"):
         episode.worlds(dos[4:])
-    assert stage_of(world).at_hand >= rollouts.LEAST
+    assert twins_of(world).at_hand >= parallel.LEAST
     assert episode.worlds([{}] * 22)[21] == episode
 
 
 def test_an_interruption_loses_no_world(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C while worlds are stepped, or while an outcome is read, leaves a stage that works."""
+    """Ctrl-C while worlds are stepped, or while an outcome is read, leaves twins that work."""
     world = World("pushing")
     expected = sampled(world)
     step, calls = MujocoBatch.step, []
@@ -260,8 +259,8 @@ def test_a_failure_of_the_engine_ends_one_unit(monkeypatch: pytest.MonkeyPatch) 
 @BULLET
 def test_processes_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """On an engine that steps one world at a time: branches, refusals, and structures."""
-    monkeypatch.setattr(crews, "PAYS", 1)
-    monkeypatch.setattr(crews, "GOES_ON", 1)
+    monkeypatch.setattr(parallel, "PAYS", 1)
+    monkeypatch.setattr(parallel, "GOES_ON", 1)
     world = World("pushing", backend="bullet")
     episode = world.rollout("random", steps=12)
     others = set(multiprocessing.active_children())

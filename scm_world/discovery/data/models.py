@@ -17,9 +17,9 @@ from scm_world.graph import SCM, to_json
 from scm_world.graph.structure import Edge
 from scm_world.queries.equations import Equations
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.rollouts import paths
-from scm_world.queries.stages import EquationStage
-from scm_world.queries.units import Unit
+from scm_world.queries.parallel import paths
+from scm_world.queries.rollouts import Unit
+from scm_world.queries.twins import EquationTwins
 
 
 @final
@@ -45,8 +45,8 @@ class Model:
 
     def __init__(self, model: SCM, design: Design, *, seed: int, steps: int | None) -> None:
         self._model, self._design, self._seed = model, design, seed
-        self._stage = EquationStage(model)
-        self._length = Equations(self._stage.layout).length(steps)
+        self._twins = EquationTwins(model)
+        self._length = Equations(self._twins.layout).length(steps)
         for name, act in design.acts.items():
             model.do({name: act})
         self.columns: tuple[Column, ...] = tuple(c for v in model.variables for c in columns_of(v))
@@ -72,7 +72,7 @@ class Model:
             Unit(self._seed, number, ((0, plans[kind]),), None, self._length)
             for number, kind in zip(numbers, kind_of.tolist(), strict=True)
         ]
-        vectors = paths(self._stage, units)[:, min(self._length, 1) :]
+        vectors = paths(self._twins, units)[:, min(self._length, 1) :]
         n, length, size = vectors.shape
         tell(n)
         return Part(

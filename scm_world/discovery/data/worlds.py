@@ -27,11 +27,11 @@ from scm_world.graph.structure import Edge
 from scm_world.queries.episodes import episode_of
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.outcomes import Outcome, as_outcome
+from scm_world.queries.parallel import Ending, lived
 from scm_world.queries.plans import Plan
-from scm_world.queries.rollouts import Ending, lived
+from scm_world.queries.rollouts import Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.stages import stage_of
-from scm_world.queries.units import Unit
+from scm_world.queries.twins import twins_of
 from scm_world.world import World
 from scm_world.world.requests import merged
 
@@ -69,7 +69,7 @@ class Episodes:
         every_step: bool,
         setting: Setting,
     ) -> None:
-        self._world, self._stage, self._design = world, stage_of(world), design
+        self._world, self._twins, self._design = world, twins_of(world), design
         self._setting, self._given = setting, getattr(world, "plan", Plan())
         for name, act in (*design.acts.items(), *Plan(setting.nature).acts()):
             world.model.accept(name, act)
@@ -99,7 +99,7 @@ class Episodes:
             "format": FORMAT,
             "system": self._world.task.name,
             "arguments": {n: str(v) for n, v in sorted(self._world.task.given.items())},
-            "options": plain_options(self._stage.options),
+            "options": plain_options(self._twins.options),
             "given": self._given.as_dict()["do"],
             "seed": setting.seed,
             "steps": setting.steps,
@@ -123,14 +123,14 @@ class Episodes:
             elif isinstance(ending, Exception):
                 raise ending
             else:
-                episode = episode_of(self._stage, units[place], ending)
+                episode = episode_of(self._twins, units[place], ending)
                 found = self._rows.rows(episode, self._sensors)
             with lock:
                 tell(1)
             return found
 
         units = [self._unit(n, regime) for n, regime in zip(numbers, regimes, strict=True)]
-        found = lived(self._stage, units, finish, self._setting.workers)
+        found = lived(self._twins, units, finish, self._setting.workers)
         return self._part(list(zip(numbers, regimes, found, strict=True)))
 
     def _unit(self, number: int, regime: Regime) -> Unit:

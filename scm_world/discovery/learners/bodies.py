@@ -16,10 +16,9 @@ from scm_world._types import Floats
 from scm_world.discovery.learners.found import Found
 from scm_world.errors import ModelError
 from scm_world.queries import Episode, World
-from scm_world.queries.courses import Course
 from scm_world.queries.local_graphs import LocalEpisode, LocalGraph, local_graph
 from scm_world.queries.local_truth import Pair, movers, paired_truth
-from scm_world.queries.traces import Trace, begin
+from scm_world.queries.rollouts import Schedule, Trace, begin
 from scm_world.world import World as Simulated
 from scm_world.world.start import whole_number
 
@@ -99,11 +98,11 @@ def local_steps(episode: Episode, *, rule: str = "pressing", truth: bool = False
         UnknownOption: There is no such rule.
     """
     graphs: list[LocalGraph] = []
-    course, trace = Course(episode.layers), Trace()
-    with episode.stage.twin() as world:
-        begin(world, episode.seed, episode.number, course, trace)
+    schedule, trace = Schedule(episode.layers), Trace()
+    with episode.twins.twin() as world:
+        begin(world, episode.seed, episode.number, schedule, trace)
         for step, action in enumerate(episode.actions):
-            due = course.due(world, step, trace.fired) if step else {}
+            due = schedule.due(world, step, trace.fired) if step else {}
             if due:
                 world.do(due)
             graphs.append(

@@ -93,7 +93,7 @@ def without(episode: Episode, body: str) -> Episode:
     """
     layers = [(start, _plan_without(episode, start, plan, body)) for start, plan in episode.layers]
     stripped = Episode(
-        episode.stage,
+        episode.twins,
         seed=episode.seed,
         number=episode.number,
         layers=layers,
@@ -139,7 +139,7 @@ def null_effects(episode: Episode, *, threshold: float = THRESHOLD) -> NullRepor
     bodies = bodies_of(episode)
     causes = tuple(body for body in bodies if body not in fixtures(episode))
     if not causes:
-        task = episode.stage.task.name
+        task = episode.twins.task.name
         raise ModelError(
             [f"{task} has no block and no obstacle: there is nothing to take away; fingers stay"]
         )

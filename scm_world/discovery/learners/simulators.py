@@ -25,7 +25,7 @@ from scm_world.queries.experiments.series import Series
 from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting
-from scm_world.queries.stages import stage_of
+from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous, Noise
 from scm_world.world import World
 
@@ -230,7 +230,7 @@ class EpisodeSimulator:
         *,
         progress: Progress | None = None,
     ) -> None:
-        self._world, self._stage, self._settings = world, stage_of(world), tuple(settings)
+        self._world, self._twins, self._settings = world, twins_of(world), tuple(settings)
         self._causes, self._outcomes = tuple(causes), tuple(outcomes)
         self._progress = progress
         self._target = {n: world.model.target(n) for n in self._causes}
@@ -299,7 +299,7 @@ class EpisodeSimulator:
         """Begin an episode, and look at what it begins with."""
         found.rollouts += 1
         short = replace(self._setting_of(unit), steps=1)
-        episode = short.episode(self._stage, self._world, do, unit, self._read)
+        episode = short.episode(self._twins, self._world, do, unit, self._read)
         return {name: np.array(episode[name][0]) for name in self._read}
 
     def _held(self, begin: Mapping[str, Value], names: Iterable[str]) -> dict[str, Any]:
@@ -310,5 +310,5 @@ class EpisodeSimulator:
         """Run an episode, and return what it ends with."""
         found.rollouts += 1
         names = tuple(outcome.name for outcome in self._outcomes)
-        episode = self._setting_of(unit).episode(self._stage, self._world, do, unit, names)
+        episode = self._setting_of(unit).episode(self._twins, self._world, do, unit, names)
         return [read(outcome, episode) for outcome in self._outcomes]

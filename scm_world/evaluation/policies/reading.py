@@ -218,7 +218,7 @@ def _rows(given: Any) -> Any:
 
 
 def _of_episode(episode: Episode, about: About) -> Player:
-    mode = str(episode.stage.options["action_mode"])
+    mode = str(episode.twins.options["action_mode"])
     return OpenLoop(episode.actions, _summed(about, episode.actions), action_mode=mode)
 
 

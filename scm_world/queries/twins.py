@@ -23,7 +23,7 @@ R = TypeVar("R")
 
 
 @final
-class Stage:
+class Twins:
     """Twins of one world: same task, options and engine, but none of its present.
 
     Args:
@@ -130,7 +130,7 @@ def threaded(work: Callable[[T], R], items: Iterable[T], workers: int) -> list[R
 
 
 @final
-class EquationStage:
+class EquationTwins:
     """Where questions to a causal model without a backend are tried out.
 
     Args:
@@ -146,14 +146,14 @@ class EquationStage:
         yield Equations(self.layout)
 
 
-AnyStage = Stage | EquationStage
+AnyTwins = Twins | EquationTwins
 
-_STAGES: WeakKeyDictionary[World, Stage] = WeakKeyDictionary()
+_STAGES: WeakKeyDictionary[World, Twins] = WeakKeyDictionary()
 
 
-def stage_of(world: World) -> Stage:
-    """Give the stage of a world; it lives as long as the world."""
+def twins_of(world: World) -> Twins:
+    """Give the twins of a world; it lives as long as the world."""
     found = _STAGES.get(world)
     if found is None:
-        found = _STAGES[world] = Stage(world)
+        found = _STAGES[world] = Twins(world)
     return found

@@ -10,12 +10,12 @@ from typing import Any, Self, final
 
 from scm_world._types import Floats
 from scm_world.backends import Backend
-from scm_world.queries.courses import Course, Key
 from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan
 from scm_world.queries.questions import Questions
+from scm_world.queries.rollouts import Key, Schedule
 from scm_world.queries.samples import Setting
-from scm_world.queries.stages import AnyStage, stage_of
+from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, WorldSnapshot
@@ -145,7 +145,7 @@ class World(Simulated, Questions):
         )
 
     _standing: Plan = Plan()
-    _course: Course = Course(())
+    _schedule: Schedule = Schedule(())
     _fired: Mapping[Key, int] = MappingProxyType({})
 
     # --- another world ------------------------------------------------------------------------
@@ -172,9 +172,9 @@ class World(Simulated, Questions):
         other = copy.deepcopy(self)
         other._standing = self._with(do)
         if other._started:
-            other._course = Course([*self._course.layers, (other.index, Plan(do))])
+            other._schedule = Schedule([*self._schedule.layers, (other.index, Plan(do))])
             other._fired = fired = dict(self._fired)
-            due = other._course.due(other, other.index, fired)
+            due = other._schedule.due(other, other.index, fired)
             if due:
                 other.do(due)
         return other
@@ -193,7 +193,7 @@ class World(Simulated, Questions):
             arguments,
             {
                 "_standing": self._standing,
-                "_course": self._course,
+                "_schedule": self._schedule,
                 "_fired": dict(self._fired),
             },
         )
@@ -204,19 +204,19 @@ class World(Simulated, Questions):
         """Begin an episode, with what is given; see ``scm_world.world.World.reset``."""
         plan = self._with(do)
         if not len(self._standing) and not any(True for _ in plan.timed()):
-            self._course, self._fired = Course(()), {}
+            self._schedule, self._fired = Schedule(()), {}
             return super().reset(seed=seed, episode=episode, do=do)
         super().reset(seed=seed, episode=episode)
         fired: dict[Key, int] = {}
-        self._course, self._fired = Course([(0, plan)]), fired
-        due = self._course.due(self, 0, fired)
+        self._schedule, self._fired = Schedule([(0, plan)]), fired
+        due = self._schedule.due(self, 0, fired)
         return self.do(due) if due else None
 
     def advance(self, command: Floats) -> None:
         """Advance one control step, with what is due at its beginning."""
-        if self._course.layers and self.index:
+        if self._schedule.layers and self.index:
             fired = dict(self._fired)
-            due = self._course.due(self, self.index, fired)
+            due = self._schedule.due(self, self.index, fired)
             self._fired = fired
             if due:
                 self.do(due)
@@ -224,20 +224,20 @@ class World(Simulated, Questions):
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything, with the events that have happened."""
-        return replace(super().snapshot(), memory=(self._course, dict(self._fired)))
+        return replace(super().snapshot(), memory=(self._schedule, dict(self._fired)))
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Go back to a snapshot, bit for bit."""
         super().restore(snapshot)
         if snapshot.memory is not None:
-            self._course, self._fired = snapshot.memory[0], dict(snapshot.memory[1])
+            self._schedule, self._fired = snapshot.memory[0], dict(snapshot.memory[1])
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given; of two names of one quantity the later one counts."""
         return Plan(merged(self.model, self._standing, Plan(do)))
 
-    def _asked(self) -> tuple[AnyStage, System]:
-        return stage_of(self), self
+    def _asked(self) -> tuple[AnyTwins, System]:
+        return twins_of(self), self
 
     def _setting(self, given: Mapping[str, Any]) -> Setting:
         return Setting(**given)
