@@ -132,7 +132,7 @@ def digest(folder: Path) -> tuple[str, int]:
 
 def collected(out: Path, episodes: int, shard: int, engine: Executor | None) -> Any:
     """Collect interventional episodes of pushing, of one control step each."""
-    design = Design("half", TARGETS, seen=0.3)
+    design = Design("half", TARGETS, observational_fraction=0.3)
     world = World("pushing", backend="fake")
     return collect(
         world, design, episodes, out=out, shard=shard, steps=1, seed=7, engine=engine,

@@ -20,7 +20,7 @@ OUTCOMES = (Outcome("tool_block.cartesian_position", "change"), Outcome("reward"
 def main(backend: str = "fake", episodes: int = 60) -> None:
     """Collect twice as many episodes as at first, and print what is in them."""
     world = World("pushing", backend=backend)
-    design = Design("single", CAUSES, values="A|B", seen=0.25)
+    design = Design("single", CAUSES, values="A|B", observational_fraction=0.25)
     nature = dict.fromkeys(CAUSES, "A") | {"sensor_noise": 0.01}
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "pushing"

@@ -26,7 +26,9 @@ def on_a_model(name: str = "er2:20", rows: int = 2000) -> None:
     """Learn a random linear model from rows with known targets, then by paired experiments."""
     scm, given = random_model(name, seed=0), problem(name, seed=0)
     print(f"{name}: {len(scm.edges)} edges")
-    design = Design("single", tuple(scm), values=Normal(mean=2.0, std=1.0), seen=0.1)
+    design = Design(
+        "single", tuple(scm), values=Normal(mean=2.0, std=1.0), observational_fraction=0.1
+    )
     table = collect(scm, design, rows, seed=0)
     shown("do_order", learn("do_order", table), given)
     shown("do_order, a tenth of the rows", learn("do_order", table.first(rows // 10)), given)

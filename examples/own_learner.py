@@ -24,7 +24,7 @@ MODEL = SCM(
 
 def contrast(data: Dataset, *, seed: int = 0, least: float = 5.0) -> np.ndarray:
     """Find what moves when a variable is set, then which of it is direct."""
-    seen, p = data.seen.values, len(data.names)
+    seen, p = data.observational.values, len(data.names)
     spread = seen.std(axis=0) / np.sqrt(len(seen))
     moves = np.zeros((p, p), bool)  # [i, j]: j is elsewhere where i is set
     for i, name in enumerate(data.names):

@@ -42,7 +42,7 @@ class Options:
         causes: Patterns of the parameters that are written down; the usual ones if there are none.
         outcomes: What is measured, each as ``name``, ``name[2]`` or ``how:name``.
         values: The space that values are drawn from.
-        seen: The share of episodes in which nothing is done.
+        observational_fraction: The share of episodes in which nothing is done.
         nature: What varies by itself, each as ``name=value``.
         every_step: Whether there is a row for each control step.
         shard: Episodes in a file.
@@ -57,7 +57,7 @@ class Options:
     causes: tuple[str, ...]
     outcomes: tuple[str, ...]
     values: str
-    seen: float
+    observational_fraction: float
     nature: tuple[str, ...]
     every_step: bool
     shard: int
@@ -112,11 +112,11 @@ def _collected(
 ) -> Dataset:
     where, patterns = options.where, options.targets or options.causes
     targets: Sequence[str] = ()
-    if options.design != "see":
+    if options.design != "observational":
         targets = settable(world, patterns) if patterns else default_causes(world)
     return collect(
         world,
-        Design(options.design, tuple(targets), options.values, options.seen),
+        Design(options.design, tuple(targets), options.values, options.observational_fraction),
         options.n,
         seed=where.seed,
         out=folder,

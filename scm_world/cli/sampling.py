@@ -24,7 +24,10 @@ Files = Annotated[str, typer.Option("--format", help="parquet or csv.")]
 def collect(
     task: Task,
     design: Annotated[
-        str, typer.Option(help="What is done: see, single, all or half of the targets at once.")
+        str,
+        typer.Option(
+            help="What is done: observational, single, all or half of the targets at once."
+        ),
     ] = "single",
     n: Annotated[int, typer.Option("-n", "--n", min=1, help="How many episodes.")] = 1000,
     target: Annotated[
@@ -37,7 +40,7 @@ def collect(
     ] = None,
     outcome: Outcomes = None,
     values: Annotated[str, typer.Option(help="Where values are drawn: A, B or 'A|B'.")] = "A",
-    seen: Annotated[
+    observational_fraction: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Share of episodes in which nothing is done.")
     ] = 0.3,
     nature: Nature = None,
@@ -74,7 +77,7 @@ def collect(
         causes=tuple(cause or ()),
         outcomes=tuple(outcome or ()),
         values=values,
-        seen=seen,
+        observational_fraction=observational_fraction,
         nature=tuple(nature or ()),
         every_step=every_step,
         shard=shard,

@@ -44,7 +44,11 @@ def collider() -> SCM:
 def table(kind: str) -> Dataset:
     """Collect ``"observational"`` or ``"interventional"`` rows of that model."""
     targets = tuple(collider())
-    design = Design() if kind == "observational" else Design("single", targets, DONE, seen=0.3)
+    design = (
+        Design()
+        if kind == "observational"
+        else Design("single", targets, DONE, observational_fraction=0.3)
+    )
     return collect(collider(), design, ROWS, seed=5)
 
 

@@ -278,7 +278,7 @@ def test_observational_learners_leave_interventions_out(name: str) -> None:
     if name != "pcmci+":
         found = learn(name, data)
         assert told(found, "300 of 600 rows were left out")
-        np.testing.assert_array_equal(found.edges, learn(name, data.seen).edges)
+        np.testing.assert_array_equal(found.edges, learn(name, data.observational).edges)
     with pytest.raises(ModelError, match=f"{name.replace('+', '.')}.*nothing is done"):
         learn(name, chains("x", "y"))
 

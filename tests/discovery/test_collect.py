@@ -57,31 +57,33 @@ def world() -> World:
 @pytest.mark.parametrize("seen", [0.0, 0.3, 0.5, 1.0])
 def test_every_prefix_has_its_share(name: str, seen: float) -> None:
     """The first N episodes have the share of watched ones, to one episode."""
-    chosen = Design(name, tuple("abc"), seen=seen).chosen(0, 0, 200)
+    chosen = Design(name, tuple("abc"), observational_fraction=seen).chosen(0, 0, 200)
     watched = np.cumsum(~chosen.any(axis=1))
     assert np.all(np.abs(watched - seen * np.arange(1, 201)) <= 1.0)
 
 
 def test_single_targets_take_turns() -> None:
     """Watched episodes do not make a target lose its turn."""
-    chosen = Design("single", tuple("abc"), seen=0.25).chosen(0, 0, 40)
+    chosen = Design("single", tuple("abc"), observational_fraction=0.25).chosen(0, 0, 40)
     turns = chosen[chosen.any(axis=1)].argmax(axis=1)
     np.testing.assert_array_equal(turns, np.arange(30) % 3)
 
 
 def test_half_is_drawn_by_lot() -> None:
     """Half of the targets, rounded up; each one about as often; another seed, other lots."""
-    design = Design("half", tuple("abcde"), seen=0.0)
+    design = Design("half", tuple("abcde"), observational_fraction=0.0)
     chosen = design.chosen(1, 0, 1000)
     assert set(chosen.sum(axis=1)) == {3}
     assert np.all(np.abs(chosen.mean(axis=0) - 0.6) < 0.06)  # four standard errors
     assert not np.array_equal(chosen, design.chosen(2, 0, 1000))
 
 
-@pytest.mark.parametrize("name", ["see", "single", "all", "half"])
+@pytest.mark.parametrize("name", ["observational", "single", "all", "half"])
 def test_an_episode_does_not_know_how_many_there_are(name: str) -> None:
     """Episode i is the same in a part as in the whole."""
-    design = Design(name, () if name == "see" else tuple("abcd"), seen=0.3)
+    design = Design(
+        name, () if name == "observational" else tuple("abcd"), observational_fraction=0.3
+    )
     np.testing.assert_array_equal(design.chosen(5, 0, 90)[37:61], design.chosen(5, 37, 24))
 
 
@@ -90,7 +92,7 @@ def test_an_episode_does_not_know_how_many_there_are(name: str) -> None:
     [
         (("sigle", ("a",)), "did you mean 'single'"),
         (("single", ()), "targets cannot be"),
-        (("see", ("a",)), "none with 'see'"),
+        (("observational", ("a",)), "none with 'observational'"),
         (("all", ("a", "a")), "each of them once"),
         (("all", ("a",), "C"), "it can be: A, B"),
         (("all", ("a", "b"), {"a": "A"}), "a source for 'b'"),
@@ -135,7 +137,9 @@ def test_a_lagged_model_is_solved_step_by_step() -> None:
             ),
         ]
     )
-    found = collect(drift, Design("all", ("x",), 3.0, seen=0.5), 4, seed=1, steps=6)
+    found = collect(
+        drift, Design("all", ("x",), 3.0, observational_fraction=0.5), 4, seed=1, steps=6
+    )
     assert found.step.tolist() == [0, 1, 2, 3, 4, 5] * 4
     seen, done = drift.draw(4, seed=1, steps=6), drift.do({"x": 3.0}).draw(4, seed=1, steps=6)
     for episode in range(4):
@@ -170,7 +174,7 @@ def test_a_model_takes_no_policy() -> None:
 
 def test_a_row_of_a_world_is_its_episode(world: World) -> None:
     """Causes as they were set, outcomes as they ended."""
-    design = Design("all", (MASS,), "B", seen=0.5)
+    design = Design("all", (MASS,), "B", observational_fraction=0.5)
     outcomes = ["fractional_success", Outcome("tool_block.cartesian_position", "change", 1)]
     found = collect(world, design, 4, seed=2, steps=3, causes=[FRICTION], outcomes=outcomes)
     assert found.names == (
@@ -220,7 +224,7 @@ def test_a_state_is_a_target_at_its_instant_only(world: World) -> None:
     """A parameter stays set; where a block was put counts for the first row."""
     place = "tool_block.cylindrical_position"
     values = {MASS: 0.05, place: [0.05, 0.1, 0.0325]}
-    design = Design("all", (MASS, place), values, seen=0.0)
+    design = Design("all", (MASS, place), values, observational_fraction=0.0)
     found = collect(
         world, design, 1, steps=3, every_step=True, outcomes=["tool_block.cartesian_position"]
     )
@@ -368,7 +372,7 @@ def test_what_can_never_be_is_refused_at_once(world: World) -> None:
 def test_a_laboratory_pays_for_every_row(world: World) -> None:
     """Each episode is an experiment, with what the laboratory reports."""
     lab = Laboratory(world, settable=["*.mass"], visible=["tool_block.*"], budget=10, steps=2)
-    found = collect(lab, Design("all", (MASS,), "B", seen=0.5), 4)
+    found = collect(lab, Design("all", (MASS,), "B", observational_fraction=0.5), 4)
     assert lab.remaining == 6
     assert [record.kind for record in lab.records] == ["see", "do", "see", "do"]
     assert found.targeted[:, found.names.index(MASS)].tolist() == [False, True] * 2

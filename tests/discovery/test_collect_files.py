@@ -34,7 +34,9 @@ from scm_world.variables import Mechanism
 
 pytest.importorskip("pyarrow")
 
-DESIGN = Design("half", ("tool_block.mass", "floor_friction", "gravity"), seen=0.3)
+DESIGN = Design(
+    "half", ("tool_block.mass", "floor_friction", "gravity"), observational_fraction=0.3
+)
 HOW: dict[str, Any] = {"steps": 2, "seed": 5, "shard": 4, "nature": {"sensor_noise": 0.01}}
 KINDS = ("parquet", "csv")
 
@@ -166,7 +168,7 @@ PROGRAM = """
 import sys
 from scm_world.discovery.data import Design, collect
 from scm_world.queries import World
-design = Design("half", ("tool_block.mass", "floor_friction", "gravity"), seen=0.3)
+design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
 print("begin", flush=True)
 collect(World("pushing", backend="fake"), design, 400, out=sys.argv[1], shard=3, steps=2)
 """

@@ -67,13 +67,17 @@ def drifting() -> SCM:
 @pytest.fixture(scope="module")
 def table() -> Dataset:
     """Rows of the chain, with interventions on each of its variables."""
-    return collect(chain(), Design("single", ("x", "y", "z"), seen=0.25), 40, seed=3)
+    return collect(
+        chain(), Design("single", ("x", "y", "z"), observational_fraction=0.25), 40, seed=3
+    )
 
 
 @pytest.fixture(scope="module")
 def series() -> Dataset:
     """Time series with a category in them."""
-    return collect(drifting(), Design("single", ("level",), seen=0.5), 6, seed=3, steps=5)
+    return collect(
+        drifting(), Design("single", ("level",), observational_fraction=0.5), 6, seed=3, steps=5
+    )
 
 
 def test_a_joined_table_is_the_whole_again(table: Dataset) -> None:
@@ -270,7 +274,7 @@ def test_states_are_told_apart_from_their_ends() -> None:
     """An intervention on where a block begins does not make its end a target."""
     world = World("pushing", backend="fake")
     name = "tool_block.cartesian_position"
-    design = Design("all", (name,), values=[0.02, 0.03, 0.0325], seen=0.0)
+    design = Design("all", (name,), values=[0.02, 0.03, 0.0325], observational_fraction=0.0)
     found = collect(world, design, 2, causes=[name], steps=2)
     assert found.columns[0].variable == f"first {name}"
     np.testing.assert_array_equal(found[f"first {name}"][0], [0.02, 0.03, 0.0325])

@@ -279,7 +279,7 @@ def test_the_true_graph_predicts_interventions() -> None:
     assert rmse([("y", "x", 0), ("y", "z", 0)], data, ("y",)) > 0.3
     assert rmse([("x", "y", 0), ("z", "y", 0)], data, ("y",)) > 0.3
     train, test = hold_out(data, [("x",)])
-    nothing = effect_rmse(Found.of_edges(("x", "y", "z"), []), train.seen, test)
+    nothing = effect_rmse(Found.of_edges(("x", "y", "z"), []), train.observational, test)
     assert nothing.rmse == pytest.approx(nothing.unmoved)
     assert nothing.by_regime == {("x",): nothing.rmse}
 
@@ -299,7 +299,7 @@ def test_prediction_says_when_it_does_not_apply() -> None:
     assert effect_rmse(ring, train, test).note == "the graph has a cycle, or no extension"
     assert effect_rmse(late, train, test).note == "the graph has edges through time"
     with pytest.raises(ModelError, match="something was done"):
-        effect_rmse(ring, train, data.seen)
+        effect_rmse(ring, train, data.observational)
     with pytest.raises(ModelError, match="nothing was done"):
         effect_rmse(ring, test, test)
     with pytest.raises(UnknownVariable, match="'w'"):

@@ -22,7 +22,7 @@ UNIT = Normal(mean=0.0, std=1.0)
 
 def drawn(scm: SCM, n: int, seed: int, *, design: str = "single", seen: float = 2 / 22) -> Dataset:
     """Collect rows of a model without physics."""
-    return collect(scm, Design(design, tuple(scm), DONE, seen=seen), n, seed=seed)
+    return collect(scm, Design(design, tuple(scm), DONE, seen), n, seed=seed)
 
 
 def true_edges(scm: SCM) -> Edges:
@@ -164,7 +164,7 @@ def test_time_gives_lagged_edges() -> None:
         Derived(name=name, parents=(parent,), mechanism=Linear(weights=(weight,)), noise=UNIT)
         for name, (parent, weight) in lines.items()
     )
-    design = Design("single", ("a", "b", "c"), DONE, seen=0.5)
+    design = Design("single", ("a", "b", "c"), DONE, 0.5)
     found = learn("do_order", collect(scm, design, 200, seed=0, steps=8))
     assert found.names == ("a", "b", "c")
     assert set(found.directed) == {("a", "a", 1), ("a", "b", 1), ("b", "c", 0)}

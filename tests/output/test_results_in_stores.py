@@ -21,7 +21,9 @@ from scm_world.output.remote import Remote
 from scm_world.queries import World
 
 HOW: dict[str, Any] = {"n": 60, "backend": "fake", "env": {"max_episode_length": 3}}
-DESIGN = Design("half", ("tool_block.mass", "floor_friction", "gravity"), seen=0.3)
+DESIGN = Design(
+    "half", ("tool_block.mass", "floor_friction", "gravity"), observational_fraction=0.3
+)
 WHERE = ("memory", "shelf")
 """A store of objects, and one in which files are moved to their place."""
 

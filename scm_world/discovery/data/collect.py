@@ -98,7 +98,7 @@ def collect(
     Example:
         >>> from scm_world.queries import World
         >>> world = World("pushing", backend="fake")
-        >>> design = Design("single", ("tool_block.mass", "floor_friction"), values="B", seen=0.5)
+        >>> design = Design("single", ("tool_block.mass", "floor_friction"), "B", 0.5)
         >>> table = collect(world, design, 4, steps=2, causes=["floor_friction"])
         >>> [table.regimes[i].targets for i in table.regime]
         [(), ('tool_block.mass',), (), ('floor_friction',)]

@@ -268,7 +268,7 @@ class Dataset:
         )
 
     @property
-    def seen(self) -> Dataset:
+    def observational(self) -> Dataset:
         """The rows in which nothing was done."""
         return self.rows(~self._acted[self.regime])
 

@@ -18,7 +18,7 @@ from scm_world.variables import Draw, Function, Intervention, Mechanism, Noise
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
 
-DESIGNS = ("see", "single", "all", "half")
+DESIGNS = ("observational", "single", "all", "half")
 
 STREAM = "design"
 """The stream of what a design draws by lot."""
@@ -30,29 +30,29 @@ class Design:
     """What is done in episode i: a function of the seed and of i only.
 
     Attributes:
-        name: ``"see"``: nothing; ``"single"``: one target in each episode, in turn; ``"all"``:
-            every target, each on its own; ``"half"``: in each episode half of the targets
-            (rounded up), drawn by lot.
+        name: ``"observational"``: nothing; ``"single"``: one target in each episode, in turn;
+            ``"all"``: every target, each on its own; ``"half"``: in each episode half of the
+            targets (rounded up), drawn by lot.
         targets: Variables to intervene on.
         values: Where their values come from: a space ``"A"``, ``"B"`` or ``"A|B"``, a distribution,
             a value or any intervention; or a mapping of these by target.
-        seen: In which share of the episodes nothing is done. They are spread evenly, beginning with
-            the first one, so that the first N episodes hold the same share of them.
+        observational_fraction: In which share of the episodes nothing is done. They are spread
+            evenly, beginning with the first one, so that the first N episodes hold the same share.
 
     Raises:
         UnknownOption: There is no such design, a target is given twice or has no values, or the
             share is none.
 
     Example:
-        >>> design = Design("single", ("x", "y"), values="A", seen=0.5)
+        >>> design = Design("single", ("x", "y"), values="A", observational_fraction=0.5)
         >>> [design.regime(i).targets for i in range(4)]
         [(), ('x',), (), ('y',)]
     """
 
-    name: str = "see"
+    name: str = "observational"
     targets: tuple[str, ...] = ()
     values: Any = "A"
-    seen: float = 0.3
+    observational_fraction: float = 0.3
     _acts: dict[str, Intervention] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -60,13 +60,14 @@ class Design:
         if self.name not in DESIGNS:
             raise UnknownOption("design", self.name, DESIGNS)
         given = (self.targets,) if isinstance(self.targets, str) else tuple(self.targets)
-        if bool(given) == (self.name == "see"):
-            allowed = ("none with 'see'", "one or more with the other designs")
+        if bool(given) == (self.name == "observational"):
+            allowed = ("none with 'observational'", "one or more with the other designs")
             raise UnknownOption("targets", given, allowed)
         if len(set(given)) < len(given):
             raise UnknownOption("targets", given, ("names, each of them once",))
-        if isinstance(self.seen, str) or not 0.0 <= self.seen <= 1.0:
-            raise UnknownOption("seen", self.seen, ("a share from 0 to 1",))
+        share = self.observational_fraction
+        if isinstance(share, str) or not 0.0 <= share <= 1.0:
+            raise UnknownOption("observational_fraction", share, ("a share from 0 to 1",))
         object.__setattr__(self, "targets", given)
         object.__setattr__(self, "_acts", _acts(given, self.values))
 
@@ -87,7 +88,7 @@ class Design:
         """
         episodes, k = np.arange(first, first + count), len(self.targets)
         match self.name:
-            case "see":
+            case "observational":
                 return np.zeros((count, 0), dtype=bool)
             case "single":
                 turn = (episodes - self._seen_before(episodes)) % k
@@ -124,7 +125,7 @@ class Design:
         """
         return {
             "name": self.name,
-            "seen": float(self.seen),
+            "observational_fraction": float(self.observational_fraction),
             "do": self.plan_of(self.targets).as_dict()["do"],
         }
 
@@ -139,7 +140,8 @@ class Design:
 
     @cached_property
     def _share(self) -> Fraction:
-        return Fraction(1 if self.name == "see" else self.seen).limit_denominator(1_000_000)
+        share = 1 if self.name == "observational" else self.observational_fraction
+        return Fraction(share).limit_denominator(1_000_000)
 
     def _seen_before(self, episodes: Ints) -> Ints:
         """Count the watched episodes before each of some episodes, in whole numbers."""

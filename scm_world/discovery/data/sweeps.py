@@ -134,7 +134,7 @@ class Grid:
         self._points = [
             Episodes(
                 world,
-                Design("all", tuple(point), point, seen=0.0),
+                Design("all", tuple(point), point, observational_fraction=0.0),
                 causes=tuple(point),
                 outcomes=measured,
                 every_step=False,

@@ -105,7 +105,7 @@ def effect_rmse(found: Found, train: Dataset, test: Dataset) -> Prediction:
         >>> round(effect_rmse(Found.of_edges(["x", "y"], [("x", "y", 0)]), train, test).rmse, 6)
         0.0
     """
-    if not len(train.seen):
+    if not len(train.observational):
         raise ModelError(["train has no row in which nothing was done"])
     if not any(test.regimes[number].targets for number in np.unique(test.regime)):
         raise ModelError(["test has no row in which something was done"])
@@ -115,7 +115,7 @@ def effect_rmse(found: Found, train: Dataset, test: Dataset) -> Prediction:
     if dag is None:
         return Prediction(None, note="the graph has a cycle, or no extension")
     where, graph = _over_columns(found.names, dag, train)
-    seen = train.seen.values[:, where]
+    seen = train.observational.values[:, where]
     spread = seen.std(axis=0)
     spread[spread <= CONSTANT * (1.0 + np.abs(seen.mean(axis=0)))] = np.nan
     weight, offset = _fitted(train.values[:, where], train.targeted[:, where], graph)

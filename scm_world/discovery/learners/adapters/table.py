@@ -73,7 +73,7 @@ def prepare(learner: str, data: Dataset, *, done: bool = False) -> Table:
     Raises:
         ModelError: No row is left, or not more rows than columns.
     """
-    rows = data if done else data.seen
+    rows = data if done else data.observational
     if len(rows) == 0:
         raise ModelError(
             [f"{learner!r} uses only rows in which nothing is done, and there are none; add some"]
