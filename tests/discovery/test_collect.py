@@ -153,7 +153,7 @@ def test_interventions_that_close_a_cycle_happen_in_different_episodes() -> None
     """Each of them is possible; only together they close a cycle."""
     follows = {n: Box(Affine(parent=m), 99.0) for n, m in (("x", "y"), ("y", "x"))}
     pair = SCM([Exogenous(name=n, distribution=Box(0.0, 1.0)) for n in ("x", "y")])
-    found = collect(pair, Design("single", ("x", "y"), follows, seen=0.0), 4)
+    found = collect(pair, Design("single", ("x", "y"), follows, observational_fraction=0.0), 4)
     x, y = found.values[:2].T
     assert x[0] > y[0]
     assert y[1] > x[1]
