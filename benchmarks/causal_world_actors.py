@@ -107,7 +107,7 @@ def episode(
         if setting.held:
             observation = observation.copy()
             observation[when] = 1.0
-        action = policy(observation, deterministic=generator is None, generator=generator)
+        action = policy(observation, generator=generator)
         observation, reward, terminated, truncated, info = env.step(action)
         over = terminated or truncated
         fractions.append(info["fractional_success"])

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 
 from scm_world.evaluation import evaluate
-from scm_world.evaluation.policies.weights import save_policy
+from scm_world.policies import save_policy
 from scm_world.training.tuned import ENV
 
 GOALS = [f"goal_{finger}.cartesian_position" for finger in (60, 120, 300)]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 
 from scm_world.evaluation import evaluate
-from scm_world.evaluation.zoo import zoo
+from scm_world.policies.zoo import zoo
 
 ENGINES = ("mujoco", "bullet")
 LEARNED = "zoo:picking" if "picking" in zoo() else "grasp"

@@ -10,7 +10,7 @@ import sys
 
 from scm_world.evaluation import evaluate
 from scm_world.evaluation.statistics import unpaired_interval
-from scm_world.evaluation.zoo import zoo
+from scm_world.policies.zoo import zoo
 
 PAIRS = (("P1", "P2"), ("P7", "P8"))  # mass; goal, start and mass: from A, and from B
 LEARNED = "zoo:picking" if "picking" in zoo() else "grasp"

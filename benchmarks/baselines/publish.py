@@ -6,7 +6,7 @@
 
 ``RUN`` is the folder of a training run, or a policy file; ``EVALUATION`` a folder that
 ``scm-world evaluate`` wrote about this very file, on one engine or both. The policy without its
-value network becomes ``scm_world/evaluation/zoo/NAME.safetensors``, and ``docs/zoo.md`` is written
+value network becomes ``scm_world/policies/zoo/NAME.safetensors``, and ``docs/zoo.md`` is written
 anew.
 """
 
@@ -20,15 +20,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from benchmarks.baselines.cards import COMMAND, LIMITS, RESULTS, SCORES, page_text
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation
-from scm_world.evaluation.policies.cards import PolicyAbout
-from scm_world.evaluation.policies.trained import in_run
-from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
-from scm_world.evaluation.zoo import page as zoo_page
-from scm_world.evaluation.zoo import shelf
-from scm_world.evaluation.zoo.texts import COMMAND, LIMITS, RESULTS, SCORES
 from scm_world.output.durable import write_whole
+from scm_world.policies import NetworkPolicy, PolicyAbout, file_of, load_policy, save_policy, zoo
 from scm_world.training.recipe import Recipe, recipe
 
 LARGEST = 1_000_000  # [bytes] of a file in the package
@@ -126,7 +122,7 @@ def published(
             LIMITS: [*limits],
         }
     )
-    return NetworkPolicy(policy.layers, about, policy.log_std)
+    return NetworkPolicy(policy.layers, policy.log_std, about=about)
 
 
 def publish(
@@ -149,13 +145,13 @@ def publish(
     """
     if not re.fullmatch(r"[a-z0-9_]+", name):
         raise UnknownOption("name in the zoo", name, ("small letters, digits and _",))
-    policy = published(in_run(source) if source.is_dir() else source, results, **more)
+    policy = published(file_of(source), results, **more)
     size = sum(array.nbytes for array in policy.tensors().values()) + len(policy.about.text())
     if size >= LARGEST:
         raise UnknownOption("size of a policy", f"{size:,} bytes", (f"below {LARGEST:,}",))
-    path = shelf.FOLDER / f"{name}{shelf.SUFFIX}"
+    path = zoo.FOLDER / f"{name}.safetensors"
     save_policy(path, policy)
-    write_whole(zoo_page(), page)
+    write_whole(page_text(zoo.zoo()), page)
     return path
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.speed.scenes import ENGINES, SEED, Case, actions, bare, cases, commands
 from benchmarks.speed.timing import MICRO, Settings, busy, in_turns, medians, ratio
-from scm_world.evaluation.recording.recorder import Recorder
+from scm_world.evaluation.recording import Recorder
 
 STEPS, ROUNDS = 250, 15
 

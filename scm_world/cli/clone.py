@@ -125,7 +125,7 @@ def clone(
 
 def _is_a_start(learned: Lesson) -> bool:
     """Tell whether the usual recipe of the task trains a policy of this form."""
-    from scm_world.evaluation.policies.cards import COMMON, FORM
+    from scm_world.policies.cards import COMMON, FORM
     from scm_world.training.recipe import recipe
 
     usual = recipe(learned.task, observations=learned.observations)

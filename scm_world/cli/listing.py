@@ -11,9 +11,8 @@ from scm_world.discovery.problems import FAMILIES
 from scm_world.env import IDS
 from scm_world.errors import EngineError
 from scm_world.evaluation import protocols_of
-from scm_world.evaluation.policies.cards import PolicyAbout
-from scm_world.evaluation.zoo import zoo
-from scm_world.evaluation.zoo.texts import COMMAND, best_known
+from scm_world.policies import PolicyAbout
+from scm_world.policies.zoo import best_known, zoo
 from scm_world.tasks import CONVENTIONS, TASKS
 from scm_world.tasks.trifinger.entities.robot import ACTIONS
 from scm_world.tasks.trifinger.presets import PRESETS
@@ -60,7 +59,7 @@ def show_zoo() -> None:
     made = table("name", "task", "seed", "scores", "command", title="trained policies")
     cards = zoo()
     for name, about in cards.items():
-        seed, command = about.card.get("seed", ""), about.card.get(COMMAND, "")
+        seed, command = about.card.get("seed", ""), about.card.get("command", "")
         cells = (name, about.task, str(seed), best_known(about), str(command))
         made.add_row(*map(Text, cells))
     console().print(made if cards else "there are no trained policies in this installation")

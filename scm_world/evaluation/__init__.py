@@ -8,13 +8,13 @@ An evaluation is one call::
     found.save("results")
 """
 
-from scm_world.evaluation.again import Check, check
 from scm_world.evaluation.arena import METRICS
 from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.checking import Check, check
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
 from scm_world.evaluation.files import merge
 from scm_world.evaluation.pipeline import evaluate
-from scm_world.evaluation.policies import Player, WorldPolicy, as_player
+from scm_world.evaluation.players import Player, WorldPolicy, as_player, player_from
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.recording import Recorder, Recording, record
 from scm_world.evaluation.results import Evaluation
@@ -37,6 +37,7 @@ __all__ = [
     "check",
     "evaluate",
     "merge",
+    "player_from",
     "protocols_of",
     "record",
     "why",

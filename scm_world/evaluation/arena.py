@@ -15,8 +15,7 @@ from scm_world.curricula import Memory, Turn
 from scm_world.curricula.choices import Stages
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
-from scm_world.evaluation.policies import Player
-from scm_world.evaluation.policies.players import Actions
+from scm_world.evaluation.players import Actions, Player
 from scm_world.evaluation.protocols import Protocol
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Null, Subset

@@ -13,8 +13,8 @@ from scm_world.curricula.parts import Acts, AnyPart, Part
 from scm_world.curricula.situations import Situation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.again import bench_of
 from scm_world.evaluation.arena import Arena, Row
+from scm_world.evaluation.checking import bench_of
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation

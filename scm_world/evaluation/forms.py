@@ -11,15 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.policies.cards import (
-    COMMON,
-    FORM,
-    FREE,
-    PolicyAbout,
-    contradiction,
-    plain,
-    usual,
-)
+from scm_world.policies import PolicyAbout
+from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
 from scm_world.tasks import Task
 
 Options = dict[str, Any]

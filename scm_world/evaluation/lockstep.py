@@ -14,8 +14,7 @@ from scm_world.env.batched.inside import Inside
 from scm_world.env.batched.native import NativeCrew
 from scm_world.env.batched.sheet import FLAGS, FRACTION
 from scm_world.evaluation.arena import Arena, Game, Row
-from scm_world.evaluation.policies import Player
-from scm_world.evaluation.policies.players import Actions, Playing
+from scm_world.evaluation.players import Actions, Player
 from scm_world.evaluation.protocols import Protocol
 
 LONG = 0.1
@@ -125,9 +124,8 @@ class Lockstep:
             and world.backend.capabilities.batch
             and not len(world.family.head)  # else bodies may come and go in some of them
             and not Inside.of(self._env).is_partial
-            and isinstance(player, Playing)
             and not any(player is one for one in self._apart)
-            and player.twin() is not None
+            and player.parallel
         )
 
     def _played(self, player: Any, episodes: Episodes) -> list[Row] | None:

@@ -13,7 +13,7 @@ from scm_world.errors import UnreadableFile
 from scm_world.evaluation.arena import Arena, Row
 from scm_world.evaluation.lockstep import Episodes, Lockstep
 from scm_world.evaluation.parts import read_part, write_part
-from scm_world.evaluation.policies import Player, as_player
+from scm_world.evaluation.players import Player, as_player
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import Seat
 from scm_world.evaluation.setups import SHARD, Setup, Shard, prepare

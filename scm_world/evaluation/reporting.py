@@ -7,7 +7,7 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from scm_world.evaluation.again import bench_of
+from scm_world.evaluation.checking import bench_of
 from scm_world.evaluation.outputs import (
     bars_figure,
     causes_figure,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption
 from scm_world.evaluation.forms import form_of
-from scm_world.evaluation.policies import Player, WorldPolicy, as_player
-from scm_world.evaluation.policies.cards import PolicyAbout
+from scm_world.evaluation.players import Player, WorldPolicy, as_player
 from scm_world.evaluation.protocols import named
+from scm_world.policies import PolicyAbout
 
 _TRIES = 25  # observations on which a policy without a file is tried out
 _PLACE = ("path",)  # where a policy lies does not say which one it is

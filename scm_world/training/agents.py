@@ -21,8 +21,8 @@ from scm_world.curricula import make_vec
 from scm_world.env import IDS
 from scm_world.env.batched.choice import fastest
 from scm_world.errors import Diverged, MissingExtra, UnknownOption, UnreadableFile
-from scm_world.evaluation.policies.weights import save_policy
 from scm_world.output.durable import made, write_durably, write_whole
+from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress
 from scm_world.training.export import begin_with, exported, mean, scored, words
 from scm_world.training.recipe import Recipe, curriculum_of

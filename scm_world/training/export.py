@@ -10,8 +10,8 @@ import numpy as np
 
 from scm_world.errors import UnreadableFile
 from scm_world.evaluation import evaluate
-from scm_world.evaluation.policies.cards import FORM, OPTIONS, PolicyAbout
-from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
+from scm_world.policies import NetworkPolicy, PolicyAbout, load_policy
+from scm_world.policies.cards import FORM, OPTIONS
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
 

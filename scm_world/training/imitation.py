@@ -20,12 +20,12 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import protocols_of
-from scm_world.evaluation.policies.cards import OPTIONS
-from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
 from scm_world.evaluation.protocols import chosen
 from scm_world.evaluation.recording import Recording
 from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import locked, made, write_durably
+from scm_world.policies import NetworkPolicy, load_policy, save_policy
+from scm_world.policies.cards import OPTIONS
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.policies import NAMED
 from scm_world.queries.progress import Progress

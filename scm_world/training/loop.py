@@ -15,12 +15,10 @@ from typing import Any, final
 
 from scm_world.backends import backends
 from scm_world.errors import Diverged, UnknownOption, UnreadableFile
-from scm_world.evaluation.policies.trained import in_run
-from scm_world.evaluation.policies.weights import load_policy
 from scm_world.evaluation.setups import Place
-from scm_world.evaluation.zoo.shelf import PREFIX, path_of
 from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import is_draft, locked, made, write_whole
+from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.training.recipe import Recipe
@@ -198,9 +196,7 @@ def named(start: Path | str) -> Path:
         UnknownOption: There is none of this name in the zoo.
         UnreadableFile: The folder is of no run.
     """
-    if str(start).startswith(PREFIX):
-        return path_of(str(start))
-    return in_run(Path(start)) if Path(start).is_dir() else Path(start)
+    return file_of(start)
 
 
 @contextmanager

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from scm_world.evaluation.policies.cards import KEY
-from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
 from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import write_durably
+from scm_world.policies import NetworkPolicy, load_policy
+from scm_world.policies.cards import KEY
 
 OPSET, FORMAT = 17, 8
 """Versions that onnxruntime has known since 2022."""

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 pd = pytest.importorskip("pandas")
 
 from benchmarks.reproduction import __main__ as command  # noqa: E402 # from there
-from scm_world.evaluation.policies.weights import save_policy  # noqa: E402
+from scm_world.policies import save_policy  # noqa: E402
 from scm_world.training.recipe import Recipe  # noqa: E402
 
 COMMON = ["--algos", "ppo", "--curricula", "1", "--scale", "0.01", "--backend", "fake"]

@@ -17,7 +17,7 @@ from scm_world.cli import app
 from scm_world.cli.evaluation import policies_of
 from scm_world.errors import UnknownOption
 from scm_world.evaluation import METRICS, Evaluation, protocols_of
-from scm_world.evaluation.policies import save_policy
+from scm_world.policies import save_policy
 
 QUICK = ("--backend", "fake", "--env", "max_episode_length=3", "--workers", "1")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scm_world.evaluation.policies.weights import NetworkPolicy, save_policy
+from scm_world.policies import NetworkPolicy, save_policy
 
 RELATIVE = {
     "action_mode": "delta_joint_positions",

@@ -12,8 +12,8 @@ from scm_world.curricula import every
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, check, evaluate, merge, why
 from scm_world.evaluation.files import false_scores
-from scm_world.evaluation.policies.onnx import ByNetwork
 from scm_world.evaluation.reporting import write_outputs
+from scm_world.policies import OnnxPolicy
 from scm_world.tasks import Pushing
 
 SHORT: dict[str, Any] = {"max_episode_length": 3}
@@ -86,7 +86,7 @@ def test_weights_beside_a_network_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "p.onnx"
     path.write_bytes(b"..\x0a\x08location\x12\x06p.data..")
     with pytest.raises(UnreadableFile, match="save it as one file"):
-        ByNetwork(path, {"name": "p"})
+        OnnxPolicy(path)
 
 
 class Noisy:

@@ -16,8 +16,8 @@ from scm_world.evaluation import pipeline as pipelines
 from scm_world.evaluation.arena import Row
 from scm_world.evaluation.lockstep import Lockstep
 from scm_world.evaluation.pipeline import Bench
-from scm_world.evaluation.policies import mlp
 from scm_world.evaluation.setups import prepare
+from scm_world.policies import Layer, MlpPolicy
 
 WITHIN = Protocol("late", act={"tool_block.cartesian_position": [0.2, 0.2, 0.0325]}).at(3)
 """Refused in the fourth control step: the block would be outside of the arena."""
@@ -112,8 +112,7 @@ def network(folder: Path) -> Any:
 def small_mlp() -> Any:
     """Give a network of this package."""
     draw = np.random.default_rng(0).normal(size=(56, 9)).astype(np.float32)
-    layer = mlp.Layer(draw, np.zeros(9, np.float32))
-    return mlp.MlpPolicy((), layer, np.zeros(9, np.float32))
+    return MlpPolicy((Layer(draw, np.zeros(9, np.float32)),))
 
 
 @pytest.mark.parametrize("protocols", [None, "P2@3,P9@1"], ids=["published", "within"])

@@ -14,7 +14,7 @@ from scm_world.errors import EvaluationError, ModelError, ScmWorldError, Unknown
 from scm_world.evaluation import Protocol, evaluate, protocols_of
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import ROLES, ROWS
-from scm_world.evaluation.policies import as_player
+from scm_world.evaluation.players import as_player
 from scm_world.evaluation.protocols import chosen
 from scm_world.tasks import TASKS
 from scm_world.variables import Box, Mechanism, Normal, Subset

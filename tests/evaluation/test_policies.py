@@ -16,8 +16,8 @@ import pytest
 
 import scm_world
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.policies import NAMES, WorldPolicy, as_player, checked, player_from
-from scm_world.evaluation.policies.mlp import Layer, MlpPolicy
+from scm_world.evaluation.players import NAMES, WorldPolicy, as_player, checked, player_from
+from scm_world.policies import Layer, MlpPolicy
 from scm_world.queries import Random, save_episode
 
 STEPS = 6
@@ -54,7 +54,7 @@ def mlp(n: int, hidden: int = 4) -> MlpPolicy:
     draw = np.random.default_rng(0).normal(size=(n + 9, hidden)).astype(np.float32)
     first = Layer(draw[:n] / n, np.zeros(hidden, np.float32))
     last = Layer(np.ascontiguousarray(draw[n:].T), np.zeros(9, np.float32))
-    return MlpPolicy((first,), last, np.zeros(9, np.float32))
+    return MlpPolicy((first, last), np.zeros(9, np.float32))
 
 
 # --- functions and models ---------------------------------------------------------------------
@@ -225,7 +225,7 @@ def test_functions_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyP
     name = module(
         tmp_path,
         monkeypatch,
-        "from scm_world.evaluation.policies import WorldPolicy\n"
+        "from scm_world.evaluation import WorldPolicy\n"
         "def up(seen): return np.full(9, 0.5)\n"
         "@WorldPolicy\n"
         "def high(world): return world.action_high\n"
@@ -329,7 +329,7 @@ def test_archives_that_hold_pickles_are_refused(tmp_path: Path) -> None:
     path = archive(tmp_path / "ppo.zip", "_stable_baselines3_version")
     with pytest.raises(UnreadableFile, match=r"as_player\(PPO.load\(path\)\)"):
         as_player(path)
-    with pytest.raises(UnreadableFile, match="no member"):
+    with pytest.raises(UnreadableFile, match="no item named"):
         as_player(archive(tmp_path / "other.zip", "readme"))
     with pytest.raises(UnreadableFile, match="No such file"):
         as_player(tmp_path / "missing.zip")
@@ -339,10 +339,10 @@ def published(path: Path, n: int) -> MlpPolicy:
     """Write an archive as Stable-Baselines 2 does, and give the policy in it."""
     policy = mlp(n)
     tensors = {
-        "model/shared_fc0/w:0": policy.hidden[0].weight,
-        "model/shared_fc0/b:0": policy.hidden[0].bias,
-        "model/pi/w:0": policy.mean.weight,
-        "model/pi/b:0": policy.mean.bias,
+        "model/shared_fc0/w:0": policy.layers[0].weight,
+        "model/shared_fc0/b:0": policy.layers[0].bias,
+        "model/pi/w:0": policy.layers[1].weight,
+        "model/pi/b:0": policy.layers[1].bias,
         "model/pi/logstd:0": policy.log_std,
     }
     inside = path.with_suffix(".npz")
@@ -370,10 +370,9 @@ def network(path: Path, policy: MlpPolicy, rows: Any = 1, name: str = "observati
     onnx: Any = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     helper, single = onnx.helper, onnx.TensorProto.FLOAT
-    layers = (policy.hidden[0], policy.mean)
     weights = [
         onnx.numpy_helper.from_array(array, f"{what}{number}")
-        for number, layer in enumerate(layers)
+        for number, layer in enumerate(policy.layers)
         for what, array in (("w", layer.weight), ("b", layer.bias))
     ]
     nodes = [
@@ -402,7 +401,7 @@ def test_networks_act(tmp_path: Path, rows: Any) -> None:
     path = network(tmp_path / "policy.onnx", policy, rows)
 
     def same(seen: Any) -> Any:
-        return np.tanh(policy.mean(policy.features(seen)))
+        return np.tanh(policy.mean(seen))
 
     found = played(path, env)
     np.testing.assert_allclose(found, played(same, env), atol=1e-5)
@@ -438,7 +437,7 @@ def test_a_network_that_gives_no_number_is_named(tmp_path: Path) -> None:
     """With its file; nothing is clipped or replaced."""
     env = make()
     policy = mlp(env.observation_space.shape[0])
-    policy.mean.bias[3] = np.nan
+    policy.layers[1].bias[3] = np.nan
     path = network(tmp_path / "nan.onnx", policy)
     with pytest.raises(ActionError, match=r"nan\.onnx"):
         played(path, env)

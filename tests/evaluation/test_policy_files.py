@@ -22,9 +22,9 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation.policies import as_player, player_from, weights
-from scm_world.evaluation.policies.cards import KEY, OPTIONS, USUAL, PolicyAbout
-from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy, save_policy
+from scm_world.evaluation.players import as_player, player_from
+from scm_world.policies import NetworkPolicy, PolicyAbout, load_policy, networks, save_policy
+from scm_world.policies.cards import KEY, OPTIONS, USUAL
 
 SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
 
@@ -180,7 +180,7 @@ def test_a_file_that_is_too_large_is_not_read(
 ) -> None:
     """Its size is looked at first."""
     path = trained(tmp_path / "a.safetensors")
-    monkeypatch.setattr(weights, "LARGEST", 1000)
+    monkeypatch.setattr(networks, "LARGEST", 1000)
     with pytest.raises(UnreadableFile, match="more than 1000 bytes"):
         load_policy(path)
 
@@ -360,5 +360,5 @@ def test_an_onnx_network_may_say_what_it_was_trained_for(tmp_path: Path) -> None
 
 def test_the_names_are_public() -> None:
     """What users write and read files with is where its documentation says."""
-    assert scm_world.evaluation.policies.load_policy is load_policy
-    assert scm_world.evaluation.policies.save_policy is save_policy
+    assert scm_world.policies.load_policy is load_policy
+    assert scm_world.policies.save_policy is save_policy

@@ -19,7 +19,7 @@ from scm_world.evaluation import Protocol, protocols_of
 from scm_world.evaluation.arena import Arena, Row, _drawn
 from scm_world.evaluation.benchmark import REACHING as REACHING_ROW
 from scm_world.evaluation.benchmark import ROLES, ROWS
-from scm_world.evaluation.policies import as_player
+from scm_world.evaluation.players import as_player
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.feasibility import overlaps
 

@@ -20,7 +20,7 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation.policies import as_player
+from scm_world.evaluation.players import as_player
 from scm_world.evaluation.recording import Recorded, Recorder, Recording, record
 from scm_world.tasks import Pushing
 from scm_world.variables import Box, Draw, Mechanism

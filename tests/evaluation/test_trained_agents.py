@@ -14,8 +14,8 @@ from scm_world.errors import EvaluationError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation, WorldPolicy, check, evaluate, merge, why
 from scm_world.evaluation.forms import shared_options, task_for
 from scm_world.evaluation.pipeline import Bench
-from scm_world.evaluation.policies import PolicyAbout
 from scm_world.evaluation.setups import prepare
+from scm_world.policies import PolicyAbout
 
 OTHER = {**RELATIVE, "context": "privileged", "max_episode_length": 16}
 INPUTS = ["context", "observation"]

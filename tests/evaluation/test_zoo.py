@@ -9,12 +9,14 @@ import pytest
 from policy_samples import RELATIVE, tensors, trained
 
 from benchmarks.baselines import publish as publishing
+from benchmarks.baselines.cards import card_text, page_text
 from benchmarks.baselines.publish import command_of, publish
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import check, evaluate
-from scm_world.evaluation.policies import as_player, load_policy, player_from, save_policy
-from scm_world.evaluation.zoo import card, card_text, page, shelf, zoo
-from scm_world.evaluation.zoo.texts import best_known
+from scm_world.evaluation.players import as_player, player_from
+from scm_world.policies import file_of, load_policy, save_policy
+from scm_world.policies import zoo as zoo_module
+from scm_world.policies.zoo import best_known, card, zoo
 from scm_world.training.recipe import recipe
 
 PAGE = Path(__file__).parents[2] / "docs" / "zoo.md"
@@ -35,7 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Have an empty zoo in a folder of its own."""
     made = tmp_path / "zoo"
     made.mkdir()
-    monkeypatch.setattr(shelf, "FOLDER", made)
+    monkeypatch.setattr(zoo_module, "FOLDER", made)
     return made
 
 
@@ -64,8 +66,8 @@ def test_a_published_policy_acts_by_its_name(published: str) -> None:
     found = evaluate(published, "P0", n=2, backend="fake", env={"max_episode_length": 5})
     assert found.agents == ("small",)
     assert check(found, episodes=2).wrong == ()
-    shelf.path_of(published).write_bytes(
-        trained(shelf.FOLDER / "other.safetensors", seed=1).read_bytes()
+    file_of(published).write_bytes(
+        trained(zoo_module.FOLDER / "other.safetensors", seed=1).read_bytes()
     )
     with pytest.raises(UnreadableFile, match="another file"):
         player_from(about)
@@ -99,19 +101,19 @@ def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_
     ):
         assert part in text
     assert best_known(about).startswith("P0 0.")
-    assert (tmp_path / "zoo.md").read_text() == page()
-    assert "## zoo:small" in page()
+    assert (tmp_path / "zoo.md").read_text() == page_text(zoo())
+    assert "## zoo:small" in page_text(zoo())
 
 
 def test_the_page_shows_the_zoo_of_the_package() -> None:
     """It was written with the policies that are there."""
-    assert PAGE.read_text(encoding="utf-8") == page()
+    assert PAGE.read_text(encoding="utf-8") == page_text(zoo())
 
 
 def test_every_policy_of_the_package_is_small_and_has_a_card() -> None:
     """With command, scores on both engines, and a task in whose environment it can act."""
     for name, about in zoo().items():
-        assert shelf.path_of(name).stat().st_size < 1_000_000
+        assert file_of(name).stat().st_size < 1_000_000
         assert about.card["command"]
         rows: Any = about.card["scores"]
         assert {"mujoco", "bullet"} >= {row["engine"] for row in rows} >= {"mujoco"}

@@ -15,7 +15,7 @@ from scm_world.discovery.run import Checkpoint
 from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation.files import merge
-from scm_world.evaluation.recording.recording import Recording
+from scm_world.evaluation.recording import Recording
 from scm_world.evaluation.reporting import write_outputs
 from scm_world.output.remote import Remote
 from scm_world.queries import World
@@ -148,7 +148,7 @@ def test_a_recording_is_read_from_a_store() -> None:
     pytest.importorskip("pyarrow")
     import gymnasium
 
-    from scm_world.evaluation.recording.recorder import record
+    from scm_world.evaluation.recording import record
 
     env = gymnasium.make("scm_world/Reaching-v0", backend="fake", max_episode_length=3)
     file = fresh() / "episodes.parquet"

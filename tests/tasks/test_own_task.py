@@ -8,7 +8,7 @@ import pytest
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import evaluate, protocols_of
-from scm_world.evaluation.again import check
+from scm_world.evaluation.checking import check
 from scm_world.tasks import TASKS, Building, Reaching, Task, register, tasks
 from scm_world.training.loop import identity_of
 from scm_world.training.recipe import Recipe, recipe

@@ -13,8 +13,8 @@ import pytest
 import scm_world  # noqa: F401 # registers the environments
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.policies.weights import NetworkPolicy, load_policy
 from scm_world.evaluation.recording import record
+from scm_world.policies import NetworkPolicy, load_policy
 from scm_world.training import imitation
 from scm_world.training.imitation import (
     Demonstrations,

@@ -9,7 +9,7 @@ import pytest
 
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate
-from scm_world.evaluation.policies import load_policy
+from scm_world.policies import load_policy
 from scm_world.training.recipe import Recipe, recipe
 
 TASK = f"{Path(__file__).parents[1] / 'env' / 'model_tasks.py'}:Balance"

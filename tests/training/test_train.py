@@ -23,7 +23,7 @@ from scm_world.errors import (
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.evaluation.policies.weights import load_policy, save_policy
+from scm_world.policies import load_policy, save_policy
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.training.settings import Rate

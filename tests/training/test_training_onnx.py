@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from scm_world.errors import MissingExtra, UnreadableFile
-from scm_world.evaluation.policies.weights import NetworkPolicy, save_policy
+from scm_world.policies import NetworkPolicy, save_policy
 from scm_world.training.onnx import to_onnx
 
 SIZES = {"achieved_goal": 10, "desired_goal": 10, "observation": 36}

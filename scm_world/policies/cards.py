@@ -1,4 +1,4 @@
-"""What a trained policy says of itself: its task, how it sees and acts, and how it was made."""
+"""What a trained policy was trained for: its task, its observations and actions, and its card."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from scm_world.tasks import tasks
 from scm_world.variables.spaces import Frozen
 
 KEY = "scm_world"
-"""Under which a file keeps it, among its metadata."""
+"""Metadata entry of a policy file that holds a ``PolicyAbout``."""
 
 RELATIVE = ("delta_scale", "delta_origin")
-"""Options of an environment that say what relative actions mean."""
+"""Options of an environment that define relative actions."""
 
 FORM = (
     "action_mode",
@@ -32,19 +32,19 @@ FORM = (
     "normalize_observations",
     "goal_env",
 )
-"""Options of an environment that decide what is observed and what actions mean."""
+"""Options of an environment that define observations and actions."""
 
 COMMON = ("frame_skip", "conventions")
-"""Options that have to be the same for all who are compared, and for the policy itself."""
+"""Options that must be equal for all compared policies, and equal to those of the training."""
 
 FREE = ("preset", "max_episode_length")
-"""Options that a policy was trained with, and that may be others."""
+"""Options of the training that may differ in an evaluation."""
 
 OPTIONS = (*FORM, *COMMON, *FREE)
 
 
 def plain(value: Any) -> Any:
-    """Give an option as JSON has it, for comparisons.
+    """Return an option as JSON has it, for comparisons.
 
     Example:
         >>> plain(("a", "b"))
@@ -56,11 +56,11 @@ def plain(value: Any) -> Any:
 USUAL: Mapping[str, Any] = {
     name: plain(inspect.signature(ScmWorldEnv).parameters[name].default) for name in OPTIONS
 }
-"""What these options are if nothing is said; None is the task's own."""
+"""Defaults of these options; None is the task's own."""
 
 
 def usual(option: str, task: str) -> Any:
-    """Give what an option is if nothing is said; None where only the task itself knows it.
+    """Return the default of an option; None where only the task itself knows it.
 
     Example:
         >>> usual("frame_skip", "pushing"), usual("frame_skip", "cartpole.xml")
@@ -76,18 +76,18 @@ def usual(option: str, task: str) -> Any:
 
 @final
 class PolicyAbout(Frozen):
-    """What stands in the file of a trained policy besides its weights.
+    """Metadata of a trained policy.
 
     Attributes:
-        format: Of this text.
+        format: Name of the format.
         version: Of the format.
         task: Name of the task.
-        env: Options of the environment, those of ``OPTIONS``; what is not named is as usual.
+        env: Options of the environment, those of ``OPTIONS``; the others have their defaults.
         activation: After each hidden layer.
-        output: What keeps actions in [-1, 1].
-        inputs: Parts of an observation in a dictionary, in the order in which they are joined;
-            None: the observation is one array.
-        card: How it was made and how well it does, as JSON.
+        output: Keeps actions in [-1, 1].
+        inputs: Parts of a dictionary observation in the order in which they are joined; None: the
+            observation is one array.
+        card: How it was trained and how well it does, as JSON.
     """
 
     format: Literal["scm_world.policy"] = "scm_world.policy"
@@ -126,28 +126,28 @@ class PolicyAbout(Frozen):
         return inputs
 
     def option(self, name: str) -> Any:
-        """Give an option of the environment, as JSON has it; None is the task's own."""
+        """Return an option of the environment, as JSON has it; None is the task's own."""
         return self.env.get(name, usual(name, self.task))
 
     def unusual(self, names: tuple[str, ...]) -> dict[str, Any]:
-        """Give those of some options that are not as usual."""
+        """Return those of some options that differ from their defaults."""
         found = {name: self.option(name) for name in names}
         return {name: v for name, v in found.items() if v != usual(name, self.task)}
 
     def with_card(self, **entries: Any) -> Self:
-        """Give the same with other entries of the card."""
+        """Return a copy with other entries of the card."""
         return type(self)(**{**self.model_dump(), "card": {**self.card, **entries}})
 
     def text(self) -> str:
-        """Write it down as JSON."""
+        """Return it as JSON."""
         return json.dumps(self.model_dump(mode="json"), allow_nan=False)
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | str | PolicyAbout) -> Self:
-        """Make it from what it has, or from its text.
+        """Make it from its fields or its JSON.
 
         Raises:
-            ModelError: Something is wrong; all of it is named.
+            ModelError: Some fields are wrong; all of them are named.
         """
         if isinstance(given, cls):
             return given
@@ -156,33 +156,29 @@ class PolicyAbout(Frozen):
                 return cls.model_validate_json(given)
             return cls.model_validate(given)
         except ValidationError as error:
-            raise ModelError([_said(problem) for problem in error.errors()]) from None
+            raise ModelError(
+                [
+                    f"{'.'.join(map(str, one['loc'])) or 'the text'}: {one['msg']}"
+                    for one in error.errors()
+                ]
+            ) from None
 
+    def check(self, env: ScmWorldEnv, name: str) -> None:
+        """Check that an environment has the observations and actions of the training.
 
-def refuse_other_form(made_for: PolicyAbout | None, env: ScmWorldEnv, name: str) -> None:
-    """Refuse an environment that shows other things, or in which actions mean others.
+        Args:
+            env: Where the policy should act.
+            name: Of the policy, for the message.
 
-    Args:
-        made_for: What the policy was trained for, if it says so.
-        env: Where it should act.
-        name: Of the policy, for the message.
-
-    Raises:
-        UnknownOption: An option is not the one that the policy was trained with.
-    """
-    if made_for is None:
-        return
-    for option in (*FORM, *COMMON):
-        given, wanted = plain(env.made_with[option]), made_for.option(option)
-        if wanted is not None and given != wanted:
-            raise contradiction(option, given, wanted, name)
+        Raises:
+            UnknownOption: An option differs from that of the training.
+        """
+        for option in (*FORM, *COMMON):
+            given, wanted = plain(env.made_with[option]), self.option(option)
+            if wanted is not None and given != wanted:
+                raise contradiction(option, given, wanted, name)
 
 
 def contradiction(option: str, given: Any, wanted: Any, name: str) -> UnknownOption:
-    """Say that an option is not the one that a policy was trained with."""
+    """Return the error that an option differs from that of the training."""
     return UnknownOption(f"{option} for {name!r}", given, (f"{wanted!r}, as in its training",))
-
-
-def _said(problem: Any) -> str:
-    where = ".".join(map(str, problem["loc"])) or "the text"
-    return f"{where}: {problem['msg']}"

@@ -14,9 +14,9 @@ from scm_world.curricula.parts import Do
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.pipeline import Bench
-from scm_world.evaluation.policies import as_player, player_from
+from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
-from scm_world.evaluation.recording.environments import refuse_untrusted
+from scm_world.evaluation.recording import refuse_untrusted
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import Seat, listed
 from scm_world.evaluation.setups import Place, Setup

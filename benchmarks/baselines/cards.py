@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from scm_world.evaluation.policies.cards import PolicyAbout
 from scm_world.evaluation.statistics import Interval
+from scm_world.policies import PolicyAbout
 
 SCORES = {"last_fractional_success": "last fractional success", "success": "success"}
 """Columns of the table, and what they are called."""
@@ -66,14 +66,6 @@ def card_text(about: PolicyAbout, name: str | None = None, *, level: int = 1) ->
             lines += ["", f"<details><summary>{entry}</summary>", "", "```json"]
             lines += [json.dumps(value, indent=1), "```", "", "</details>"]
     return "\n".join(lines) + "\n"
-
-
-def best_known(about: PolicyAbout) -> str:
-    """Write the scores of a policy in a line, those of the first engine that it was scored on."""
-    rows: Any = about.card.get(RESULTS) or []
-    metric = next(iter(SCORES))
-    mine = [row for row in rows if row["engine"] == rows[0]["engine"]]
-    return ", ".join(f"{row['protocol']} {row[metric]['value']:.2f}" for row in mine)
 
 
 def _facts(about: PolicyAbout) -> Iterable[str]:

@@ -1,0 +1,500 @@
+"""Players: policies of every form behind two methods, ``begin`` and ``act``."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import math
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, repeat
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scm_world.env import ScmWorldEnv
+from scm_world.env.delta import PREFIX as RELATIVE_MODE
+from scm_world.env.given import action_scale
+from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation.recording_files import Recorded, from_parquet
+from scm_world.policies import MlpPolicy, OnnxPolicy, PolicyAbout, file_of, load_policy, load_sb2
+from scm_world.policies.zoo import PREFIX as ZOO
+from scm_world.queries.episode_files import load_episode
+from scm_world.queries.episodes import Episode
+from scm_world.queries.policies import NAMED, Policy
+from scm_world.tasks.policies import Blind
+from scm_world.variables import Function
+from scm_world.world import World
+
+Actions = NDArray[Any]
+About = dict[str, Any]
+"""Description of a policy as plain data: its kind, its name, and where it comes from."""
+
+Act = Callable[[Any], Any]
+"""Gives an action for an observation, within one episode."""
+
+PACKAGE = "scm_world"
+SUFFIXES = (".safetensors", ".onnx", ".zip", ".npz", ".parquet")
+_ADVICE = "give the path of a policy"
+_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+
+
+def still(world: World) -> Any:
+    """Return the idle action of the task, shape (n_actions,)."""
+    return world.task.idle(world)
+
+
+def _still() -> Policy:
+    return still
+
+
+NAMES: Mapping[str, Callable[[], Policy]] = {"still": _still, **NAMED}
+"""Policies that have a name; each entry gives the policy of one episode."""
+
+FORMS = (
+    *NAMES,
+    "a function of the observation",
+    "a WorldPolicy",
+    "an object with the method predict",
+    "an array of actions",
+    "an episode",
+    "a file (.safetensors, .onnx, .zip of Stable-Baselines 2, .npz of an episode, .parquet of a "
+    "recording)",
+    "the folder of a training run",
+    "'zoo:name'",
+    "'module:function'",
+)
+
+
+@final
+@dataclass(frozen=True)
+class WorldPolicy:
+    """Marks a policy that reads the world instead of the observation.
+
+    It is called with the world of the environment and gives an action in the units of the action
+    mode (rad, N m or m), shape (n_actions,). It serves as a decorator.
+
+    Attributes:
+        policy: The function; a class is instantiated for every episode.
+
+    Example:
+        >>> @WorldPolicy
+        ... def lazy(world):
+        ...     return 0.5 * (world.action_low + world.action_high)
+    """
+
+    policy: Callable[..., Any]
+
+    def __call__(self, world: Any) -> Any:
+        """Choose the action."""
+        return self.policy(world)
+
+
+@final
+class Player:
+    """Acts in an environment, episode after episode; ``as_player`` makes it.
+
+    Args:
+        about: Description of the policy.
+        start: Gives what acts in the episode that an environment has begun.
+        made_for: What the policy was trained for, if known.
+        is_plain: Whether its actions are known to follow from its observations of the episode.
+        parallel: Whether it can act in several episodes at the same time.
+    """
+
+    def __init__(
+        self,
+        about: Mapping[str, Any],
+        start: Callable[[ScmWorldEnv], Act],
+        *,
+        made_for: PolicyAbout | None = None,
+        is_plain: bool = False,
+        parallel: bool = True,
+    ) -> None:
+        self._about, self._start = dict(about), start
+        self.made_for, self.is_plain, self.parallel = made_for, is_plain, parallel
+        self._env: ScmWorldEnv | None = None
+        self._act: Act | None = None
+
+    @property
+    def about(self) -> About:
+        """Description of the policy; ``player_from`` makes it again where that is possible."""
+        return dict(self._about)
+
+    def begin(self, env: ScmWorldEnv) -> None:
+        """Begin an episode; called after every reset.
+
+        Args:
+            env: Whose episode has begun.
+
+        Raises:
+            UnknownOption: It has other observations or actions than the policy was trained with.
+            ActionError: Its observations or actions have other shapes.
+            UnreadableFile: A network in a file takes other observations.
+        """
+        self._env, self._act = env, self._start(env)
+
+    def act(self, observation: Any) -> Actions:
+        """Choose an action of the environment, shape (n_actions,).
+
+        Args:
+            observation: Of the environment: an array, or arrays by name.
+
+        Raises:
+            ActionError: The policy gave no such action, or no episode has begun.
+        """
+        name = self._about["name"]
+        if self._act is None:
+            raise ActionError(f"the policy {name!r} acts in no episode; call begin()", None)
+        return checked(self._act(observation), self._env, name)
+
+    def twin(self) -> Player:
+        """Return another player of the policy, for another episode."""
+        return copy(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy and pickle without the episode."""
+        return {**vars(self), "_env": None, "_act": None}
+
+
+def checked(action: Any, env: Any, name: str) -> Actions:
+    """Check that a policy gave finite numbers; numbers beyond the range are left alone.
+
+    Args:
+        action: What it gave.
+        env: Where it acts, which says how many numbers there are; any number if None.
+        name: Of the policy.
+
+    Returns:
+        The same array; anything but floats becomes 64-bit floats.
+
+    Raises:
+        ActionError: It is no such array.
+
+    Example:
+        >>> checked([0] * 9, None, "lazy")
+        array([0., 0., 0., 0., 0., 0., 0., 0., 0.])
+        >>> checked([0.0, float("nan")], None, "wild")
+        Traceback (most recent call last):
+        scm_world.errors.ActionError: the policy 'wild' gave [0.0, nan]; an action is an array of
+        shape (n,) with finite numbers
+    """
+    shape = None if env is None else env.action_space.shape
+    if type(action) is np.ndarray and action.dtype in _FLOATS and action.shape == shape:
+        found: Actions = action
+        if math.isfinite(sum(action.tolist())):  # faster than numpy for a few numbers
+            return found
+    else:
+        try:
+            found = np.asarray(action)
+            if found.dtype.kind != "f":
+                is_real = found.dtype.kind in "bui"
+                found = found.astype(np.float64, casting="safe" if is_real else "no")
+        except (TypeError, ValueError):
+            found = np.empty((0, 0))
+    if (found.shape == shape or (shape is None and found.ndim == 1)) and np.isfinite(found).all():
+        return found
+    where = "" if env is None else f" of {env.action_space}"
+    raise ActionError(
+        f"the policy {name!r} gave {action!r}; an action is an array of shape {shape or '(n,)'} "
+        f"with finite numbers{where}",
+        action,
+    )
+
+
+# --- how episodes begin -----------------------------------------------------------------------
+
+
+def _function(policy: Any, env: ScmWorldEnv) -> Act:
+    if callable(getattr(policy, "reset", None)):
+        policy.reset()
+    act: Act = policy
+    return act
+
+
+def _model(model: Any, env: ScmWorldEnv) -> Act:
+    """Carry what a recurrent model remembers from step to step."""
+    state, first = None, True
+
+    def act(observation: Any) -> Any:
+        nonlocal state, first
+        action, state = model.predict(
+            observation, state=state, episode_start=np.array([first]), deterministic=True
+        )
+        first = False
+        return action
+
+    return act
+
+
+def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Act:
+    if policy.made_for is not None:
+        policy.made_for.check(env, name)
+    policy.check(env.observe(), env.world.declaration.n_actions)
+    return policy
+
+
+def _of_world(make: Any, name: str, env: ScmWorldEnv) -> Act:
+    """Give actions that lead as near to the command of a world policy as one action can."""
+    policy = _function(make(), env)
+    return lambda _: env.toward(checked(policy(env.world), env, name))
+
+
+def _named(name: str) -> Policy:
+    return NAMES[name]()  # can be pickled, unlike some entries
+
+
+def _itself(policy: Policy) -> Policy:
+    return policy
+
+
+def _open_loop(
+    actions: Actions, name: str, given: Mapping[str, Any] | None, env: ScmWorldEnv
+) -> Act:
+    """Play actions one after another and hold the last one.
+
+    Where the environment has the same kind of actions they are played bit for bit; where it has
+    other units they are converted, which rounds them to 64-bit floats.
+
+    Args:
+        actions: Shape (steps, n).
+        name: Of the policy.
+        given: Options of the environment of the actions; None: those of this one.
+        env: Where an episode has begun.
+    """
+    checked(actions[0], env, name)
+    for option, wanted in (given or {}).items():
+        there = env.action_mode if option == "action_mode" else env.made_with[option]
+        if option != "normalize_actions" and there != wanted:
+            raise UnknownOption(f"{option} for {name!r}", there, (repr(wanted),))
+    normalized = bool(env.made_with["normalize_actions"])
+    if given is not None and given["normalize_actions"] != normalized:
+        if env.action_mode.startswith(RELATIVE_MODE):
+            allowed = f"normalize_actions={not normalized}, as the relative actions given"
+            raise UnknownOption(f"environment for {name!r}", env.action_mode, (allowed,))
+        actions = np.asarray(actions, dtype=np.float64)
+        if normalized:
+            actions = np.array([env.as_action(command) for command in actions])
+        else:
+            middle, half = action_scale(env.world)
+            actions = middle + half * actions
+    rows = chain(actions, repeat(actions[-1]))
+    return lambda _: next(rows)
+
+
+# --- what a user gives ------------------------------------------------------------------------
+
+
+def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
+    """Read a policy.
+
+    Args:
+        policy: A function of the observation; an object with ``predict`` as Stable-Baselines3 has
+            it; the name of a policy of this package; a ``WorldPolicy``; actions, shape (n,) or
+            (steps, n); an episode of ``World.rollout`` or of a recording; the path of a policy
+            file, of an ONNX network, an archive of Stable-Baselines 2, a saved episode or a
+            recording (``"runs.parquet#3"`` for its fourth episode); the folder of a training run;
+            ``"zoo:pushing"``, one that comes with this package; or
+            ``"package.module:function"``.
+        trusted: Packages whose functions may be named. None: any, as the caller named it.
+
+    Raises:
+        UnknownOption: It is none of these.
+        ModelError: It names a function that is not there, or of no trusted package.
+        UnreadableFile: The file is no policy, or reading it would run code in it.
+        ActionError: Actions have another shape, or are not finite.
+        MissingExtra: The file needs a library that is not installed.
+
+    Example:
+        >>> about = as_player("random").about
+        >>> about["kind"], player_from(about).about == about
+        ('named', True)
+    """
+    if isinstance(policy, str | Path):
+        return _of_text(str(policy), trusted)
+    if isinstance(policy, Player):
+        return policy
+    if isinstance(policy, np.ndarray | list | tuple):
+        return _of_actions(policy, {"kind": "actions", "name": "actions"})
+    if isinstance(policy, Episode | Recorded):
+        return _of_episode(policy, {"kind": "actions", "name": "episode"})
+    if callable(policy) or hasattr(policy, "predict"):
+        return _of_object(policy, _description(policy))
+    raise UnknownOption("policy", policy, FORMS)
+
+
+def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Player:
+    """Make the player again that ``Player.about`` describes.
+
+    Args:
+        about: Description in a results file.
+        trusted: Packages whose functions may be named.
+
+    Raises:
+        UnknownOption: It was an object in memory; it can only be given.
+        UnreadableFile: The file is gone, or its content has changed.
+        ModelError: It is a function of no trusted package.
+    """
+    kind, name = about.get("kind"), str(about.get("name"))
+    advice = "give the policy itself: policy=…"
+    if kind == "named" and name in NAMES:
+        return as_player(name)
+    if kind == "function":
+        found = _resolved(name, trusted)
+        if about.get("sees") == "world" and not isinstance(found, WorldPolicy):
+            found = WorldPolicy(found)
+        return _of_object(found, {"kind": kind, "name": name, **_library(name)})
+    if kind not in ("zoo", "file"):
+        raise UnknownOption(f"policy to make again from {kind!r}", name, (advice,))
+    text = name if kind == "zoo" else str(about["path"])
+    path = file_of(text.partition("#")[0])
+    if _sha256(path, advice) != about["sha256"]:
+        raise UnreadableFile(str(path), "it is another file than the one that acted", advice)
+    return as_player(text, trusted=trusted)
+
+
+def _of_text(text: str, trusted: Sequence[str] | None) -> Player:
+    ours = _library(PACKAGE)
+    if text in NAMES:
+        about = {"kind": "named", "name": text, **ours}
+        return Player(about, partial(_of_world, partial(_named, text), text), parallel=False)
+    part, _, number = text.partition("#")
+    if text.startswith(ZOO):
+        path, about = file_of(text), {"kind": "zoo", "name": text, **ours}
+    elif Path(text).is_dir():
+        path = file_of(text)
+        about = {"kind": "file", "name": Path(text).resolve().name, "path": str(path)}
+    elif Path(part).suffix in SUFFIXES:
+        path, about = Path(part), {"kind": "file", "name": Path(text).name, "path": text}
+    elif ":" in text:
+        about = {"kind": "function", "name": text, **_library(text)}
+        return _of_object(_resolved(text, trusted), about)
+    else:
+        raise UnknownOption("policy", text, FORMS)
+    about["sha256"] = _sha256(path, _ADVICE)
+    match path.suffix:
+        case ".safetensors":
+            return _of_network(load_policy(path), about)
+        case ".onnx":
+            network = OnnxPolicy(path)
+            return _of_network(network, {**about, "library": network.library})
+        case ".zip":
+            return _of_network(_archived(path), about)
+        case ".npz":
+            return _of_episode(load_episode(path, trusted=trusted or ()), about)
+    return _of_episode(_recorded(path, number, trusted or ()), about)
+
+
+def _archived(path: Path) -> MlpPolicy:
+    try:
+        return load_sb2(path)
+    except UnreadableFile as error:
+        if b"_stable_baselines3_version" not in path.read_bytes():
+            raise
+        advice = "load it if you trust it, and give the model: as_player(PPO.load(path))"
+        reason = "it is one of Stable-Baselines3, whose reading may run any code in it"
+        raise UnreadableFile(str(path), reason, advice) from error
+
+
+def _recorded(path: Path, number: str, trusted: Sequence[str]) -> Recorded:
+    _, found = from_parquet(path.read_bytes(), str(path), trusted)
+    if not number and len(found) != 1:
+        advice = f"say which one: {path}#0 to #{len(found) - 1}"
+        raise UnreadableFile(str(path), f"it has {len(found)} episodes", advice)
+    if number and not (number.isdecimal() and int(number) < len(found)):
+        raise UnknownOption("episode of a recording", number, (f"0 to {len(found) - 1}",))
+    return found[int(number or 0)]
+
+
+def _of_episode(episode: Episode | Recorded, about: About) -> Player:
+    """Play the actions of an episode of ``World.rollout``, or of a recording."""
+    if isinstance(episode, Episode):
+        mode = episode.twins.options["action_mode"]
+        return _of_actions(
+            episode.actions, about, {"action_mode": mode, "normalize_actions": False}
+        )
+    return _of_actions(episode.actions, about, episode.action_options)
+
+
+def _of_actions(actions: Any, about: About, given: Mapping[str, Any] | None = None) -> Player:
+    try:
+        rows = np.atleast_2d(np.asarray(actions, dtype=getattr(actions, "dtype", np.float64)))
+    except (TypeError, ValueError):
+        rows = np.empty((0, 0))
+    if rows.ndim != 2 or not len(rows):
+        raise ActionError("actions have shape (n,) or (steps, n), with one step at least", actions)
+    for row in rows:
+        checked(row, None, about["name"])
+    about = {"sha256": hashlib.sha256(rows.tobytes()).hexdigest(), **about}
+    start = partial(_open_loop, rows, about["name"], given)
+    return Player(about, start, is_plain=True)
+
+
+def _of_network(policy: MlpPolicy | OnnxPolicy, about: About) -> Player:
+    start = partial(_network, policy, about["name"])
+    return Player(about, start, made_for=policy.made_for, is_plain=True)
+
+
+def _of_object(policy: Any, about: About) -> Player:
+    if isinstance(policy, WorldPolicy) or policy is still or isinstance(policy, Blind):
+        inside = policy.policy if isinstance(policy, WorldPolicy) else policy
+        make = inside if isinstance(inside, type) else partial(_itself, inside)
+        start = partial(_of_world, make, about["name"])
+        return Player({**about, "sees": "world"}, start, parallel=False)
+    if isinstance(policy, type):
+        return _of_object(policy(), about)
+    if isinstance(policy, MlpPolicy):
+        return _of_network(policy, {**about, "sha256": policy.sha256})
+    if hasattr(policy, "predict"):
+        library = type(policy).__module__.partition(".")[0]
+        is_plain = library in ("stable_baselines3", "sb3_contrib")  # they keep no state themselves
+        return Player(about, partial(_model, policy), is_plain=is_plain)
+    resets = callable(getattr(policy, "reset", None))
+    return Player(about, partial(_function, policy), parallel=not resets)
+
+
+def _description(policy: Any) -> About:
+    """Describe a policy in memory: a function that can be found again, or an object."""
+    inside = policy.policy if isinstance(policy, WorldPolicy) else policy
+    named = inside if hasattr(inside, "__qualname__") else type(inside)
+    name = f"{named.__module__}:{named.__qualname__}"
+    try:
+        found = Function(name).resolve()
+        found = found.policy if isinstance(found, WorldPolicy) else found
+    except (ImportError, AttributeError, ModelError):
+        found = None
+    is_found = named is inside is found and named.__module__ != "__main__"
+    return {"kind": "function" if is_found else "object", "name": name, **_library(name)}
+
+
+def _library(name: str) -> dict[str, str]:
+    """Return the distribution of ``"module:function"`` and its version, where there is one."""
+    package = name.partition(":")[0].partition(".")[0]
+    try:
+        version = importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    return {"library": f"{package.replace('_', '-')} {version}"}
+
+
+def _resolved(name: str, trusted: Sequence[str] | None) -> Any:
+    function = Function(name)
+    if trusted is not None and not function.is_defined_in((PACKAGE, *trusted)):
+        allowed = ", ".join((PACKAGE, *trusted))
+        raise ModelError([f"{name!r} is no function of {allowed}; pass trusted=(…) to use it"])
+    try:
+        return function.resolve()
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ModelError([f"there is no function {name!r}: {error}"]) from None
+
+
+def _sha256(path: Path, advice: str) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise UnreadableFile(str(path), error.strerror or str(error), advice) from None

@@ -1,0 +1,562 @@
+"""Recordings: episodes of an environment with everything that a bit-exact replay needs."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.env import ScmWorldEnv
+from scm_world.env.given import doubles, names_of
+from scm_world.env.observer import Observation
+from scm_world.errors import (
+    InterventionError,
+    ModelError,
+    NotReset,
+    SnapshotMismatch,
+    UnknownOption,
+    UnreadableFile,
+)
+from scm_world.evaluation.players import as_player
+from scm_world.evaluation.recording_files import (
+    Recorded,
+    from_minari,
+    from_parquet,
+    header_of,
+    parts,
+    to_minari,
+    to_parquet,
+)
+from scm_world.output.durable import write_durably
+from scm_world.output.locations import Location, located
+from scm_world.output.remote import said
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.plans import Plan
+from scm_world.tasks import Task
+from scm_world.world.start import whole_number
+
+__all__ = ["Recorded", "Recorder", "Recording", "record"]
+
+Singles = NDArray[np.float32]
+
+INFOS = ("success", "fractional_success")
+ALL = "all"
+
+_UNUSED: Mapping[str, Any] = {
+    "start": None,
+    "random_goal": None,
+    "attempts": 1,
+    "variables_space": None,
+    "render_mode": None,
+}
+"""Arguments of an environment that repeats recorded interventions, and makes none itself."""
+
+_CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
+
+
+@final
+@dataclass(frozen=True)
+class Recording:
+    """Episodes of one environment, with everything that a bit-exact replay needs.
+
+    Attributes:
+        environment: Arguments of the environment.
+        episodes: The recorded episodes.
+        versions: Of Python, the packages and the backend.
+        policy: Description of the policy, if known.
+        trusted: Packages whose functions may be called to make the environment again; any if the
+            recording was made in this process.
+    """
+
+    environment: Mapping[str, Any]
+    episodes: tuple[Recorded, ...]
+    versions: Mapping[str, str] = field(default_factory=dict)
+    policy: Mapping[str, Any] | None = None
+    trusted: Sequence[str] | None = field(default=None, compare=False, repr=False)
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return len(self.episodes)
+
+    def __getitem__(self, number: int) -> Recorded:
+        return self.episodes[number]
+
+    def __iter__(self) -> Iterator[Recorded]:
+        return iter(self.episodes)
+
+    def __repr__(self) -> str:
+        steps = sum(map(len, self.episodes))
+        counts = (len(self), "episode"), (steps, "control step")
+        words = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in counts)
+        return f"Recording of {words}, of {_name(self.environment)}"
+
+    def pairs(self) -> tuple[Singles, Singles]:
+        """Return observations and the actions that followed, for behavior cloning.
+
+        Returns:
+            Observations, shape (n, k), and actions, shape (n, m), of all control steps. The parts
+            of a dictionary observation follow one another in the order of their names.
+
+        Raises:
+            ModelError: The observations have several lengths, as the structure changed.
+        """
+        rows = [
+            np.concatenate([part.reshape(-1) for part in parts(seen).values()])
+            for episode in self.episodes
+            for seen in episode.observations[: len(episode)]
+        ]
+        lengths = sorted({len(row) for row in rows})
+        if len(lengths) != 1:
+            raise ModelError([f"pairs need observations of one length, got the lengths {lengths}"])
+        actions = np.concatenate([episode.actions for episode in self.episodes])
+        return np.array(rows, dtype=np.float32), actions.astype(np.float32)
+
+    def replay(self, which: int | None = None, *, task: Task | str | None = None) -> int:
+        """Repeat actions and interventions; compare observations, rewards and true states.
+
+        Args:
+            which: Number of the episode; all if None.
+            task: In place of the task of the recording, if that is not registered, or the text
+                that names it, to run what is in there.
+
+        Returns:
+            How many control steps were repeated, bit for bit.
+
+        Raises:
+            SnapshotMismatch: Something differs; it says from which control step on.
+            UnknownOption: The task is not registered, or a function of no trusted package.
+        """
+        if task is None:
+            refuse_untrusted(_name(self.environment), self.trusted)
+        arguments = {**self.environment, **_UNUSED}
+        unknown = arguments.keys() - inspect.signature(ScmWorldEnv.__init__).parameters.keys()
+        if unknown:
+            raise SnapshotMismatch(
+                "the recording is one of another version: environments have no option "
+                f"{min(unknown)!r}"
+            )
+        if task is not None:
+            arguments["task"] = task
+        if isinstance(task, Task):
+            arguments["task_options"] = None
+        numbers = range(len(self)) if which is None else (range(len(self))[which],)
+        env = ScmWorldEnv(**arguments)
+        try:
+            for number in numbers:
+                for difference in _differences(env, self.episodes[number]):
+                    made = ", ".join(f"{name} {v}" for name, v in self.versions.items())
+                    raise SnapshotMismatch(
+                        f"episode {number} happens otherwise from {difference}; the recording was "
+                        f"made with {made or 'unknown versions'}"
+                    )
+        finally:
+            env.close()
+        return sum(len(self.episodes[number]) for number in numbers)
+
+    def save(self, path: Location | str) -> Location:
+        """Write a Parquet file, whole or not at all: one row for each instant.
+
+        Args:
+            path: Of the file; it gets the ending ``.parquet`` if it has another one.
+
+        Raises:
+            MissingExtra: pyarrow is not installed.
+            ModelError: Something cannot be written: a function without a name, say.
+            UnwritableFolder: There is no such folder, no room, or no permission.
+        """
+        target = located(path)
+        if target.suffix != ".parquet":
+            target = target.with_name(target.name + ".parquet")
+        write_durably(target, to_parquet(self._header(), self.episodes))
+        return target
+
+    @classmethod
+    def load(cls, path: Location | str, *, trusted: Sequence[str] = ()) -> Recording:
+        """Read a file of ``save``.
+
+        Args:
+            path: Of the file.
+            trusted: Packages, besides this one, whose functions may be mechanisms.
+
+        Raises:
+            MissingExtra: pyarrow is not installed.
+            UnreadableFile: It is no recording, or damaged.
+            ModelError: A mechanism is a function of no trusted package.
+        """
+        try:
+            data = located(path).read_bytes()
+        except OSError as error:
+            advice = "give one that a Recording was saved to"
+            raise UnreadableFile(str(path), said(error), advice) from None
+        return cls._of(*from_parquet(data, str(path), trusted), trusted)
+
+    def to_minari(self, dataset_id: str, **about: Any) -> Any:
+        """Write a dataset of Minari; its ``recover_environment`` returns the environment.
+
+        Args:
+            dataset_id: Such as ``"scm_world/pushing/sweep-v0"``.
+            about: Arguments of ``minari.create_dataset_from_buffers``: ``author``,
+                ``author_email``, ``code_permalink``, ``algorithm_name``, ``description``,
+                ``data_format``, ….
+
+        Returns:
+            The ``minari.MinariDataset``.
+
+        Raises:
+            MissingExtra: Minari is not installed.
+            ModelError: Observations have several shapes, the task has no id with Gymnasium, or
+                something cannot be written.
+            ValueError: There is such a dataset already, says Minari.
+        """
+        usual = {
+            "algorithm_name": str((self.policy or {}).get("name", "unknown")),
+            "description": f"{self!r}, recorded by scm_world.",
+        }
+        return to_minari(self._header(), self.episodes, dataset_id, **{**usual, **about})
+
+    @classmethod
+    def from_minari(cls, dataset: Any, *, trusted: Sequence[str] = ()) -> Recording:
+        """Read a dataset of ``to_minari``, or a part of it.
+
+        Args:
+            dataset: A ``minari.MinariDataset``, also a filtered one, or the id of a local one.
+            trusted: Packages, besides this one, whose functions may be mechanisms.
+
+        Raises:
+            MissingExtra: Minari is not installed.
+            UnreadableFile: It is another dataset, or a damaged one.
+            ModelError: A mechanism is a function of no trusted package.
+        """
+        return cls._of(*from_minari(dataset, trusted), trusted)
+
+    @classmethod
+    def _of(
+        cls, header: Mapping[str, Any], episodes: Sequence[Recorded], trusted: Sequence[str]
+    ) -> Recording:
+        about = header["environment"], tuple(episodes), header["versions"], header["policy"]
+        return cls(*about, tuple(trusted))
+
+    def _header(self) -> str:
+        return header_of(self.environment, self.versions, self.policy, self.episodes)
+
+
+def _name(made_with: Mapping[str, Any]) -> str:
+    task = made_with["task"]
+    return task.name if isinstance(task, Task) else str(task)
+
+
+def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
+    """Refuse to run a function that a file names, as ``"module:function"`` for a task.
+
+    Args:
+        task: The text of the file.
+        trusted: Packages whose functions may be called, without ``.py``; any if None.
+
+    Raises:
+        UnknownOption: With what to do.
+    """
+    home, colon, _ = task.rpartition(":")
+    package = Path(home).stem if home.endswith(".py") else home.partition(".")[0]
+    if colon and trusted is not None and package not in trusted:
+        allowed = (f"task={task!r}, or trusted={(package,)}, to run what is in there",)
+        raise UnknownOption("task that a file names", task, allowed)
+
+
+def _differences(env: ScmWorldEnv, episode: Recorded) -> Iterator[str]:
+    """Repeat an episode; yield each control step that differs, and in what."""
+    env.reset(seed=episode.seed, options={"episode": episode.number})
+    for step in range(len(episode) + 1):
+        for at, plan in episode.interventions:
+            try:
+                if at == step:
+                    env.do(plan.at_start())
+            except InterventionError as error:
+                yield f"control step {step}: an intervention is refused ({error})"
+        if _digest(env.world.current()[1].vector) != episode.states[step]:
+            yield f"control step {step}: the true state"
+        now, then = parts(env.observe()), parts(episode.observations[step])
+        for name in sorted({*now, *then}):
+            if name not in now or name not in then or not _same(now[name], then[name]):
+                yield f"control step {step}: the observation{f' {name!r}' if name else ''}"
+        if step < len(episode):
+            reward, known = env.step(episode.actions[step])[1], episode.rewards[step]
+            if not _same(np.float64(reward), known):
+                yield f"control step {step}: the reward is {reward!r}, not {float(known)!r}"
+
+
+def _same(one: NDArray[Any] | np.generic, other: NDArray[Any] | np.generic) -> bool:
+    same = one.dtype == other.dtype and one.shape == other.shape
+    return bool(same) and one.tobytes() == other.tobytes()
+
+
+def _digest(state: Floats) -> int:
+    """Return a digest of a true state: a whole number of 64 bits."""
+    digest = hashlib.blake2b(state.tobytes(), digest_size=8).digest()
+    return int.from_bytes(digest, "little", signed=True)
+
+
+# --- recording --------------------------------------------------------------------------------
+
+
+@dataclass
+class _Episode:
+    """An episode so far."""
+
+    seed: int
+    number: int
+    observations: list[Observation] = field(default_factory=list)
+    infos: list[dict[str, Any]] = field(default_factory=list)
+    states: list[int] = field(default_factory=list)
+    actions: list[NDArray[Any]] = field(default_factory=list)
+    returns: list[tuple[float, bool, bool]] = field(default_factory=list)
+    interventions: tuple[tuple[int, Mapping[str, Any]], ...] = ()
+
+
+@final
+class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Records whole episodes of an environment, so that they can be replayed.
+
+    All interventions count: at the reset, by ``env.unwrapped.do``, or by a wrapper above or below.
+    An instant is recorded after its interventions, as the next action meets it. An episode without
+    any step is left out.
+
+    Args:
+        env: Of this package. Wrappers that change actions, observations or rewards belong above the
+            recorder.
+        infos: Names in ``info`` that are kept; ``"all"`` for all numbers that every instant has,
+            terms of the reward as ``"reward_terms.…"``; None for success and fractional success,
+            if the task has them.
+
+    Raises:
+        UnknownOption: The environment is none of this package, or a wrapper changes it.
+
+    Example:
+        >>> env = Recorder(gymnasium.make("scm_world/Pushing-v0", backend="fake"))
+        >>> _ = env.reset(seed=0, options={"do": {"tool_block.mass": "A"}})
+        >>> _ = env.step(np.zeros(9, np.float32))
+        >>> _ = env.unwrapped.do({"floor_friction": 0.4})
+        >>> env.recording()
+        Recording of 1 episode, 1 control step, of pushing
+    """
+
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], infos: Sequence[str] | str | None = None
+    ) -> None:
+        RecordConstructorArgs.__init__(self, infos=infos)
+        super().__init__(env)
+        self._inner = _inner(env)
+        _refuse_changes(env, self._inner)
+        model = self._inner.world.model
+        chosen = tuple(name for name in INFOS if name in model) if infos is None else infos
+        self._wanted = chosen if chosen == ALL else names_of("infos", chosen)
+        self._made: list[Recorded] = []
+        self._now: _Episode | None = None
+        self._version = -1
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; the last one is kept.
+
+        Raises:
+            UnknownOption: ``info`` has no such name as one that should be kept.
+        """
+        self._keep()
+        observation, info = self.env.reset(seed=seed, options=options)
+        world = self._inner.world
+        self._now = _Episode(world.noise.seed, world.episode)
+        self._write(self._now, observation, info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Advance one control step.
+
+        Raises:
+            NotReset: There is no episode.
+        """
+        episode = self._now
+        if episode is None:
+            raise NotReset
+        self._update(episode)
+        single = getattr(action, "dtype", None) == np.float32
+        n = self._inner.world.declaration.n_actions
+        taken = np.array(action if single else doubles(action, n))  # as the environment reads it
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        episode.actions.append(taken)
+        episode.returns.append((float(reward), bool(terminated), bool(truncated)))
+        self._write(episode, observation, info)
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Keep the last episode, and free the backend."""
+        self._keep()
+        super().close()
+
+    def recording(self, policy: Mapping[str, Any] | None = None) -> Recording:
+        """Return all episodes so far, the present one included.
+
+        Args:
+            policy: Description of the policy.
+        """
+        present = self._recorded()
+        episodes = (*self._made, *([present] if present else []))
+        made_with = versions(self._inner.world.engine)
+        return Recording(self._inner.made_with, episodes, made_with, policy)
+
+    def _write(
+        self,
+        episode: _Episode,
+        observation: Any,
+        info: Mapping[str, Any],
+        before: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Record an instant; ``before`` are its infos before an intervention."""
+        world = self._inner.world
+        self._version = world.version
+        numbers = {**(before or {}), **dict(_numbers(info))}
+        for name in () if self._wanted == ALL else self._wanted:
+            if name not in numbers:
+                raise UnknownOption("info", name, numbers)
+        names = numbers if self._wanted == ALL else self._wanted
+        episode.infos.append({name: numbers[name] for name in names})
+        copied = {name: np.array(part) for name, part in parts(observation).items()}
+        episode.observations.append(copied if isinstance(observation, dict) else copied[""])
+        episode.states.append(_digest(world.current()[1].vector))
+        episode.interventions = self._inner.interventions
+
+    def _update(self, episode: _Episode) -> None:
+        """Record the present instant anew if there was an intervention since."""
+        if self._inner.world.version != self._version:
+            observation, info = self._inner.present()
+            del episode.observations[-1], episode.states[-1]
+            self._write(episode, observation, info, before=episode.infos.pop())
+
+    def _keep(self) -> None:
+        made = self._recorded()
+        if made is not None:
+            self._made.append(made)
+        self._now = None
+
+    def _recorded(self) -> Recorded | None:
+        """Return the present episode, if it has a step."""
+        episode = self._now
+        if episode is None or not episode.actions:
+            return None
+        self._update(episode)
+        rewards, ends, cuts = zip(*episode.returns, strict=True)
+        infos = {}
+        for name in episode.infos[0]:
+            if all(name in info for info in episode.infos):
+                values = [info[name] for info in episode.infos]
+                is_logical = all(isinstance(value, bool | np.bool_) for value in values)
+                infos[name] = np.array(values, dtype=np.bool_ if is_logical else np.float64)
+        return Recorded(
+            environment=self._inner.made_with,
+            seed=episode.seed,
+            number=episode.number,
+            interventions=tuple((step, Plan(did)) for step, did in episode.interventions),
+            observations=tuple(episode.observations),
+            actions=np.array(episode.actions),
+            rewards=np.array(rewards, dtype=np.float64),
+            terminations=np.array(ends, dtype=np.bool_),
+            truncations=np.array(cuts, dtype=np.bool_),
+            infos=infos,
+            states=np.array(episode.states, dtype=np.int64),
+        )
+
+
+def record(
+    policy: Any,
+    env: gymnasium.Env[Any, Any],
+    n: int,
+    *,
+    seed: int = 0,
+    first: int = 0,
+    do: Mapping[str, Any] | None = None,
+    infos: Sequence[str] | str | None = None,
+    out: Location | str | None = None,
+) -> Recording:
+    """Run a policy for some episodes, and record them.
+
+    Args:
+        policy: Anything that ``as_player`` reads.
+        env: Of this package; it may have wrappers that intervene, such as a curriculum.
+        n: How many episodes.
+        seed: Of the noise.
+        first: Number of the first episode within the noise.
+        do: An intervention at every reset.
+        infos: Names in ``info`` that are kept; see ``Recorder``.
+        out: Where to save the recording, if anywhere.
+
+    Raises:
+        UnknownOption: A number is not whole, or the environment or the policy is none.
+        ActionError: The policy gave no action.
+        InterventionError: ``do`` was refused.
+
+    Example:
+        >>> env = gymnasium.make("scm_world/Reaching-v0", backend="fake", max_episode_length=5)
+        >>> record("random", env, 2)
+        Recording of 2 episodes, 10 control steps, of reaching
+    """
+    player, recorder = as_player(policy), Recorder(env, infos)
+    whole_number("n", n, least=1)
+    start: dict[str, Any] = {"seed": seed, "options": {"episode": first, "do": do}}
+    for _ in range(n):
+        observation, _info = recorder.reset(**start)
+        start = {"options": {"do": do}}  # the next episode, also after attempts that failed
+        player.begin(_inner(env))
+        over = False
+        while not over:
+            observation, _, ended, cut, _info = recorder.step(player.act(observation))
+            over = ended or cut
+    found = recorder.recording(player.about)
+    if out is not None:
+        found.save(out)
+    return found
+
+
+def _inner(env: gymnasium.Env[Any, Any]) -> ScmWorldEnv:
+    """Return the environment of this package below its wrappers.
+
+    Raises:
+        UnknownOption: There is none.
+    """
+    found = env.unwrapped
+    if not isinstance(found, ScmWorldEnv):
+        raise UnknownOption("environment", type(found).__name__, ("an environment of scm_world",))
+    return found
+
+
+def _refuse_changes(env: gymnasium.Env[Any, Any], inside: ScmWorldEnv) -> None:
+    """Refuse wrappers below a recorder that change actions, observations or rewards.
+
+    Raises:
+        UnknownOption: There is one.
+    """
+    layer = env
+    while isinstance(layer, gymnasium.Wrapper):
+        same = layer.action_space == inside.action_space
+        same = same and layer.observation_space == inside.observation_space
+        if isinstance(layer, _CHANGING) or not same:
+            name = type(layer).__name__
+            allowed = (f"one that changes nothing; record below it: {name}(Recorder(env))",)
+            raise UnknownOption("wrapper below a Recorder", name, allowed)
+        layer = layer.env
+
+
+def _numbers(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    """List the numbers in an info, those of dictionaries with dotted names."""
+    for name, value in info.items():
+        if isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
+            yield within + name, value
+        elif isinstance(value, Mapping):
+            yield from _numbers(value, f"{within}{name}.")

@@ -1,0 +1,25 @@
+"""Policies: networks in files, and the zoo of trained policies."""
+
+from scm_world.policies.cards import PolicyAbout
+from scm_world.policies.networks import (
+    Layer,
+    MlpPolicy,
+    NetworkPolicy,
+    load_policy,
+    load_sb2,
+    save_policy,
+)
+from scm_world.policies.onnx import OnnxPolicy
+from scm_world.policies.zoo import file_of
+
+__all__ = [
+    "Layer",
+    "MlpPolicy",
+    "NetworkPolicy",
+    "OnnxPolicy",
+    "PolicyAbout",
+    "file_of",
+    "load_policy",
+    "load_sb2",
+    "save_policy",
+]

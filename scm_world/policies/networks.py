@@ -1,0 +1,506 @@
+"""Multilayer perceptrons in safetensors files and in archives of Stable-Baselines 2.
+
+A safetensors file has the tensors ``layers.<i>.weight`` (outputs, inputs) and ``layers.<i>.bias``,
+from the observation to the action; it may have ``log_std``, and ``value.layers.<i>…`` of a second
+network for the value of the state. Its metadata has a ``PolicyAbout`` under ``"scm_world"``.
+
+An archive of Stable-Baselines 2 is a zip file. Its member ``parameters`` is a numpy archive of
+plain arrays; its member ``data`` holds pickled Python objects and is never opened. Reading a file
+of either kind runs no code in it.
+
+Actions are computed in 64-bit floats, always in the same order, and rounded to 32 bits at the end:
+they depend neither on the size of the batch nor on the number of threads.
+
+Source:
+    Stable-Baselines 2.10, ``common/base_class.py``; the tensors are those of its ``MlpPolicy`` for
+    PPO2 in CausalWorld 1.2.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any, NamedTuple, Self, final
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numba import njit
+from numpy.typing import NDArray
+
+from scm_world._types import Floats
+from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
+from scm_world.output.durable import write_durably
+from scm_world.output.locations import Location, located
+from scm_world.policies.cards import KEY, PolicyAbout
+from scm_world.tasks import tasks
+
+Weights = NDArray[np.float32]
+
+LARGEST = 2**28  # [bytes] of a file: more is no policy, and might fill the memory
+_SAVED = "give a file that scm_world.policies.save_policy has written"
+_ARCHIVE = "only multilayer perceptrons of PPO2 (MlpPolicy) can be loaded"
+_ENV = (
+    "use the observation that it was trained with: of a policy file "
+    "gymnasium.make(…, **policy.about.env)"
+)
+
+
+class Layer(NamedTuple):
+    """A layer of a network: weight, shape (inputs, outputs), and bias, shape (outputs,)."""
+
+    weight: Weights
+    bias: Weights
+
+
+@dataclass(frozen=True, eq=False)
+class MlpPolicy:
+    """A normal distribution over actions whose mean is a multilayer perceptron.
+
+    Attributes:
+        layers: From the observation to the action; all but the last are hidden.
+        log_std: Logarithm of the standard deviations of the actions, shape (n,), if known.
+        value: The layers of the network for the value of the state, if known.
+
+    Raises:
+        ModelError: Layers do not fit one another, or are no finite numbers; all problems.
+    """
+
+    layers: tuple[Layer, ...]
+    log_std: Weights | None = field(default=None, repr=False)
+    value: tuple[Layer, ...] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        problems = [*_misfits("layers", self.layers, None, self._wanted())]
+        if self.value and not problems:
+            problems = [*_misfits("value.layers", self.value, self.n_observed, 1)]
+        if self.log_std is not None and not problems:
+            shape = self.layers[-1].bias.shape
+            if not _is_good(self.log_std, shape):
+                problems = [f"log_std: expected shape {shape} and finite numbers"]
+        if problems:
+            raise ModelError(problems)
+
+    def _wanted(self) -> int | None:
+        """Return how many numbers an action must have, if that is known."""
+        return None
+
+    @property
+    def activation(self) -> str:
+        """Function after each hidden layer."""
+        return "tanh"
+
+    @property
+    def output(self) -> str:
+        """Function that keeps actions in [-1, 1]."""
+        return "clip"
+
+    @property
+    def inputs(self) -> tuple[str, ...] | None:
+        """Parts of a dictionary observation in their order; None: it is one array."""
+        return None
+
+    @property
+    def made_for(self) -> PolicyAbout | None:
+        """What the policy was trained for, if known."""
+        return None
+
+    @property
+    def n_observed(self) -> int:
+        """Number of components of an observation."""
+        return int(self.layers[0].weight.shape[0])
+
+    @property
+    def n_actions(self) -> int:
+        """Number of components of an action."""
+        return int(self.layers[-1].weight.shape[1])
+
+    def __call__(
+        self, observation: Any, *, generator: np.random.Generator | None = None
+    ) -> Weights:
+        """Choose the action.
+
+        Args:
+            observation: Shape (..., n), or arrays by name, those of ``inputs``.
+            generator: Draws the action from the distribution; None: the action is the mean.
+
+        Returns:
+            Shape (..., n_actions), in [-1, 1], dtype float32; each observation of a batch gets, bit
+            for bit, the action that it gets alone.
+
+        Raises:
+            ActionError: The observation has another number of components, or other parts.
+            UnknownOption: There is a generator, but the standard deviations are not known.
+        """
+        found = self.mean(observation)
+        if generator is not None:
+            if self.log_std is None:
+                raise UnknownOption("generator", generator, ("None: there is no log_std",))
+            found = found + np.exp(self.log_std) * generator.standard_normal(found.shape)
+        found = np.tanh(found) if self.output == "tanh" else np.clip(found, -1.0, 1.0)
+        return found.astype(np.float32)
+
+    def mean(self, observation: Any) -> Floats:
+        """Compute the mean before it is bounded, shape (..., n_actions); errors as above."""
+        return self._computed(self.layers, self.joined(observation))
+
+    def values(self, observation: Any) -> Floats:
+        """Compute the value of the state, shape (..., 1).
+
+        Raises:
+            ActionError: As above.
+            UnknownOption: The network of the value is not known.
+        """
+        if not self.value:
+            raise UnknownOption("policy", self, ("one with a value network",))
+        return self._computed(self.value, self.joined(observation))
+
+    def _computed(self, layers: tuple[Layer, ...], seen: NDArray[Any]) -> Floats:
+        x = np.ascontiguousarray(seen.reshape(-1, self.n_observed), dtype=np.float64)
+        doubles = self._doubles if layers is self.layers else _in_doubles(layers)
+        hidden = 1 if self.activation == "tanh" else 2
+        for number, (weight, bias) in enumerate(doubles, start=1):
+            x = _dense(x, weight, bias, hidden if number < len(layers) else 0)
+        return x.reshape(*seen.shape[:-1], x.shape[1])
+
+    @cached_property
+    def _doubles(self) -> list[tuple[Floats, Floats]]:
+        return _in_doubles(self.layers)
+
+    def joined(self, observation: Any) -> NDArray[Any]:
+        """Join the parts of an observation, shape (..., n); errors as above."""
+        inputs = self.inputs
+        if isinstance(observation, Mapping):
+            if inputs is None or not observation.keys() >= set(inputs):
+                wanted = "one array" if inputs is None else f"the parts {[*inputs]}"
+                raise ActionError(
+                    f"the policy observes {wanted}, got the parts {[*observation]}; {_ENV}", None
+                )
+            seen = np.concatenate([np.asarray(observation[name]) for name in inputs], axis=-1)
+        elif inputs is not None:
+            raise ActionError(f"the policy observes the parts {[*inputs]} by name; {_ENV}", None)
+        else:
+            seen = np.asarray(observation)
+        if seen.ndim == 0 or seen.shape[-1] != self.n_observed or seen.dtype.kind not in "fiub":
+            wanted = f"the policy observes {self.n_observed} numbers"
+            raise ActionError(f"{wanted}, got the shape {seen.shape}; {_ENV}", None)
+        return seen
+
+    def check(self, observation: Any, n_actions: int) -> None:
+        """Check that observations and actions have the right numbers of components.
+
+        Raises:
+            ActionError: They have not.
+        """
+        self.joined(observation)
+        if self.n_actions != n_actions:
+            wrong = f"the policy gives {self.n_actions} numbers, and an action has {n_actions}"
+            raise ActionError(wrong, None)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Weights, None]:
+        """Choose the action, with the signature of Stable-Baselines3.
+
+        Args:
+            observation: As above.
+            state: Not used: the policy has no memory.
+            episode_start: Not used either.
+            deterministic: Must be true; draws need a generator: ``policy(…, generator=…)``.
+
+        Returns:
+            The action, shape (..., n_actions), and no state.
+
+        Raises:
+            ActionError: As above.
+            UnknownOption: ``deterministic`` is false.
+        """
+        if not deterministic:
+            raise UnknownOption("deterministic", deterministic, ("True",))
+        return self(observation), None
+
+    def tensors(self) -> dict[str, Weights]:
+        """Return the tensors of a file, by name."""
+        found: dict[str, Weights] = {}
+        for prefix, layers in (("layers", self.layers), ("value.layers", self.value)):
+            for number, (weight, bias) in enumerate(layers):
+                found[f"{prefix}.{number}.weight"] = np.ascontiguousarray(weight.T)
+                found[f"{prefix}.{number}.bias"] = np.ascontiguousarray(bias)
+        if self.log_std is not None:
+            found["log_std"] = np.ascontiguousarray(self.log_std)
+        return found
+
+    def content(self) -> bytes:
+        """Return the content of a safetensors file."""
+        about = self.made_for
+        return safetensors.numpy.save(self.tensors(), about and {KEY: about.text()})
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the weights and the metadata."""
+        return hashlib.sha256(self.content()).hexdigest()
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Any], **more: Any) -> Self:
+        """Make a policy from tensors by name, 32-bit floats; a weight has shape (outputs, inputs).
+
+        Raises:
+            ModelError: There are others, or they do not fit; all problems.
+        """
+        wrong = [
+            f"{name}: expected an array of float32, "
+            f"got {getattr(array, 'dtype', type(array).__name__)}"
+            for name, array in tensors.items()
+            if not isinstance(array, np.ndarray) or array.dtype != np.float32
+        ]
+        left, networks = dict(tensors), []
+        for prefix in ("layers", "value.layers"):
+            layers: list[Layer] = []
+            while (name := f"{prefix}.{len(layers)}.weight") in left:
+                bias = f"{prefix}.{len(layers)}.bias"
+                if bias not in left:
+                    raise ModelError([f"there is no tensor {bias!r}"])
+                layers.append(Layer(left.pop(name).T, left.pop(bias)))
+            networks.append(tuple(layers))
+        log_std = left.pop("log_std", None)
+        wrong += [f"{name!r} is no tensor of a policy" for name in left]
+        if wrong:
+            raise ModelError(wrong)
+        return cls(networks[0], log_std, networks[1], **more)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class NetworkPolicy(MlpPolicy):
+    """A multilayer perceptron with the metadata of a policy file.
+
+    Attributes:
+        about: What it was trained for, and how.
+    """
+
+    about: PolicyAbout = field(kw_only=True)
+
+    def _wanted(self) -> int | None:
+        kind = tasks().get(self.about.task)
+        return (len(kind.rest) or None) if kind is not None else None
+
+    @property
+    def activation(self) -> str:
+        """Function after each hidden layer."""
+        return self.about.activation
+
+    @property
+    def output(self) -> str:
+        """Function that keeps actions in [-1, 1]."""
+        return self.about.output
+
+    @property
+    def inputs(self) -> tuple[str, ...] | None:
+        """Parts of a dictionary observation in their order; None: it is one array."""
+        return self.about.inputs
+
+    @property
+    def made_for(self) -> PolicyAbout:
+        """What the policy was trained for."""
+        return self.about
+
+    @classmethod
+    def of(
+        cls, tensors: Mapping[str, Any], about: PolicyAbout | Mapping[str, Any]
+    ) -> NetworkPolicy:
+        """Make a policy from the tensors and the metadata of a file.
+
+        Raises:
+            ModelError: They do not fit; all problems.
+        """
+        return cls.from_tensors(tensors, about=PolicyAbout.of(about))
+
+
+def save_policy(
+    path: Location | str,
+    network: NetworkPolicy | Mapping[str, Any],
+    about: PolicyAbout | Mapping[str, Any] | None = None,
+) -> Location:
+    """Write a trained policy, whole or not at all.
+
+    Args:
+        path: Of the file; it ends in ``.safetensors``.
+        network: A policy, or its tensors by name; see ``NetworkPolicy.of``.
+        about: What it was trained for; that of the policy if None.
+
+    Returns:
+        The path.
+
+    Raises:
+        ModelError: The tensors or the metadata do not fit the format.
+        UnknownOption: The path has another ending.
+        UnwritableFolder: There is no room, or no permission.
+    """
+    target = located(path)
+    if target.suffix != ".safetensors":
+        raise UnknownOption("ending of a policy file", target.suffix, (".safetensors",))
+    tensors = network.tensors() if isinstance(network, NetworkPolicy) else network
+    said = network.about if about is None and isinstance(network, NetworkPolicy) else about
+    write_durably(target, NetworkPolicy.of(tensors, {} if said is None else said).content())
+    return target
+
+
+def load_policy(path: Path | str) -> NetworkPolicy:
+    """Read a trained policy. Nothing in the file is executed.
+
+    Args:
+        path: Of the file.
+
+    Raises:
+        UnreadableFile: It is damaged, of another kind, too large, or not there.
+    """
+    name = str(path)
+    try:
+        if Path(name).exists() and not Path(name).is_file():  # a folder, or a pipe without an end
+            raise UnreadableFile(name, "it is no file", _SAVED)
+        _refuse_huge(name, Path(name).stat().st_size, _SAVED)
+        with safetensors.safe_open(name, framework="np") as file:
+            text = (file.metadata() or {}).get(KEY)
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 # no mapping
+    except OSError as error:
+        raise UnreadableFile(name, error.strerror or str(error), _SAVED) from None
+    except UnreadableFile:
+        raise
+    except (safetensors.SafetensorError, ValueError, TypeError, KeyError, AttributeError) as error:
+        reason = f"it is damaged, or of another kind ({error})"
+        raise UnreadableFile(name, reason, _SAVED) from None
+    if text is None:
+        raise UnreadableFile(name, f"its metadata has no {KEY!r}, what it is for", _SAVED)
+    try:
+        return NetworkPolicy.of(tensors, text)
+    except ModelError as error:
+        raise UnreadableFile(name, "; ".join(error.problems), _SAVED) from None
+
+
+def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
+    """Read a policy that was trained with PPO2 of Stable-Baselines 2.
+
+    Nothing in the file is executed.
+
+    Args:
+        path: Of the ``.zip`` archive.
+
+    Raises:
+        UnreadableFile: It is no such archive, or the policy in it is no multilayer perceptron.
+        FileNotFoundError: There is no such file.
+    """
+    name = fspath(path)
+    try:
+        with zipfile.ZipFile(name) as archive:
+            _refuse_huge(name, archive.getinfo("parameters").file_size, _ARCHIVE)
+            raw = io.BytesIO(archive.read("parameters"))
+        with zipfile.ZipFile(raw) as inner:
+            _refuse_huge(name, sum(info.file_size for info in inner.infolist()), _ARCHIVE)
+        with np.load(raw, allow_pickle=False) as arrays:
+            found = {key: np.asarray(arrays[key], dtype=np.float32) for key in arrays.files}
+        hidden = ["shared_fc0"]
+        while f"model/shared_fc{len(hidden)}/w:0" in found:
+            hidden.append(f"shared_fc{len(hidden)}")
+        tensors = {"log_std": found["model/pi/logstd:0"].reshape(-1)}
+        for prefix, last in (("layers", "pi"), ("value.layers", "vf")):
+            if last == "vf" and "model/vf/w:0" not in found:
+                continue
+            for number, layer in enumerate((*hidden, last)):
+                tensors[f"{prefix}.{number}.weight"] = found[f"model/{layer}/w:0"].T
+                tensors[f"{prefix}.{number}.bias"] = found[f"model/{layer}/b:0"]
+        return MlpPolicy.from_tensors(tensors)
+    except KeyError as error:
+        raise UnreadableFile(name, f"it has no entry {error.args[0]!r}", _ARCHIVE) from None
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:  # or encrypted
+        reason = f"it is no zip archive, or damaged ({error})"
+        raise UnreadableFile(name, reason, _ARCHIVE) from None
+    except UnreadableFile:
+        raise
+    except ModelError as error:
+        raise UnreadableFile(name, "; ".join(error.problems), _ARCHIVE) from None
+    except (ValueError, TypeError) as error:  # pickled objects, or no numbers at all
+        reason = f"its weights are no plain arrays ({error})"
+        raise UnreadableFile(name, reason, _ARCHIVE) from None
+
+
+def _refuse_huge(name: str, size: int, advice: str) -> None:
+    if size > LARGEST:
+        raise UnreadableFile(name, f"it has more than {LARGEST} bytes", advice)
+
+
+def _misfits(
+    name: str, layers: tuple[Layer, ...], first: int | None, last: int | None
+) -> Iterator[str]:
+    """Name the problems of the layers of a network."""
+    if not layers:
+        yield f"there is no tensor '{name}.0.weight'"
+        return
+    shapes = [layer.weight.shape for layer in layers]
+    wrong = [
+        f"{name}.{number}: weight (outputs, inputs) and bias (outputs,) are no finite numbers of "
+        f"these shapes, got {weight.T.shape} and {bias.shape}"
+        for number, (weight, bias) in enumerate(layers)
+        if weight.ndim != 2
+        or not (_is_good(weight, weight.shape) and _is_good(bias, weight.shape[1:]))
+    ]
+    if wrong:
+        yield from wrong
+        return
+    for one, other in pairwise(shapes):
+        if one[1] != other[0]:
+            yield f"{name}: a layer gives {one[1]} numbers and the next one takes {other[0]}"
+    if last is not None and shapes[-1][1] != last:
+        yield f"{name}: the last one has to give {last} numbers, not {shapes[-1][1]}"
+    if first is not None and shapes[0][0] != first:
+        yield f"{name}: the first one has to take {first} numbers, not {shapes[0][0]}"
+
+
+def _is_good(array: Weights, shape: tuple[int, ...]) -> bool:
+    return array.shape == shape and array.size > 0 and bool(np.isfinite(array).all())
+
+
+def _in_doubles(layers: tuple[Layer, ...]) -> list[tuple[Floats, Floats]]:
+    return [
+        (np.ascontiguousarray(weight, np.float64), bias.astype(np.float64))
+        for weight, bias in layers
+    ]
+
+
+@njit(cache=True)
+def _dense(x: Floats, weight: Floats, bias: Floats, after: int) -> Floats:
+    """Compute a layer row by row, every sum in the order of the inputs.
+
+    Args:
+        x: Shape (rows, inputs).
+        weight: Shape (inputs, outputs).
+        bias: Shape (outputs,).
+        after: 1: hyperbolic tangent; 2: rectifier; 0: neither.
+    """
+    rows, inputs, outputs = x.shape[0], weight.shape[0], weight.shape[1]
+    found = np.empty((rows, outputs))
+    for row in range(rows):
+        total = found[row]
+        total[:] = bias
+        for i in range(inputs):
+            share = x[row, i]
+            for j in range(outputs):
+                total[j] += share * weight[i, j]
+        for j in range(outputs):
+            if after == 1:
+                total[j] = math.tanh(total[j])
+            elif after == 2:
+                total[j] = max(total[j], 0.0)
+    return found

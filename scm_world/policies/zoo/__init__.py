@@ -1,0 +1,76 @@
+"""Trained policies that come with this package, each with a card.
+
+A policy of the zoo is named ``"zoo:pushing"`` wherever a policy is named::
+
+    evaluate("zoo:pushing", "P0,P5")
+    print(card("zoo:pushing").card["command"])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.policies.cards import PolicyAbout
+from scm_world.policies.networks import load_policy
+
+PREFIX = "zoo:"
+FOLDER = Path(__file__).parent
+
+
+def zoo() -> Mapping[str, PolicyAbout]:
+    """Return the cards of all policies of the zoo, by name."""
+    return {name: card(name) for name in _names()}
+
+
+def card(name: str) -> PolicyAbout:
+    """Return the card of a policy of the zoo.
+
+    Args:
+        name: ``"zoo:pushing"``, or ``"pushing"``.
+
+    Raises:
+        UnknownOption: There is none of this name.
+    """
+    return load_policy(file_of(f"{PREFIX}{name.removeprefix(PREFIX)}")).about
+
+
+def file_of(policy: Path | str) -> Path:
+    """Return the file of a policy.
+
+    Args:
+        policy: A file, ``"zoo:pushing"``, or the folder of a training run, which stands for the
+            best policy of its evaluations or, if there was none, for the last one.
+
+    Raises:
+        UnknownOption: The zoo has none of this name.
+        UnreadableFile: The folder has no policy.
+    """
+    text = str(policy)
+    if text.startswith(PREFIX):
+        if text not in _names():
+            raise UnknownOption("policy of the zoo", text, _names())
+        return FOLDER / f"{text.removeprefix(PREFIX)}.safetensors"
+    if not Path(text).is_dir():
+        return Path(text)
+    for name in ("best.safetensors", "policy.safetensors"):
+        if (Path(text) / name).is_file():
+            return Path(text) / name
+    advice = "give the folder of a training run that has begun to evaluate, or a file"
+    raise UnreadableFile(text, "it has neither best.safetensors nor policy.safetensors", advice)
+
+
+def best_known(about: PolicyAbout) -> str:
+    """Return the scores on a card in one line, those of the first backend."""
+    rows: Any = about.card.get("scores") or []
+    return ", ".join(
+        f"{row['protocol']} {row['last_fractional_success']['value']:.2f}"
+        for row in rows
+        if row["engine"] == rows[0]["engine"]
+    )
+
+
+def _names() -> tuple[str, ...]:
+    return tuple(f"{PREFIX}{path.stem}" for path in sorted(FOLDER.glob("*.safetensors")))
