@@ -56,12 +56,12 @@ def fuzz(world: World, count: int, seed: int) -> dict[str, Any]:
         if index % 50 == 0:
             world.reset(seed=index)
         before = world.values() if index % 20 == 0 else None
-        declaration = world.declaration
+        declaration = world.compiled
         request = random_request(world, generator)
         try:
             world.do(request)
             done += 1
-            structural += world.declaration is not declaration
+            structural += world.compiled is not declaration
         except InterventionError:
             refused += 1
             expect(before is None or same(world.values(), before), request)

@@ -74,17 +74,17 @@ class Options:
         """Name the folder of the results."""
         names = "-".join(policies_of(self.policies))
         about = suffix((*self.arguments, *self.env))
-        return RESULTS / f"evaluate-{names}-{self.the_task()}{about}"
+        return RESULTS / f"evaluate-{names}-{self.as_task()}{about}"
 
     def environment(self) -> dict[str, Any]:
         """Read the options of the environment, and the arguments of the task."""
         given = parse_assignments(self.env, "'--env'")
         found = {k: _WORDS.get(v, v) if isinstance(v, str) else v for k, v in given.items()}
         if self.arguments:
-            found["task_options"] = dict(build(self.the_task(), self.arguments).given)
+            found["task_options"] = dict(build(self.as_task(), self.arguments).given)
         return found
 
-    def the_task(self) -> str:
+    def as_task(self) -> str:
         """Name the task, also if it was not typed."""
         return self.task or task_of(policies_of(self.policies))
 
@@ -123,7 +123,7 @@ def run(options: Options, *, out: Location | None) -> int:
     """Evaluate, print a table, write everything; return the exit code."""
     _check(options)
     sys.path.insert(0, str(Path.cwd()))  # for a policy of one's own, beside where this is called
-    options = replace(options, task=options.the_task())
+    options = replace(options, task=options.as_task())
     folder = out or options.folder()
     check_writable(folder, folder=True)
     terminal = console()

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.curricula.base import words
 from scm_world.curricula.targets import matching
@@ -18,7 +19,6 @@ from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.variables import Box, Integers, Subset
 from scm_world.variables.kinds import SpaceName, Variable
 from scm_world.variables.subsets import as_region
-from scm_world.world.start import whole_number
 
 
 @final
@@ -80,7 +80,7 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
         self._shape = env.action_space.shape
         self._most = None if most is None else whole_number("most", most, least=0)
         self._flat, self._left = flat, -1
-        declaration = self._inner.world.declaration
+        declaration = self._inner.world.compiled
         self._names = matching(declaration, patterns)
         self._variables = [declaration.model.declared(name) for name in self._names]
         for variable in self._variables:

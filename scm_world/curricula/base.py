@@ -16,7 +16,7 @@ from scm_world.queries.plans import PACKAGE
 from scm_world.queries.timed import as_act
 from scm_world.variables import Draw, Function, Intervention
 from scm_world.variables.spaces import Frozen
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 
 Acts = dict[str, Any]
 """An intervention: acts by the name of the variable."""
@@ -61,7 +61,7 @@ class Part(Frozen):
         for part in self.parts():
             yield from part.live(memory, episode)
 
-    def declared(self, declaration: Declaration) -> None:
+    def declared(self, declaration: CompiledTask) -> None:
         """Look for names that do not exist and values that are impossible, in a structure.
 
         Raises:
@@ -185,7 +185,7 @@ class Do(Part):
         """List what it sets."""
         yield from self.request
 
-    def declared(self, declaration: Declaration) -> None:
+    def declared(self, declaration: CompiledTask) -> None:
         """Look for names that do not exist and values that are impossible."""
         for name, act in self.request.items():
             if name not in declaration.entity_names:

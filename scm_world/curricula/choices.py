@@ -8,11 +8,11 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world.curricula.base import Acts, AnyPart, Part, as_part
 from scm_world.curricula.situations import Memory, Progress, Situation
 from scm_world.errors import UnknownOption
-from scm_world.world.requests import merged
-from scm_world.world.start import whole_number
+from scm_world.world.plan import merged
 
 
 class _Several(Part):
@@ -37,7 +37,7 @@ class Together(_Several):
 
     def acts(self, situation: Situation) -> Acts:
         """Put them over one another."""
-        return merged(situation.declaration.model, *(part.acts(situation) for part in self.of))
+        return merged(situation.compiled.model, *(part.acts(situation) for part in self.of))
 
 
 @final

@@ -125,7 +125,7 @@ class Curriculum(Frozen):
         may_come = self._may_restructure(world)
         for part in self.part.walk():
             try:
-                part.declared(world.declaration)
+                part.declared(world.compiled)
             except UnknownVariable:
                 if not may_come:
                     raise
@@ -133,7 +133,7 @@ class Curriculum(Frozen):
             check_subset(self.space, world.model.variables, may_come=may_come)
 
     def _may_restructure(self, world: World) -> bool:
-        head = tuple(world.family.head)
+        head = tuple(world.structures.head)
         goals = world.task.goal_causes
         return any(
             any(fnmatchcase(name, pattern) for name in head)

@@ -8,6 +8,7 @@ from typing import Any, Literal, final
 import numpy as np
 from pydantic import Field
 
+from scm_world._arguments import whole_number
 from scm_world._types import Value
 from scm_world.curricula.base import Acts, Part, acts_of
 from scm_world.curricula.situations import Situation
@@ -22,8 +23,7 @@ from scm_world.graph import flatten
 from scm_world.variables import Function, Rotations, Variable
 from scm_world.variables.kinds import AsMechanism
 from scm_world.variables.mechanisms import Linear
-from scm_world.world.declaration import Declaration
-from scm_world.world.start import whole_number
+from scm_world.world.compiled_task import CompiledTask
 
 
 @final
@@ -71,7 +71,7 @@ class Interpolate(Part):
         return {name: self._between(situation, name, share) for name in names}
 
     def _between(self, situation: Situation, name: str, share: float) -> Value:
-        variable = situation.declaration.model.declared(name)
+        variable = situation.compiled.model.declared(name)
         begin = self.start.get(name)
         if begin is None:
             usual = situation.initial.get(name)
@@ -92,7 +92,7 @@ class Interpolate(Part):
         """List what it sets."""
         yield from self.stop
 
-    def declared(self, declaration: Declaration) -> None:
+    def declared(self, declaration: CompiledTask) -> None:
         """Look for names that do not exist and ends that a variable cannot reach."""
         model = declaration.model
         for name, stop in self.stop.items():

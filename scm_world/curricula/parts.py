@@ -15,7 +15,7 @@ from scm_world.variables.checks import check_draw, check_region
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
 from scm_world.variables.subsets import refuse_infinite
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 
 __all__ = ["Acts", "AnyPart", "Do", "Goal", "Part", "Resample", "as_part"]
 
@@ -58,13 +58,13 @@ class Resample(Part):
         """Draw, where it is due."""
         if not situation.due:
             return {}
-        drawn = self._draws(situation.declaration, situation.first)
+        drawn = self._draws(situation.compiled, situation.first)
         if self.exclusive:
             without = _SIZES if situation.uniform(self.key) < 0.5 else _POSITIONS
             return {name: act for name, act in drawn.items() if not name.endswith(without)}
         return dict(drawn)
 
-    def _draws(self, declaration: Declaration, first: frozenset[str] | None) -> Acts:
+    def _draws(self, declaration: CompiledTask, first: frozenset[str] | None) -> Acts:
         """Give the draws, which are the same whenever a structure comes again."""
         kept = _DRAWS.setdefault(declaration, {})
         word = (self.key, first is None)
@@ -78,12 +78,12 @@ class Resample(Part):
         """List what it sets."""
         yield from self.what
 
-    def declared(self, declaration: Declaration) -> None:
+    def declared(self, declaration: CompiledTask) -> None:
         """Look for names that do not exist and regions that are impossible."""
         self.targets(declaration)
 
     def targets(
-        self, declaration: Declaration, among: frozenset[str] | None = None
+        self, declaration: CompiledTask, among: frozenset[str] | None = None
     ) -> dict[str, SpaceName | Distribution]:
         """Name the variables, each with the region that it is drawn from.
 
@@ -112,7 +112,7 @@ class Resample(Part):
         return found
 
     def _matching(
-        self, declaration: Declaration, patterns: tuple[str, ...], among: frozenset[str] | None
+        self, declaration: CompiledTask, patterns: tuple[str, ...], among: frozenset[str] | None
     ) -> tuple[str, ...]:
         if among is None:
             return matching(declaration, patterns)
@@ -130,7 +130,7 @@ class Resample(Part):
 
 _SIZES = (".size", "block_size", "_dims")
 _POSITIONS = (".cylindrical_position",)
-_DRAWS: WeakKeyDictionary[Declaration, dict[tuple[str, bool], Acts]] = WeakKeyDictionary()
+_DRAWS: WeakKeyDictionary[CompiledTask, dict[tuple[str, bool], Acts]] = WeakKeyDictionary()
 
 
 def _check(variable: Variable, region: SpaceName | Distribution) -> None:
@@ -175,7 +175,7 @@ class Goal(Part):
         if not situation.due:
             return {}
         stream = f"{STREAM}/{self.key}"
-        drawn = situation.declaration.task.sample_goal(self.space)
+        drawn = situation.compiled.task.sample_goal(self.space)
         return {
             name: act.model_copy(update={"stream": stream}) if isinstance(act, Draw) else act
             for name, act in drawn.items()
@@ -186,7 +186,7 @@ class Goal(Part):
         """List what it sets."""
         yield "@goals"
 
-    def declared(self, declaration: Declaration) -> None:
+    def declared(self, declaration: CompiledTask) -> None:
         """Look for causes that the goal does not have."""
         causes = declaration.task.sample_goal(self.space)
         for name in self.besides:

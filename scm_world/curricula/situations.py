@@ -13,7 +13,7 @@ from scm_world._types import Value
 from scm_world.errors import UnreadableFile
 from scm_world.variables import Noise
 from scm_world.world import World
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 
 STREAM = "curriculum"
 """First word of the noise of curricula."""
@@ -100,9 +100,9 @@ class Situation:
     initial: Mapping[str, Value] = field(default_factory=dict)
 
     @property
-    def declaration(self) -> Declaration:
+    def compiled(self) -> CompiledTask:
         """The structure that there is."""
-        return self.world.declaration
+        return self.world.compiled
 
     def values(self) -> Mapping[str, Value]:
         """Give the present value of every variable."""

@@ -9,7 +9,7 @@ from typing import Any
 from scm_world.errors import UnknownVariable
 from scm_world.variables import Exogenous, Variable
 from scm_world.variables.reserved import PRESET
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 
 LOOKS = ("*color", "light_*", "camera_*")
 """What is seen and moves nothing."""
@@ -40,7 +40,7 @@ POSE = ("cylindrical_position", "euler_orientation")
 """The coordinates in which the spaces of poses are declared."""
 
 
-def matching(declaration: Declaration, patterns: Iterable[str]) -> tuple[str, ...]:
+def matching(declaration: CompiledTask, patterns: Iterable[str]) -> tuple[str, ...]:
     """List the variables that can be set and that patterns or groups name.
 
     A group is a word after ``@``: ``@everything``, ``@goals``, ``@joints``, ``@looks``,
@@ -69,13 +69,13 @@ def matching(declaration: Declaration, patterns: Iterable[str]) -> tuple[str, ..
     return tuple(found)
 
 
-def settable(declaration: Declaration) -> tuple[str, ...]:
+def settable(declaration: CompiledTask) -> tuple[str, ...]:
     """List what ``do`` accepts in a structure, without the actions."""
     model, actions = declaration.model, declaration.commanded
     return tuple(n for n in model if model.declared(model.target(n)).settable and n not in actions)
 
 
-def _spaced(declaration: Declaration) -> Iterable[Variable]:
+def _spaced(declaration: CompiledTask) -> Iterable[Variable]:
     """List roots and states that have a space, under one name each; bundles, not their parts."""
     model = declaration.model
     for name in settable(declaration):
@@ -97,11 +97,11 @@ def _like(name: str, patterns: Iterable[str]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def _looks(declaration: Declaration) -> list[str]:
+def _looks(declaration: CompiledTask) -> list[str]:
     return [v.name for v in _spaced(declaration) if _like(v.name, LOOKS)]
 
 
-def _poses(declaration: Declaration) -> list[str]:
+def _poses(declaration: CompiledTask) -> list[str]:
     return [
         v.name
         for v in _spaced(declaration)
@@ -110,15 +110,15 @@ def _poses(declaration: Declaration) -> list[str]:
     ]
 
 
-def _joints(declaration: Declaration) -> list[str]:
+def _joints(declaration: CompiledTask) -> list[str]:
     return ["joint_positions"]
 
 
-def _goals(declaration: Declaration) -> list[str]:
+def _goals(declaration: CompiledTask) -> list[str]:
     return [name for name in declaration.task.goal_causes if name in declaration.model]
 
 
-def _physics(declaration: Declaration) -> list[str]:
+def _physics(declaration: CompiledTask) -> list[str]:
     """List what changes how bodies move, and neither where they begin nor how large they are."""
     others = {*_looks(declaration), *_poses(declaration), *_goals(declaration), "joint_positions"}
     model = declaration.model
@@ -134,11 +134,11 @@ def _physics(declaration: Declaration) -> list[str]:
     ] + [name for name in ("blocks_mass",) if name in model]
 
 
-def _everything(declaration: Declaration) -> list[str]:
+def _everything(declaration: CompiledTask) -> list[str]:
     return [v.name for v in _spaced(declaration) if v.name != PRESET]
 
 
-def _published(declaration: Declaration) -> list[str]:
+def _published(declaration: CompiledTask) -> list[str]:
     """List what the predecessor's random actor draws: never the joints.
 
     A size that follows another variable is drawn through that one, so that block and goal stay
@@ -157,7 +157,7 @@ def _published(declaration: Declaration) -> list[str]:
     return list(dict.fromkeys(found + [n for n in goals if declaration.model.declared(n).a]))
 
 
-GROUPS: Mapping[str, Callable[[Declaration], list[str]]] = {
+GROUPS: Mapping[str, Callable[[CompiledTask], list[str]]] = {
     "everything": _everything,
     "goals": _goals,
     "joints": _joints,

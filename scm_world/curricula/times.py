@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Literal, final
 
+from scm_world._arguments import whole_number
 from scm_world.curricula.base import Acts, AnyPart, Part, as_part
 from scm_world.curricula.situations import Memory, Situation
 from scm_world.errors import UnknownOption
-from scm_world.world.start import whole_number
 
 
 class _Timed(Part):

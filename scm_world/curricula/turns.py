@@ -110,7 +110,7 @@ class Turn:
     def _act(self, env: Doable, step: int) -> bool:
         """Intervene; first on what decides which bodies there are, for others have their names."""
         besides = self._besides
-        head = frozenset(env.world.family.head)
+        head = frozenset(env.world.structures.head)
         space = self.curriculum.space
         first = self._asked(env.world, step, besides, head) if head else {}
         if not first:

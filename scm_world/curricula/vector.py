@@ -12,6 +12,7 @@ from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world.curricula.choices import count
 from scm_world.curricula.crew import CurriculumCrew
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
@@ -22,7 +23,6 @@ from scm_world.env import IDS, MODEL_ID
 from scm_world.env.batched.choice import fastest
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.tasks import Task
-from scm_world.world.start import whole_number
 
 NATIVE, PROCESSES, LOOP = "native", "processes", "loop"
 SUCCESS = "is_success"

@@ -8,6 +8,7 @@ from typing import Any, final
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
+from scm_world._arguments import whole_number
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
 from scm_world.curricula.situations import Memory
 from scm_world.curricula.turns import Turn
@@ -15,7 +16,6 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import flatten
 from scm_world.world import World
-from scm_world.world.start import whole_number
 
 
 def environment(env: Any, wrapper: str) -> ScmWorldEnv:
@@ -214,7 +214,7 @@ def is_checked(curriculum: Curriculum, world: World) -> bool:
     try:
         curriculum.check(world)
     except UnknownVariable:
-        if not len(world.family.head):
+        if not len(world.structures.head):
             raise
         return False
     return True

@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
@@ -45,7 +46,6 @@ from scm_world.tasks import TASKS
 from scm_world.tasks.model import FILES
 from scm_world.work.executors import Executor, Processes, opened
 from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
-from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/benchmark/1"
 SHARES = (8, 4, 2, 1)

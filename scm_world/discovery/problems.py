@@ -422,7 +422,7 @@ class WorldProblem:
         )
 
     def _step_truth(self, shown: str) -> GroundTruth:
-        actions, bundles = self._world.declaration.actions, self._world.declaration.bundles
+        actions, bundles = self._world.compiled.actions, self._world.compiled.bundles
         outcomes = (outcome.name for outcome in self._outcomes)
         names = tuple(dict.fromkeys((*self._causes, *outcomes, *actions)))
         known = set(names)

@@ -60,7 +60,7 @@ class Copied(EzPickle):
     def sibling(self) -> Self:
         """Make another environment with the same arguments; they share what is declared."""
         given = self._ezpickle_kwargs
-        made = type(self)(**{**given, "task": self.world.family, "task_options": None})
+        made = type(self)(**{**given, "task": self.world.structures, "task_options": None})
         made._ezpickle_kwargs = given
         return made
 

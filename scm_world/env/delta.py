@@ -14,7 +14,7 @@ from scm_world.env.vector import box
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Task
 from scm_world.world import World
-from scm_world.world.family import Family
+from scm_world.world.structures import StructureCache
 
 PREFIX = "delta_"
 JOINTS, TIPS = "joint_positions", "end_effector_positions"
@@ -23,13 +23,13 @@ ORIGINS = (COMMAND, MEASURED)
 """What relative joint positions are relative to."""
 
 
-def checked_mode(mode: Any, task: Task | Family) -> str:
+def checked_mode(mode: Any, task: Task | StructureCache) -> str:
     """Check what actions should mean; None stands for the first mode of the task.
 
     Raises:
         UnknownOption: The task has no such mode, neither by itself nor after ``"delta_"``.
     """
-    modes = (task.task if isinstance(task, Family) else task).action_modes
+    modes = (task.task if isinstance(task, StructureCache) else task).action_modes
     allowed = (*modes, *(PREFIX + one for one in modes))
     if mode is None:
         return modes[0]
@@ -117,16 +117,16 @@ class Delta:
         if world.action_mode == JOINTS and self.is_set():
             found: Floats = state["joint_positions"]
             return found
-        return np.concatenate([np.ravel(now[name]) for name in world.declaration.actions])
+        return np.concatenate([np.ravel(now[name]) for name in world.compiled.actions])
 
     def is_set(self) -> bool:
         """Tell whether nothing was commanded since the joints were put where they are."""
         world = self._world
         if world.version != self._version:
             self._version = world.version
-            instant = world.snapshot().instant
+            base = world.snapshot().base
             joints = world.model.targets("joint_positions")
-            set_now = instant and (instant.at_start or any(j in instant.requests for j in joints))
+            set_now = base and (base.at_start or any(j in base.pending for j in joints))
             self._fresh = world.index if set_now else -1
         return self._fresh == world.index
 

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.env.copies import Copied
@@ -30,9 +31,8 @@ from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, World
-from scm_world.world.declaration import Declaration
-from scm_world.world.requests import merged
-from scm_world.world.start import whole_number
+from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.plan import merged
 
 RENDER_MODES = ("rgb_array", "human")
 SINGLE = np.dtype(np.float32)
@@ -210,7 +210,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
         self._observers: WeakKeyDictionary[
-            Declaration, tuple[Observer, Goals | None, Counted, tuple[str, ...]]
+            CompiledTask, tuple[Observer, Goals | None, Counted, tuple[str, ...]]
         ] = WeakKeyDictionary()
         self._arrange(beginning_structure(self.world, self._start))
         if goal_env:
@@ -266,7 +266,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             return self.as_action(command)
         return self._delta.toward(np.asarray(command, dtype=np.float64))
 
-    def _arrange(self, declaration: Declaration) -> None:
+    def _arrange(self, declaration: CompiledTask) -> None:
         """Observe the structure that there is."""
         found = self._observers.get(declaration)
         if found is None:
@@ -287,8 +287,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         """Compute what is needed of the present."""
         if self._version != self.world.version:
             self._version = self.world.version
-            if self.world.declaration is not self._declaration:
-                self._arrange(self.world.declaration)
+            if self.world.compiled is not self._declaration:
+                self._arrange(self.world.compiled)
         return self.world.evaluate(self._needed)
 
     def reset(

@@ -11,7 +11,7 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.tasks import Task, make_task
 from scm_world.world import World
-from scm_world.world.family import Family
+from scm_world.world.structures import StructureCache
 
 
 def finite(size: int) -> str:
@@ -57,8 +57,10 @@ def names_of(option: str, given: Sequence[str]) -> tuple[str, ...]:
     return tuple(given)
 
 
-def made_task(task: Task | Family | str, options: Mapping[str, Any] | None) -> Task | Family:
-    """Make a task of a name, with its options; or take one, or a family of one.
+def made_task(
+    task: Task | StructureCache | str, options: Mapping[str, Any] | None
+) -> Task | StructureCache:
+    """Make a task of a name, with its options; or take one, or its structures.
 
     Raises:
         UnknownOption: There are options for a task that is made.

@@ -16,7 +16,7 @@ from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Linear
 from scm_world.world import World
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import places
 
 BOUND = 10.0
@@ -44,7 +44,7 @@ class Goals:
             so that a reward that is computed from them is exact.
     """
 
-    def __init__(self, declaration: Declaration) -> None:
+    def __init__(self, declaration: CompiledTask) -> None:
         sides = declaration.task.goal_names()
         self.names = (*sides[0], *sides[1])
         where = declaration.mechanisms.where

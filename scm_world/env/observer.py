@@ -19,7 +19,7 @@ from scm_world.errors import UnknownOption
 from scm_world.models.camera import Camera
 from scm_world.tasks import TIME, Observed
 from scm_world.world import World
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 
 MODES = ("structured", "full", "pixel", "custom")
 CONTEXTS = ("none", "observation", "privileged")
@@ -109,7 +109,7 @@ class Together:
 
 
 def observer(
-    world: World, declaration: Declaration, how: Observing, goals: Goals | None
+    world: World, declaration: CompiledTask, how: Observing, goals: Goals | None
 ) -> Observer:
     """Put together what is asked for.
 
@@ -143,13 +143,13 @@ def observer(
     )
 
 
-def context(declaration: Declaration) -> tuple[str, ...]:
+def context(declaration: CompiledTask) -> tuple[str, ...]:
     """Name every parameter that an intervention can set: masses, frictions, sizes and goals."""
     model = declaration.model
     return tuple(name for name in declaration.static_names if model.declared(name).settable)
 
 
-def published(world: World, declaration: Declaration) -> dict[str, Observed]:
+def published(world: World, declaration: CompiledTask) -> dict[str, Observed]:
     """List the parts of the structured observation, by variable."""
     parts = list(declaration.task.observed())
     if declaration.task.head:
@@ -159,7 +159,7 @@ def published(world: World, declaration: Declaration) -> dict[str, Observed]:
     return {part.variable: part for part in parts}
 
 
-def _vector(world: World, declaration: Declaration, how: Observing) -> Vector:
+def _vector(world: World, declaration: CompiledTask, how: Observing) -> Vector:
     names = list(how.names if how.mode == "custom" else published(world, declaration))
     if how.mode == "full":
         names += [name for name in declaration.model if name not in declaration.parts]
@@ -174,7 +174,7 @@ def _vector(world: World, declaration: Declaration, how: Observing) -> Vector:
     return Vector(world, declaration, parts, normalize=how.normalize, keypoints=corners)
 
 
-def _parts(world: World, declaration: Declaration, names: Iterable[str]) -> list[Part]:
+def _parts(world: World, declaration: CompiledTask, names: Iterable[str]) -> list[Part]:
     """Give variables the bounds of the structured observation, or those they declare.
 
     States of a model scale by the bounds they declare, and do not saturate: joint limits are soft.
@@ -201,7 +201,7 @@ def _quiet(parts: Iterable[Part]) -> list[Part]:
     return [replace(part, sensed=False) for part in parts]
 
 
-def _keypoints(declaration: Declaration) -> Keypoints:
+def _keypoints(declaration: CompiledTask) -> Keypoints:
     task = declaration.task
     if not task.tools():
         raise UnknownOption("keypoints", True, ("False: the task has no blocks",))

@@ -10,7 +10,7 @@ from scm_world.graph import flatten
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES
 from scm_world.world import World
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 
 
 def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -68,9 +68,9 @@ def begin(
             return
 
 
-def beginning_structure(world: World, acts: Mapping[str, Any]) -> Declaration:
+def beginning_structure(world: World, acts: Mapping[str, Any]) -> CompiledTask:
     """Give the structure in which an episode begins after an intervention at its reset."""
-    family = world.family
+    family = world.structures
     mine: dict[str, Any] = {}
     for name, value in acts.items():
         if name in family.head:

@@ -18,7 +18,7 @@ from scm_world.tasks import TIME
 from scm_world.variables import Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import World
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import places
 
 Layouts = Mapping[str, Mapping[str, slice]]
@@ -71,7 +71,7 @@ class Vector:
     def __init__(
         self,
         world: World,
-        declaration: Declaration,
+        declaration: CompiledTask,
         parts: Sequence[Part],
         *,
         normalize: bool,

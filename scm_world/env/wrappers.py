@@ -10,13 +10,13 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world.env.delta import PREFIX, TIPS
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.vector import box
 from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.variables import Shift
-from scm_world.world.start import whole_number
 
 Actions = NDArray[Any]
 

@@ -177,7 +177,7 @@ def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
     turn = Turn(protocol.curriculum())
     try:
         turn.curriculum.check(env.world)
-        if isinstance(protocol.space, Subset) and not env.world.family.head:
+        if isinstance(protocol.space, Subset) and not env.world.structures.head:
             for pattern in protocol.space.unused(env.world.model):
                 raise UnknownVariable(pattern, env.world.model)
     except ScmWorldError as error:
@@ -333,7 +333,7 @@ def _drawn(env: ScmWorldEnv, step: int) -> dict[str, list[float]]:
         for name, act in asked.items()
         if not isinstance(act, Null)
         and name in env.world.model
-        and name not in env.world.declaration.actions
+        and name not in env.world.compiled.actions
     )
     now = env.world.evaluate(names) if names else {}
     return {name: np.ravel(now[name]).astype(float).tolist() for name in names}

@@ -20,7 +20,7 @@ from scm_world.evaluation.protocols import LONGEST, Protocol
 from scm_world.tasks import Task, tasks
 from scm_world.variables.kinds import SpaceName
 from scm_world.world import World
-from scm_world.world.start import the_task
+from scm_world.world.structures import as_task
 
 FRICTION = "floor_friction"
 
@@ -139,7 +139,7 @@ def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol
             return (_protocol(_BLOCK, *ROWS[0]),)  # nothing varies in it
         rows = (*ROWS, REACHING) if name == "reaching" else ROWS
         return tuple(_protocol(ROLES[name], *row) for row in rows)
-    return general(the_task(task), backend)
+    return general(as_task(task), backend)
 
 
 def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
@@ -152,7 +152,7 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
         task: Of a model or a step function.
         backend: Whose parameters count; that of the task if None.
     """
-    declaration = World(task, backend=backend).declaration
+    declaration = World(task, backend=backend).compiled
     found = [Protocol("P0", doc="nothing varies")]
     spaces: tuple[SpaceName, ...] = ("A", "B")
     for space in spaces:

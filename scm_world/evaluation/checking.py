@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world.curricula.parts import Do
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.arena import Arena
@@ -26,7 +27,6 @@ from scm_world.queries.plans import PACKAGE
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.model import is_model
-from scm_world.world.start import whole_number
 
 _TASK = ("task", "arguments", "class", "model")
 """What says of an evaluation where it happened."""

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import load as load_library
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import what_it_is
 from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
-from scm_world.graph.exchange.libraries import load as load_library
 from scm_world.output.durable import locked, removed, write_durably, write_whole
 from scm_world.output.locations import Location
 

@@ -122,7 +122,7 @@ class Lockstep:
         return (
             self._threads > 1
             and world.backend.capabilities.batch
-            and not len(world.family.head)  # else bodies may come and go in some of them
+            and not len(world.structures.head)  # else bodies may come and go in some of them
             and not Inside.of(self._env).is_partial
             and not any(player is one for one in self._apart)
             and player.parallel
@@ -156,7 +156,7 @@ class Lockstep:
         """Play episodes that have begun."""
         crew = self._ready()
         which = np.arange(crew.num_envs) < len(seats)
-        actions = np.zeros((crew.num_envs, self._env.world.declaration.n_actions))
+        actions = np.zeros((crew.num_envs, self._env.world.compiled.n_actions))
         while which.any():
             rows = np.flatnonzero(which).tolist()
             for row in rows:

@@ -234,7 +234,7 @@ def _model(model: Any, env: ScmWorldEnv) -> Act:
 def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Act:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
-    policy.check(env.observe(), env.world.declaration.n_actions)
+    policy.check(env.observe(), env.world.compiled.n_actions)
     return policy
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, final
 
+from scm_world._arguments import whole_number
 from scm_world.curricula import Curriculum, as_curriculum, at_step
 from scm_world.curricula.base import read_from, words
 from scm_world.curricula.parts import AnyPart, Part, Resample, as_part
@@ -13,7 +14,6 @@ from scm_world.errors import UnknownOption
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
-from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/protocol/1"
 LONGEST = 80

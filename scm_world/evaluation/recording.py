@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.env.given import doubles, names_of
@@ -42,7 +43,6 @@ from scm_world.output.remote import said
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task
-from scm_world.world.start import whole_number
 
 __all__ = ["Recorded", "Recorder", "Recording", "record"]
 
@@ -388,7 +388,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise NotReset
         self._update(episode)
         single = getattr(action, "dtype", None) == np.float32
-        n = self._inner.world.declaration.n_actions
+        n = self._inner.world.compiled.n_actions
         taken = np.array(action if single else doubles(action, n))  # as the environment reads it
         observation, reward, terminated, truncated, info = self.env.step(action)
         episode.actions.append(taken)

@@ -20,12 +20,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import load
 from scm_world._types import Floats, Integers
 from scm_world.env import IDS, MODEL_ID
 from scm_world.env.observer import Observation
 from scm_world.env.start import asked
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.graph.exchange.libraries import load
 from scm_world.policies.cards import RELATIVE, USUAL
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task, tasks

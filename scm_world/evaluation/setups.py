@@ -12,6 +12,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world.backends import backends
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
@@ -25,7 +26,6 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
 from scm_world.tasks import TASKS, Task, make_task, tasks
 from scm_world.work.executors import Executor
-from scm_world.world.start import whole_number
 
 SHARD = 25
 """Episodes that are played and written down at once."""

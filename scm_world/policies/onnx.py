@@ -7,8 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import load
 from scm_world.errors import ActionError, ModelError, UnreadableFile
-from scm_world.graph.exchange.libraries import load
 from scm_world.policies.cards import KEY, PolicyAbout
 
 _TYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(uint8)": "uint8"}

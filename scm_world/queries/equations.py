@@ -10,15 +10,15 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.variables import Action, Noise
 from scm_world.world import Audit, World
 from scm_world.world.audit import Applied
-from scm_world.world.commands import clipped
-from scm_world.world.compare import same
-from scm_world.world.start import whole_number
+from scm_world.world.compiled_task import clipped
+from scm_world.world.solver import same
 
 
 @final
@@ -149,7 +149,7 @@ class Equations:
         *,
         vectorised: bool | None = None,
     ) -> None:
-        self.declaration, self.model = layout, layout.model
+        self.compiled, self.model = layout, layout.model
         vectorised = layout.is_vectorised if vectorised is None else vectorised
         self._groups = np.zeros(1, dtype=int) if groups is None else np.asarray(groups)
         self._is_one = groups is None
@@ -166,16 +166,16 @@ class Equations:
     @property
     def action_low(self) -> Floats:
         """Lower end of all actions, shape (n_actions,)."""
-        return self.declaration.action_bounds[0]
+        return self.compiled.action_bounds[0]
 
     @property
     def action_high(self) -> Floats:
         """Upper end of all actions, shape (n_actions,)."""
-        return self.declaration.action_bounds[1]
+        return self.compiled.action_bounds[1]
 
     def idle(self) -> Floats:
         """Give the action that is nearest to zero, shape (n_actions,)."""
-        return np.clip(np.zeros(self.declaration.n_actions), *self.declaration.action_bounds)
+        return np.clip(np.zeros(self.compiled.n_actions), *self.compiled.action_bounds)
 
     def length(self, steps: int | None) -> int:
         """Check the number of control steps of an episode.
@@ -275,18 +275,18 @@ class Equations:
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        low, high = self.declaration.action_bounds
+        low, high = self.compiled.action_bounds
         rows = np.asarray(action, dtype=np.float64) if not self._is_one else None
         if rows is not None and rows.ndim == 2:
             given = np.clip(rows, low, high)
         else:
             given = clipped(action, low, high, "1")
         now = {**self._now(), **self._split(given)}
-        for name, where in self.declaration.actions.items():
+        for name, where in self.compiled.actions.items():
             shape = self.model.declared(name).shape
             ends = (low[where].reshape(shape), high[where].reshape(shape))
             now[name] = np.clip(self._computed(name, now, self.index), *ends)
-        self._before, self._action = now, {name: now[name] for name in self.declaration.actions}
+        self._before, self._action = now, {name: now[name] for name in self.compiled.actions}
         self.index += 1
         self._solved = None
 
@@ -320,7 +320,7 @@ class Equations:
     def _split(self, action: Floats) -> dict[str, Value]:
         """Give every action variable its part of a vector of all, for each episode."""
         lead, found = () if self._count is None else (self._count,), dict[str, Value]()
-        for name, where in self.declaration.actions.items():
+        for name, where in self.compiled.actions.items():
             shape = self.model.declared(name).shape
             part = action[..., where].reshape((*action.shape[:-1], *shape))
             found[name] = np.broadcast_to(part, (*lead, *shape))

@@ -11,6 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.equations import Equations, System
@@ -19,7 +20,6 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.samples import Samples, Setting, sample
 from scm_world.queries.twins import AnyTwins
-from scm_world.world.start import whole_number
 
 CONFIDENCE = 0.95
 

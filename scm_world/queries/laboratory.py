@@ -13,6 +13,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import BudgetExhausted, Forbidden, ModelError, UnknownOption, UnreadableFile
 from scm_world.queries.outcomes import Outcome, column
@@ -22,8 +23,7 @@ from scm_world.queries.timed import Contact, Reaches
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Fixed
 from scm_world.world import World
-from scm_world.world.requests import merged
-from scm_world.world.start import whole_number
+from scm_world.world.plan import merged
 
 FORMAT = "scm_world/laboratory/1"
 

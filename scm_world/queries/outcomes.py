@@ -110,13 +110,13 @@ def usual_outcomes(world: System) -> tuple[str, ...]:
         UnknownOption: Nothing is computed from the states.
     """
     if isinstance(world, Equations):
-        return tuple(name for name in world.model if name not in world.declaration.actions)
+        return tuple(name for name in world.model if name not in world.compiled.actions)
     if FRACTION in world.model:
         return (FRACTION,)
-    declaration = world.declaration
+    declaration = world.compiled
     found = tuple(name for name in declaration.computed if name not in declaration.bundles)
     if not found:
-        allowed = ("names of variables, such as " + repr(next(iter(world.declaration.slices))),)
+        allowed = ("names of variables, such as " + repr(next(iter(world.compiled.slices))),)
         raise UnknownOption("outcomes", None, allowed)
     return found
 

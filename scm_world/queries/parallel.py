@@ -15,6 +15,7 @@ from typing import Any, TypeVar, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers, Value
 from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.queries.equations import Equations
@@ -37,8 +38,7 @@ from scm_world.work.executors import Executor
 from scm_world.work.threads import cores
 from scm_world.world import World
 from scm_world.world.batch import Batch, Table
-from scm_world.world.commands import clipped
-from scm_world.world.start import whole_number
+from scm_world.world.compiled_task import clipped
 
 R = TypeVar("R")
 
@@ -254,7 +254,7 @@ class _Layout:
     @classmethod
     def of(cls, table: Table, names: Sequence[str]) -> _Layout:
         """Look it up."""
-        declaration = table.declaration
+        declaration = table.compiled
         size = width = table.state_size
         parts, places = [np.arange(size)], {}
         for name in names:
@@ -289,7 +289,7 @@ class _Life:
     def __post_init__(self) -> None:
         self.schedule, self.policy = Schedule(()), self.unit.acts(self.world)
         self.trace = self.unit.goes_on()
-        self.ahead: Floats = np.empty((0, self.world.declaration.n_actions))
+        self.ahead: Floats = np.empty((0, self.world.compiled.n_actions))
         self._shift = 0
 
     def arrive(self) -> None:
@@ -313,8 +313,8 @@ class _Life:
         world, left = self.world, self.unit.steps - step
         policy: Any = self.policy
         given = policy.ahead(world, world.index, left)
-        bounds, unit = world.declaration.action_bounds, world.declaration.action_unit
-        commands = np.empty((self.unit.steps, world.declaration.n_actions))
+        bounds, unit = world.compiled.action_bounds, world.compiled.action_unit
+        commands = np.empty((self.unit.steps, world.compiled.n_actions))
         for row, action in zip(commands[step:], given, strict=True):
             row[:] = clipped(action, *bounds, unit)
         self.ahead = commands
@@ -343,7 +343,7 @@ class _Together:
         self._goes_on = np.zeros(len(batch), dtype=np.bool_)
         self._goes_on[: len(lives)] = True
         self._pending = self._goes_on.copy()
-        self._commands = np.zeros((len(batch), lives[0].world.declaration.n_actions))
+        self._commands = np.zeros((len(batch), lives[0].world.compiled.n_actions))
 
     def alone(self, row: int, step: int) -> None:
         """Let a world do something by itself at an instant, and write the instant down."""
@@ -489,5 +489,5 @@ def _packed(ending: Any) -> Any:
 def _unpacked(ending: Any, world: World) -> Any:
     if not isinstance(ending, Trace):
         return ending
-    found = [(step, world.family.declaration(plan)) for step, plan in ending.declarations]
+    found = [(step, world.structures.compiled(plan)) for step, plan in ending.declarations]
     return replace(ending, declarations=found)

@@ -9,13 +9,13 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.queries.equations import Equations, System, action_range
 from scm_world.queries.planning import CrossEntropy
 from scm_world.tasks import TASKS
 from scm_world.tasks.policies import Blind, kept_rows
-from scm_world.world.start import whole_number
 
 Policy = Callable[[Any], Any]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
@@ -43,7 +43,7 @@ class Random(Blind):
 
     def ahead(self, world: System, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""
-        n, noise, episode = world.declaration.n_actions, world.noise, world.episode
+        n, noise, episode = world.compiled.n_actions, world.noise, world.episode
         drawn = np.empty((count, n))
         for row, index in enumerate(range(first, first + count)):
             step = index // self.every
@@ -78,7 +78,7 @@ class Sequence(Blind):
 
     def ahead(self, world: System, first: int, count: int) -> Floats:
         """Give the actions of some control steps."""
-        n = world.declaration.n_actions
+        n = world.compiled.n_actions
         if self.actions.shape[1] != n:
             raise ActionError(
                 f"actions have shape ({n},) or (steps, {n}), got {self.actions.shape}", self.actions

@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value
 from scm_world.errors import ActionError, InterventionError
 from scm_world.queries.equations import Equations, System
@@ -16,7 +17,6 @@ from scm_world.queries.policies import Policy, as_policy
 from scm_world.queries.timed import ACTS, At, Clamp, On
 from scm_world.variables import Hard, Intervention, Mechanism, Natural
 from scm_world.world import Audit, World
-from scm_world.world.start import whole_number
 
 Layer = tuple[int, Plan]
 """The control step from which a plan counts, and the plan."""
@@ -331,8 +331,8 @@ def note_parameters(world: System, trace: Trace, step: int) -> None:
     now = world.current()[0] if isinstance(world, World) else {}
     values = {name: np.array(now[name]) for name in world.static_names}
     trace.statics.append((step, values))
-    if not trace.declarations or trace.declarations[-1][1].plan != world.declaration.plan:
-        trace.declarations.append((step, world.declaration))
+    if not trace.declarations or trace.declarations[-1][1].plan != world.compiled.plan:
+        trace.declarations.append((step, world.compiled))
 
 
 def write(world: System, trace: Trace, names: tuple[str, ...], contacts: bool = False) -> None:

@@ -11,6 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode, episode_of
@@ -21,8 +22,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
 from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.twins import AnyTwins, EquationTwins
-from scm_world.world.requests import merged
-from scm_world.world.start import whole_number
+from scm_world.world.plan import merged
 
 STEPS = 25
 """Control steps of an episode by default: one second at 25 steps a second."""

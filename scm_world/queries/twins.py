@@ -16,7 +16,7 @@ from scm_world.queries.equations import Equations, Layout
 from scm_world.work.executors import Executor, Processes
 from scm_world.world import World
 from scm_world.world.batch import Batch
-from scm_world.world.family import Family
+from scm_world.world.structures import StructureCache
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -82,7 +82,7 @@ class Twins:
         with self._singing:
             worlds, self._choir = self._choir[:n], self._choir[n:]
             while len(worlds) < n:
-                worlds.append(self._make(worlds[0].family if worlds else None))
+                worlds.append(self._make(worlds[0].structures if worlds else None))
             try:
                 yield Batch(worlds, threads=threads, names=names)
             finally:
@@ -110,7 +110,7 @@ class Twins:
                 weakref.finalize(self, self._crew.close)
             return self._crew
 
-    def _make(self, family: Family | None = None) -> World:
+    def _make(self, family: StructureCache | None = None) -> World:
         task = copy.copy(self.task) if family is None else family
         made: World = self._build(self._kind, task, dict(self.options), None)
         return made

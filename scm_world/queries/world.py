@@ -20,7 +20,7 @@ from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit, WorldSnapshot
 from scm_world.world import World as Simulated
-from scm_world.world.requests import merged
+from scm_world.world.plan import merged
 
 
 @final

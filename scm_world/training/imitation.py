@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator
 
+from scm_world._arguments import load, whole_number
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
@@ -22,7 +23,6 @@ from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
 from scm_world.evaluation.recording import Recording
-from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import locked, made, write_durably
 from scm_world.policies import NetworkPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
@@ -48,7 +48,6 @@ from scm_world.training.settings import (
 )
 from scm_world.training.tuned import ENV, LESSONS
 from scm_world.variables.spaces import Frozen
-from scm_world.world.start import whole_number
 
 SHARD = 25
 """Episodes in a file."""
@@ -324,7 +323,7 @@ def _episode(
     learner: NetworkPolicy | None,
 ) -> tuple[list[tuple[Any, Any]], dict[str, Any]]:
     """Run an episode; return what was observed and what the teacher would have done, and infos."""
-    teacher, size = NAMED[lesson.teacher](), env.world.declaration.n_actions
+    teacher, size = NAMED[lesson.teacher](), env.world.compiled.n_actions
     scale, share = lesson.noise * random.uniform(), lesson.share * random.uniform(0.0, 2.0)
     noise, learns, over, info = np.zeros(size), False, False, dict[str, Any]()
     pairs = []

@@ -13,16 +13,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, final
 
+from scm_world._arguments import load, whole_number
 from scm_world.backends import backends
 from scm_world.errors import Diverged, UnknownOption, UnreadableFile
 from scm_world.evaluation.setups import Place
-from scm_world.graph.exchange.libraries import load
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.training.recipe import Recipe
-from scm_world.world.start import whole_number
 
 FORMAT = "scm_world/run/1"
 EVERY = 60.0  # [s] between checkpoints

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scm_world.graph.exchange.libraries import load
+from scm_world._arguments import load
 from scm_world.output.durable import write_durably
 from scm_world.policies import NetworkPolicy, load_policy
 from scm_world.policies.cards import KEY

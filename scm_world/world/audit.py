@@ -9,6 +9,13 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value
+from scm_world.backends import Backend
+from scm_world.models import Difference
+from scm_world.variables import Hard
+from scm_world.variables.reserved import CONTROL_INDEX
+from scm_world.world.feasibility import Present
+from scm_world.world.plan import InterventionPlan
+from scm_world.world.solver import same
 
 
 @final
@@ -70,3 +77,94 @@ class Audit:
 
 def _show(value: Value) -> str:
     return np.array2string(np.asarray(value), precision=6, separator=", ")
+
+
+def report(
+    request: Mapping[str, Any],
+    plan: InterventionPlan,
+    change: Difference,
+    before: Present,
+    now: Present,
+    inertia: Mapping[str, Value],
+    backend: Backend,
+) -> Audit:
+    """Return what a committed intervention did.
+
+    Args:
+        request: As it was given, with dotted names.
+        plan: That was applied.
+        change: What the backend had to change.
+        before: What the backend had before; its values are not overwritten.
+        now: What it has now.
+        inertia: Principal moments before, of the bodies whose mass or size changed.
+        backend: That took over the plan.
+    """
+    targets = {}
+    for name in plan.asked:
+        applied, read_back = _asked(plan, now, backend, name)
+        targets[name] = Applied(name, request[name], applied, read_back)
+    bundles = plan.compiled.bundles
+    known = {*targets, *(part for name in targets for part in bundles.get(name, ()))}
+    followed = {
+        name: (before.values[name], value)
+        for name, value in plan.static.items()
+        if value is not before.values.get(name, value)
+        and name not in known
+        and not (
+            np.shape(value) == np.shape(before.values[name]) and same(value, before.values[name])
+        )
+    }
+    moved = (n for n in before.compiled.slices if n not in before.compiled.bundles)
+    for name in moved if change.state is not None else ():
+        if name in now.values and name not in known:
+            old, new = before.compiled.view(name, before.state), now.values[name]
+            if not same(old, new):
+                followed[name] = (_typed(old, new), np.array(new))
+    engine = {f"{body}.inertia": (old, backend.inertia(body)) for body, old in inertia.items()}
+    there, were = (
+        {*one.compiled.composition.blocks, *one.compiled.composition.obstacles}
+        for one in (now, before)
+    )
+    came, went = sorted(there - were), sorted(were - there)
+    return Audit(targets, followed, engine, tuple(came), tuple(went))
+
+
+def _typed(old: Value, new: Value) -> Value:
+    return old.astype(np.asarray(new).dtype)
+
+
+def _asked(
+    plan: InterventionPlan, now: Present, backend: Backend, name: str
+) -> tuple[Value | None, Value | None]:
+    """Give what was applied and read back of what was asked for: also coordinates, or a bundle."""
+    compiled = plan.compiled
+    targets = compiled.model.targets(name)
+    outcomes = [_outcome(plan, now, backend, target) for target in targets]
+    if targets == (name,):
+        return outcomes[0]
+    values = [applied for applied, _ in outcomes if applied is not None]
+    reported = [back for _, back in outcomes if back is not None]
+    if len(values) < len(targets):
+        return None, None
+    applied = compiled.in_coordinates(name, *values)
+    if len(reported) < len(targets):
+        return applied, None
+    exact = all(map(same, reported, values))
+    return applied, applied if exact else compiled.in_coordinates(name, *reported)
+
+
+def _outcome(
+    plan: InterventionPlan, now: Present, backend: Backend, target: str
+) -> tuple[Value | None, Value | None]:
+    """Give the value that a target has now, and what the backend reports; None if unknown."""
+    compiled = plan.compiled
+    if target in compiled.actions:
+        act = plan.pending[target][1]
+        return (np.array(act.value) if isinstance(act, Hard) else None), None
+    applied = np.array(now.values[target])
+    if target == CONTROL_INDEX:
+        return applied, np.array(applied)
+    if target in compiled.slices:
+        return applied, np.array(compiled.view(target, now.state))
+    key = compiled.parameter_keys.get(target)
+    return applied, None if key is None else backend.parameters([key])[key]

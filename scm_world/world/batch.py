@@ -8,12 +8,12 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import UnknownOption
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.work.threads import cores
-from scm_world.world.declaration import Declaration
-from scm_world.world.start import whole_number
+from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.world import World
 
 KEPT = 4
@@ -25,21 +25,21 @@ class Table:
     """The present of worlds of one structure: a row for each world, columns for variables.
 
     Args:
-        declaration: Of the structure.
+        compiled: The task in that structure.
         names: What is computed after every step.
         n: How many worlds there could be.
 
     Attributes:
-        declaration: Of the structure.
+        compiled: The task in that structure.
         matrix: Shape (n, width); the first columns are those of the state.
         state_size: How many these are.
         where: The columns of each variable. What is computed and not in ``names`` may be old.
     """
 
-    def __init__(self, declaration: Declaration, names: Iterable[str], n: int) -> None:
-        self.declaration = declaration
-        self.names = tuple(name for name in names if name in declaration.model)
-        mechanisms = declaration.mechanisms
+    def __init__(self, compiled: CompiledTask, names: Iterable[str], n: int) -> None:
+        self.compiled = compiled
+        self.names = tuple(name for name in names if name in compiled.model)
+        mechanisms = compiled.mechanisms
         self.matrix = np.repeat(mechanisms.start[None], n, axis=0)  # rows are views of this
         self.state_size, self.where = mechanisms.state_size, mechanisms.where
 
@@ -49,7 +49,7 @@ class Table:
 
     def actions(self) -> Floats:
         """Give the actions of all rows, shape (n, n_actions), as a view."""
-        return self.matrix[:, self.declaration.mechanisms.actions]
+        return self.matrix[:, self.compiled.mechanisms.actions]
 
     def clock(self, row: int) -> int:
         """Give the control step of a row."""
@@ -96,7 +96,7 @@ class Batch:
         self._engine = backends[0].batch(backends, count)
         self._names = tuple(names)
         n = len(self._worlds)
-        self._tables: dict[Declaration, Table] = {}
+        self._tables: dict[CompiledTask, Table] = {}
         self._kinds: list[tuple[Any, ...]] = [()] * n  # table, mode and substeps of each world
         self._groups: list[tuple[Any, Integers]] | None = None  # all worlds, by these
         self._stepped = np.zeros(n, dtype=np.bool_)  # the world does not know yet
@@ -132,7 +132,7 @@ class Batch:
     def table(self, index: int) -> Table:
         """Give the table in whose row of this number the present of a world is."""
         kind = self._kinds[index]
-        return kind[0] if kind else self._table(self._worlds[index].declaration)
+        return kind[0] if kind else self._table(self._worlds[index].compiled)
 
     def tables(self, rows: Integers) -> list[tuple[Table, Integers]]:
         """Give the tables of some worlds, each with the rows of those that are in it."""
@@ -166,13 +166,13 @@ class Batch:
         for (table, mode, substeps), members in groups:
             self._step(table, mode, substeps, members, commands)
         for (table, *_), members in groups if evaluate else ():
-            table.declaration.mechanisms.evaluate(table.names, table.matrix, members)
+            table.compiled.mechanisms.evaluate(table.names, table.matrix, members)
             self._fresh[members] = True
 
     def _step(
         self, table: Table, mode: Any, substeps: int, rows: Integers, commands: Floats
     ) -> None:
-        matrix, mechanisms = table.matrix, table.declaration.mechanisms
+        matrix, mechanisms = table.matrix, table.compiled.mechanisms
         if not self._translating:
             self._commands[rows] = commands[rows]
         for row in rows.tolist() if self._translating else ():
@@ -205,7 +205,7 @@ class Batch:
     def _take(self, row: int) -> None:
         """Let the present of a world be in its row."""
         world = self._worlds[row]
-        table = self._table(world.declaration)
+        table = self._table(world.compiled)
         world.evaluate(table.names)
         if world.numbers.base is not table.matrix:
             world.move(table.matrix[row : row + 1])
@@ -222,15 +222,15 @@ class Batch:
             else:
                 rows.discard(row)
 
-    def _table(self, declaration: Declaration) -> Table:
-        found = self._tables.get(declaration)
+    def _table(self, compiled: CompiledTask) -> Table:
+        found = self._tables.get(compiled)
         if found is None:
             used = {id(kind[0]) for kind in self._kinds if kind}
             unused = [key for key, table in self._tables.items() if id(table) not in used]
             for key in unused[: max(0, len(self._tables) + 1 - KEPT)]:
                 del self._tables[key]
-            found = Table(declaration, self._names, len(self._worlds))
-            self._tables[declaration] = found
+            found = Table(compiled, self._names, len(self._worlds))
+            self._tables[compiled] = found
         return found
 
     def close(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any, final
@@ -16,50 +16,7 @@ from scm_world.backends.step import StepModel
 from scm_world.errors import SnapshotMismatch
 from scm_world.models import Model
 from scm_world.variables import Intervention
-from scm_world.world.family import Family
-from scm_world.world.proposal import Instant, Requests
-
-
-@final
-@dataclass(frozen=True)
-class SavedInstant:
-    """An instant without its model, of which only the interventions are kept."""
-
-    interventions: Mapping[str, Intervention]
-    static: Mapping[str, Value]
-    vector: Floats
-    index: int
-    requests: Requests
-    at_start: bool
-    plan: Hashable = None
-
-    @classmethod
-    def of(cls, instant: Instant) -> SavedInstant:
-        """Save an instant."""
-        return cls(
-            instant.model.interventions,
-            dict(instant.static),
-            instant.state.vector.copy(),
-            instant.index,
-            dict(instant.requests),
-            instant.at_start,
-            instant.declaration.plan,
-        )
-
-    def instant(self, family: Family) -> Instant:
-        """Give the instant back."""
-        declaration = family.declaration(self.plan)
-        state = declaration.empty_state(self.vector.copy())
-        held = declaration.model.with_interventions(self.interventions)
-        return Instant(
-            declaration,
-            held,
-            self.static,
-            state,
-            self.index,
-            dict(self.requests),
-            self.at_start,
-        )
+from scm_world.world.compiled_task import PendingInterventions, Plan
 
 
 @final
@@ -79,12 +36,16 @@ class WorldSnapshot:
         seed: Of the noise.
         episode: Number of the episode.
         world: Task, options and names of all variables, to tell worlds apart.
-        instant: What was done at this instant so far, and where it began.
-        plan: What stands in the world.
+        plan: The structure.
         memory: What a world of another kind remembers besides.
+        base: The world at this control step before anyone intervened; None after a step. Of it,
+            only ``static``, ``interventions``, ``index``, ``plan`` and what follows here count.
+        vector: Of a base: where everything is.
+        pending: Of a base: what was asked for since.
+        at_start: Of a base: whether an episode was just beginning.
     """
 
-    engine: EngineSnapshot | bytes
+    engine: EngineSnapshot | bytes | None
     static: Mapping[str, Value]
     interventions: Mapping[str, Intervention] = field(default_factory=dict)
     previous: Mapping[str, Value] = field(default_factory=dict)
@@ -93,12 +54,15 @@ class WorldSnapshot:
     seed: int = 0
     episode: int = 0
     world: tuple[Any, ...] = ()
-    instant: SavedInstant | None = None
-    plan: Hashable = None
+    plan: Plan = (None, frozenset())
     memory: Any = None
+    base: WorldSnapshot | None = None
+    vector: Floats = field(default_factory=lambda: np.zeros(0))
+    pending: PendingInterventions = field(default_factory=dict)
+    at_start: bool = False
 
     def __getstate__(self) -> dict[str, Any]:
-        if isinstance(self.engine, bytes):
+        if self.engine is None or isinstance(self.engine, bytes):
             return vars(self)
         file = BytesIO()
         _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(self.engine)
@@ -114,8 +78,10 @@ class WorldSnapshot:
             structure: What the world compiles.
 
         Raises:
-            SnapshotMismatch: It was taken of another model.
+            SnapshotMismatch: It was taken of another model, or is the base of another snapshot.
         """
+        if self.engine is None:
+            raise SnapshotMismatch("the snapshot has no engine's part: it is the base of another")
         if not isinstance(self.engine, bytes):
             return self.engine
         found: EngineSnapshot = _Unpickler(BytesIO(self.engine), structure).load()

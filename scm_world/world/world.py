@@ -4,45 +4,48 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.backends import Backend
-from scm_world.errors import NotReset, SnapshotMismatch
-from scm_world.graph import SCM, Moment
-from scm_world.models import Scene, State
+from scm_world.backends import Backend, backends, make_backend
+from scm_world.backends.base import EngineSnapshot
+from scm_world.errors import EngineFailure, NotReset, SnapshotMismatch, UnknownOption
+from scm_world.graph import SCM, Moment, flatten
+from scm_world.models import ControlMode, Difference, Scene, State
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
-from scm_world.variables import Noise
-from scm_world.variables.reserved import CONTROL_INDEX
+from scm_world.variables import Draw, Mechanism, Noise, Subset
+from scm_world.variables.checks import check_subset
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world.audit import Audit
-from scm_world.world.commands import clipped
-from scm_world.world.commit import commit, difference, feasible, refuse_overlaps
-from scm_world.world.declaration import Declaration, Options
-from scm_world.world.family import Family, as_family
-from scm_world.world.following import policy_inputs
-from scm_world.world.proposal import Instant, Proposal
-from scm_world.world.snapshot import SavedInstant, WorldSnapshot
-from scm_world.world.start import (
+from scm_world.world.attributes import WorldAttributes
+from scm_world.world.audit import Audit, report
+from scm_world.world.compiled_task import (
+    CompiledTask,
+    Options,
+    StepBase,
     beginning,
     check_functions,
-    check_held,
-    the_backend,
-    the_task,
-    whole_number,
 )
-from scm_world.world.stepping import Stepped
+from scm_world.world.feasibility import Present, feasible_plan, refusal
+from scm_world.world.plan import InterventionPlan
+from scm_world.world.snapshot import WorldSnapshot
+from scm_world.world.solver import same
+from scm_world.world.structures import StructureCache, as_structures, as_task
+from scm_world.world.values import PresentValues
+
+READ_BACK = 1e-6  # how far an engine may report a number from what it was given
 
 
-class World(Stepped):
+class World(WorldAttributes):
     """A task as a causal model, with an engine that moves it.
 
     Args:
-        task: A registered name, a task, or the ``family`` of a world that was made with the same
-            options: then they share what is declared.
+        task: A registered name, a task, or the ``structures`` of a world that was made with the
+            same options: then they share what is compiled.
         backend: ``"mujoco"``, ``"bullet"``, ``"step"``, ``"fake"``, or an engine that is not used
             elsewhere; that of the task if None.
         preset: Of the robot's tasks: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
@@ -76,7 +79,7 @@ class World(Stepped):
 
     def __init__(
         self,
-        task: Task | Family | str = "pushing",
+        task: Task | StructureCache | str = "pushing",
         *,
         backend: Backend | str | None = None,
         preset: str | None = None,
@@ -88,9 +91,10 @@ class World(Stepped):
         variables_space: AnyRegion | None = None,
     ) -> None:
         self.variables_space = as_region("variables_space", variables_space)
-        given = task.task if isinstance(task, Family) else the_task(task)
-        self.backend = the_backend(backend, given.backend)
-        kind = given if isinstance(task, Family) else given.on(self.backend)
+        shared = task if isinstance(task, StructureCache) else None
+        given = as_task(task) if shared is None else shared.task
+        self.backend = _as_backend(given.backend if backend is None else backend)
+        kind = given if shared is not None else given.on(self.backend)
         self.options = Options.checked(
             kind,
             preset=preset,
@@ -100,20 +104,28 @@ class World(Stepped):
             max_episode_length=max_episode_length,
             conventions_name=conventions,
         )
-        self.family = as_family(task if isinstance(task, Family) else kind, self.options)
+        self.structures = as_structures(shared or kind, self.options)
         self._started = self._checked = False
         self.noise, self.episode = Noise(0), 0
         self.version = 0  # counts changes of anything but what physics moves
-        self._static: Values = {}
-        self._held_actions: tuple[str, ...] = ()
-        self._translates = False
-        self._inputs: tuple[str, ...] = ()
+        self._origin: EngineSnapshot | None = None
+        self._origin_static: Values = {}
+        self._lost = ""
         self._index = 0
-        self._instant: Instant | None = None
-        self._enter(self.family.natural(None))
-        self._held = self.model
-        check_held(self.variables_space, self.family)
-        self.structure = self.declaration.structure(self.model.solve(only=self.static_names))
+        self._base: StepBase | None = None
+        compiled = self.structures.natural(None)
+        self._values = PresentValues(compiled)
+        self._adopt_model(compiled.model)
+        if isinstance(self.variables_space, Subset):
+            # Where variables decide which bodies there are, some may be named that are not there.
+            may_come = len(self.structures.head) > 0
+            check_subset(self.variables_space, compiled.model.variables, may_come=may_come)
+        self.structure = compiled.structure(compiled.model.solve(only=compiled.static_names))
+
+    @property
+    def compiled(self) -> CompiledTask:
+        """The task in the structure that there is."""
+        return self._values.compiled
 
     @property
     def graph(self) -> SCM:
@@ -125,6 +137,11 @@ class World(Stepped):
         """How many control steps of the episode are over."""
         return self._index
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether there is an episode."""
+        return self._started
+
     def __getitem__(self, name: str) -> Value:
         """Give the present value of one variable.
 
@@ -134,14 +151,14 @@ class World(Stepped):
         """
         self.model.declared(name)
         self._require_episode()
-        self._compute()
-        return np.array(self._now[name])
+        self._values.compute()
+        return np.array(self._values.now[name])
 
     def values(self) -> dict[str, Value]:
         """Give the present value of every variable, as copies."""
         self._require_episode()
-        self._compute()
-        return {name: np.array(self._now[name]) for name in self.model}
+        self._values.compute()
+        return {name: np.array(self._values.now[name]) for name in self.model}
 
     def previous(self) -> dict[str, Value]:
         """Give the values of one control step ago that present variables depend on."""
@@ -149,7 +166,7 @@ class World(Stepped):
         declared = self.model.declared
         return {
             name: value.astype(np.float64 if declared(name).dtype == "real" else np.int64)
-            for name, value in self._before.items()
+            for name, value in self._values.before.items()
         }
 
     def evaluate(self, names: tuple[str, ...]) -> dict[str, Value]:
@@ -161,18 +178,18 @@ class World(Stepped):
             NotReset: There is no episode yet.
         """
         self._require_episode()
-        self._compute(names)
-        return self._now
+        self._values.compute(names)
+        return self._values.now
 
     def scene(self) -> Scene:
         """Describe the present for a picture, or for another engine."""
         self._require_episode()
-        return self.describe(self._now, self._state.copy())
+        return self.describe(self._values.now, self._values.state.copy())
 
     def cameras(self) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables: the three of the robot."""
         self._require_episode()
-        return self.composition.cameras(self._now)
+        return self.composition.cameras(self._values.now)
 
     def reset(
         self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
@@ -204,46 +221,51 @@ class World(Stepped):
 
     def _begin(self) -> None:
         self._lost = ""
-        origin = self.family.natural(None)
-        if self._started:
-            self.backend.restore(self._origin.unpacked(self.structure))
+        origin = self.structures.natural(None)
+        if self._started and self._origin is not None:
+            self.backend.restore(self._origin)
         else:
-            self._build(origin)
-        self._action[:] = 0.0
-        self.adopt(origin, origin.model, self._origin.static, 0)
+            static, state = beginning(origin, None)
+            self.backend.build(origin.describe(static, state))
+            self._origin, self._origin_static = self.backend.snapshot(), static
+            self._started = True
+        self._values.action[:] = 0.0
+        self._adopt(origin, origin.model, self._origin_static, 0)
         self._draw_nature()
         self._forget()
         if self.task.checks_functions and not self._checked:
-            self._compute()
-            check_functions(self.declaration, self._now)
+            self._values.compute()
+            check_functions(self.compiled, self._values.now)
             self._checked = True
-        self._instant = self._present(at_start=True)
-
-    def _build(self, origin: Declaration) -> None:
-        static, state = beginning(origin, None)
-        self.backend.build(origin.describe(static, state))
-        self._origin = WorldSnapshot(engine=self.backend.snapshot(), static=static)
-        self._started = True
+        self._base = self._step_base(at_start=True)
 
     def _draw_nature(self) -> None:
-        """Draw what is random by declaration: the noise of this episode."""
-        moment = self.moment(0)
-        declaration = self.family.natural(moment)
-        if not declaration.random:
+        """Draw what is random by declaration: the noise of this episode.
+
+        Raises:
+            Infeasible: It puts two bodies in one place.
+        """
+        key = self.moment(0)
+        compiled = self.structures.natural(key)
+        if not compiled.random:
             return
-        static, state = beginning(declaration, moment)
-        model = declaration.model
-        drawn = Proposal(declaration, model, static, state, 0, {}, declaration.random[:1])
-        change = difference(self, drawn)
-        if declaration.composition.solid:
-            refuse_overlaps(self, self._present(), drawn, change, declaration.random[0])
+        static, state = beginning(compiled, key)
+        plan = InterventionPlan(compiled, compiled.model, static, state, 0, {})
+        base, present = self._step_base(), self._present()
+        change = present.difference(plan)
+        problems = present.overlaps(base, plan, change) if compiled.composition.solid else []
+        if problems:
+            request = {compiled.random[0]: Draw("A")}
+            raise refusal(self.structures, base, present, plan, request, problems, key)
         if change:
             self.backend.apply(change)
-        self.adopt(declaration, model, static, 0)
+        self._adopt(compiled, compiled.model, static, 0)
 
     def moment(self, index: int) -> Moment:
-        """Say where in the noise a control step of this episode draws."""
+        """Return the noise key of a control step of this episode."""
         return Moment(self.noise, self.episode, index, origin=0)
+
+    # --- a control step -----------------------------------------------------------------------
 
     def step(self, action: ArrayLike) -> None:
         """Advance one control step.
@@ -257,7 +279,75 @@ class World(Stepped):
             NotReset: There is no episode yet.
             EngineFailure: The engine lost the state.
         """
-        self.advance(clipped(action, *self.declaration.action_bounds, self.declaration.action_unit))
+        self.advance(self.compiled.clipped(action))
+
+    def advance(self, command: Floats) -> None:
+        """Advance one control step with finite numbers in their range; see ``step``."""
+        self._require_state()
+        command = self.decided(command)
+        values = self._values
+        values.remember()
+        values.action[:] = command
+        try:
+            told = self.told(command, self._index)
+            self.backend.step(self.composition.mode, told, self._substeps)
+        except EngineFailure as error:
+            left = self.compiled.empty_state()
+            self.backend.read(left)
+            if np.isfinite(left.vector).all():
+                raise
+            said = f"{error}; {self._largest()}" if left.vector.size else str(error)
+            self._lost = f"the state was lost in control step {self._index}: {said}"
+            raise EngineFailure(self._lost, self.backend.name) from error
+        self.backend.read(values.state)
+        self.arrive(self._index + 1)
+
+    def _largest(self) -> str:
+        """Name the state with the largest number, as it was before a step."""
+        vector = self._values.state.vector
+        worst = int(np.abs(vector).argmax())
+        places = self.composition.slices().items()
+        name = next((name for name, where in places if where.start <= worst < where.stop), "")
+        return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
+
+    def arrive(self, index: int) -> None:
+        """Be at the next control step; where everything is has been written already."""
+        self._index = index
+        self._values.be_at(index)
+        self._base = None
+
+    def decided(self, command: Floats) -> Floats:
+        """Return the action that is taken: the command, where no action has a mechanism."""
+        held = self._held_actions
+        if not held:
+            return command
+        given = self.compiled.split(command)
+        known = {**self.evaluate(self._inputs), **given}
+        solved = self._held.solve(known, moment=self.moment(self._index), only=held)
+        command = command.copy()
+        for name in held:
+            command[self.compiled.actions[name]] = np.ravel(solved[name])
+        return self.compiled.clipped(command)
+
+    def told(self, action: Floats, index: int) -> Floats:
+        """Turn an action into a command, at a control step; it holds until the next call."""
+        commands = self.composition.commands
+        if commands is None or not self.translates:
+            return action
+        values = self._values
+        return commands.told(action, values.now, values.state.vector, self.moment(index))
+
+    @property
+    def pace(self) -> tuple[ControlMode, int]:
+        """What the engine is told besides: what a command means, and physics steps for it."""
+        return self.composition.mode, self._substeps
+
+    @property
+    def holds_action(self) -> bool:
+        """Whether an action has a mechanism, or a value of its own."""
+        return bool(self._held_actions)
+
+    # --- interventions ------------------------------------------------------------------------
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.
@@ -277,25 +367,78 @@ class World(Stepped):
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        self._require_episode()
-        self._refuse_lost()
-        instant = self._instant or self._present()
-        space = self.variables_space if space is None else space
-        proposal, change = feasible(self, instant, request, space)
-        audit, self._instant = commit(self, instant, proposal, change, request)
-        if instant.at_start:
+        self._require_state()
+        flat = flatten(request)
+        base = self._base or self._step_base()
+        region = self.variables_space if space is None else space
+        key = self.moment(base.index)
+        plan, change = feasible_plan(self.structures, base, self._present(), flat, region, key)
+        audit = self._commit(plan, change, flat)
+        self._base = replace(base, pending=plan.pending)
+        if base.at_start:
             self._forget()
         return audit
 
-    def _present(self, *, at_start: bool = False) -> Instant:
-        state = self._state.copy()
-        return Instant(
-            self.declaration, self._held, self._static, state, self._index, at_start=at_start
+    def _step_base(self, *, at_start: bool = False) -> StepBase:
+        values, state = self._values, self._values.state.copy()
+        return StepBase(
+            self.compiled, self._held, values.static, state, self._index, at_start=at_start
         )
 
-    def adopt(
+    def _present(self) -> Present:
+        values = self._values
+        return Present(self.compiled, self.structure, values.now, values.state)
+
+    def _commit(
+        self, plan: InterventionPlan, change: Difference, request: Mapping[str, Any]
+    ) -> Audit:
+        """Apply a plan, read it back, and report; or put everything back and raise.
+
+        Raises:
+            EngineFailure: The engine does not report what it was given.
+        """
+        kept, numbers, index = self._values, self._values.matrix.copy(), self._index
+        model, static, state = self._held, kept.static, kept.state.copy()
+        before = Present(self.compiled, self.structure, dict(kept.now), state)
+        undo = before.inverse(change)
+        try:
+            inertia = self._inertia(change)
+            if change:
+                self.backend.apply(change)
+                self._check_applied(change)
+            self._adopt(plan.compiled, plan.model, plan.static, plan.index)
+            return report(request, plan, change, before, self._present(), inertia, self.backend)
+        except BaseException:
+            if change:
+                self.backend.apply(undo)
+            self._values = kept
+            self._adopt(kept.compiled, model, static, index, state)
+            kept.matrix[...] = numbers
+            raise
+
+    def _inertia(self, change: Difference) -> dict[str, Value]:
+        if change.structure is not None or not self.composition.solid:
+            return {}
+        bodies = {body for body, what in change.parameters if what in ("mass", "size")}
+        bodies -= {*self.composition.obstacles}
+        return {body: self.backend.inertia(body) for body in sorted(bodies)}
+
+    def _check_applied(self, change: Difference) -> None:
+        reported = self.backend.parameters(change.parameters)
+        values = change.parameters.items()
+        wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
+        if change.state is not None:
+            got = change.state.copy()
+            self.backend.read(got)
+            if not _close(change.state.settable(), got.settable()):
+                wrong.append("the state")
+        if wrong:
+            problem = f"the engine did not take over {', '.join(wrong)}"
+            raise EngineFailure(problem, self.backend.name)
+
+    def _adopt(
         self,
-        declaration: Declaration,
+        compiled: CompiledTask,
         model: SCM,
         static: Values,
         index: int,
@@ -304,96 +447,94 @@ class World(Stepped):
         """Take over what an intervention decided; the engine has taken over its part.
 
         Args:
-            declaration: Of the structure that there is now.
+            compiled: The task in the structure that there is now.
             model: With the interventions that hold.
             static: Values of everything that physics does not move.
             index: The control step.
             state: Where everything is; what the engine reports if None.
         """
-        earlier, action = dict(self._before), self._action
-        changed = declaration is not self.declaration
-        if changed:
-            self._enter(declaration)
-            if self._action.shape == action.shape:
-                self._action[:] = action
-        row, where = self._matrix[0], declaration.mechanisms.where
-        if static is not self._static:
-            for name, value in static.items():
-                if value is not self._static.get(name):
-                    row[where[name]] = np.ravel(value)
-            self._now.update(static)
-        self._held, self._static = model, static
-        held = model.interventions
-        self._held_actions = tuple(name for name in declaration.actions if name in held)
-        self._inputs = policy_inputs(model, self._held_actions)
-        commands = declaration.composition.commands
-        self._translates = commands is not None and commands.applies(static)
-        self.structure = declaration.structure(static)
-        timestep = declaration.composition.timestep(static)
+        last = self._values
+        if compiled is not last.compiled:
+            self._values = PresentValues(compiled)
+            if self._values.action.shape == last.action.shape:
+                self._values.action[:] = last.action
+        values = self._values
+        values.take(static)
+        self._adopt_model(model)
+        commands = compiled.composition.commands
+        self.translates = commands is not None and commands.applies(static)
+        self.structure = compiled.structure(static)
+        timestep = compiled.composition.timestep(static)
         self._substeps = max(1, round(self.control_period / timestep))
         self.version += 1
         if state is None:
-            self.backend.read(self._state)
+            self.backend.read(values.state)
         else:
-            self._state.vector[:] = state.vector
-        self._be_at(index)
-        if changed:
+            values.state.vector[:] = state.vector
+        self._index = index
+        values.be_at(index)
+        if values is not last:
             self._forget()
-            for name in earlier.keys() & self._before.keys():
-                self._before[name][...] = earlier[name]
+            for name in last.before.keys() & values.before.keys():
+                values.before[name][...] = last.before[name]
 
-    def _enter(self, declaration: Declaration) -> None:
-        """Make room for the values of a structure; actions are those of the last step."""
-        self.declaration = declaration
-        self._static = {}
-        self._occupy(declaration.mechanisms.start[None].copy())
+    def _adopt_model(self, model: SCM) -> None:
+        self._held, held = model, model.interventions
+        self._held_actions = tuple(name for name in self.compiled.actions if name in held)
+        acts = (held[name] for name in self._held_actions)
+        self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
 
-    def move(self, matrix: Floats) -> None:
-        """Keep the present in another matrix from now on, shape (1, width)."""
-        matrix[...] = self._matrix
-        self._occupy(matrix)
+    def _forget(self) -> None:
+        """Let the present stand in for the step before, where there is none."""
+        self._values.compute(())
+        self._values.remember()
 
-    def _occupy(self, matrix: Floats) -> None:
-        """Look at the values in a matrix from now on, by views."""
-        self._matrix = matrix
-        row, mechanisms = matrix[0], self.declaration.mechanisms
-        self._state = self.declaration.empty_state(row[: mechanisms.state_size])
-        self._action, self._clock = row[mechanisms.actions], row[mechanisms.where[CONTROL_INDEX]]
-        self._now: dict[str, Value] = {n: mechanisms.view(row, n) for n in mechanisms.where}
-        counted = {n: (self._now[n].astype(np.int64), self._now[n]) for n in mechanisms.whole}
-        self._counted = tuple(counted.values())
-        self._now |= {name: whole for name, (whole, _) in counted.items()} | dict(self._static)
-        self._before = {n: mechanisms.view(row, n, earlier=True) for n in mechanisms.earlier}
+    # --- looking at it ------------------------------------------------------------------------
 
     @property
     def numbers(self) -> Floats:
         """The present as one row of numbers, shape (1, width); see ``Mechanisms.where``."""
-        return self._matrix
+        return self._values.matrix
 
     @property
     def vector(self) -> Floats:
         """The live state, flat, shape (size,)."""
-        return self._state.vector
+        return self._values.state.vector
+
+    def move(self, matrix: Floats) -> None:
+        """Keep the present in another matrix from now on, shape (1, width)."""
+        self._values.move(matrix)
 
     def current(self) -> tuple[Values, State]:
-        """Give the live values and the live state, for the parts of a ``do``."""
-        return self._now, self._state
+        """Return the live values and the live state; both change with the next step."""
+        return self._values.now, self._values.state
 
     def snapshot(self) -> WorldSnapshot:
         """Save everything that decides how the world goes on. It can be pickled."""
         self._require_episode()
+        base = self._base
+        saved = base and WorldSnapshot(
+            engine=None,
+            static=dict(base.static),
+            interventions=base.model.interventions,
+            index=base.index,
+            plan=base.compiled.plan,
+            vector=base.state.vector.copy(),
+            pending=dict(base.pending),
+            at_start=base.at_start,
+        )
         return WorldSnapshot(
             engine=self.backend.snapshot(),
-            static=self._static,
+            static=self._values.static,
             interventions=self._held.interventions,
             previous=self.previous(),
-            action=np.array(self._action),
+            action=np.array(self._values.action),
             index=self._index,
             seed=self.noise.seed,
             episode=self.episode,
             world=self.identity,
-            instant=None if self._instant is None else SavedInstant.of(self._instant),
-            plan=self.declaration.plan,
+            plan=self.compiled.plan,
+            base=saved,
         )
 
     def restore(self, snapshot: WorldSnapshot) -> None:
@@ -411,14 +552,25 @@ class World(Stepped):
         self.backend.restore(snapshot.unpacked(self.structure))
         self._lost = ""
         self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
-        declaration = self.family.declaration(snapshot.plan)
-        held = declaration.model.with_interventions(snapshot.interventions)
-        self.adopt(declaration, held, snapshot.static, snapshot.index)
-        self._action[:] = snapshot.action
+        compiled = self.structures.compiled(snapshot.plan)
+        held = compiled.model.with_interventions(snapshot.interventions)
+        self._adopt(compiled, held, snapshot.static, snapshot.index)
+        self._values.action[:] = snapshot.action
         for name, value in snapshot.previous.items():
-            self._before[name][...] = value
-        saved = snapshot.instant
-        self._instant = None if saved is None else saved.instant(self.family)
+            self._values.before[name][...] = value
+        self._base = None
+        if snapshot.base is not None:
+            base = snapshot.base
+            compiled = self.structures.compiled(base.plan)
+            self._base = StepBase(
+                compiled,
+                compiled.model.with_interventions(base.interventions),
+                base.static,
+                compiled.empty_state(base.vector.copy()),
+                base.index,
+                dict(base.pending),
+                base.at_start,
+            )
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
@@ -428,3 +580,34 @@ class World(Stepped):
     def _require_episode(self) -> None:
         if not self._started:
             raise NotReset
+
+    def _require_state(self) -> None:
+        """Refuse to go on from a state that the engine has lost.
+
+        Raises:
+            EngineFailure: It has; a reset or a snapshot goes on.
+            NotReset: There is no episode yet.
+        """
+        self._require_episode()
+        if self._lost:
+            advice = "reset the world, or restore a snapshot"
+            raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
+
+
+def _close(given: Floats, reported: Floats) -> bool:
+    if same(given, reported):
+        return True
+    return bool(np.all(np.abs(given - reported) <= READ_BACK * np.maximum(1.0, np.abs(given))))
+
+
+def _as_backend(backend: Any) -> Backend:
+    """Return a backend, or make the one of a name.
+
+    Raises:
+        UnknownOption: There is none of this name, or it is neither.
+    """
+    if isinstance(backend, Backend):
+        return backend
+    if isinstance(backend, str):
+        return make_backend(backend)
+    raise UnknownOption("backend", backend, (*backends(), "a backend that is made"))

@@ -82,22 +82,22 @@ def test_resample_draws_from_the_space_that_is_named() -> None:
 def test_resample_knows_patterns_groups_and_exceptions() -> None:
     """Patterns and groups name variables; ``besides`` takes some out."""
     world = World("pushing", backend="fake")
-    found = resample(["*.mass", FRICTION], besides="robot_*").targets(world.declaration)
+    found = resample(["*.mass", FRICTION], besides="robot_*").targets(world.compiled)
     assert found == {MASS: "A", FRICTION: "A"}
-    assert MASS in physics().targets(world.declaration)
-    assert set(joints().targets(world.declaration)) == {"joint_positions"}
-    assert set(poses().targets(world.declaration)) == {
+    assert MASS in physics().targets(world.compiled)
+    assert set(joints().targets(world.compiled)) == {"joint_positions"}
+    assert set(poses().targets(world.compiled)) == {
         "tool_block.cylindrical_position",
         "tool_block.euler_orientation",
     }
-    assert "tool_block.color" in looks().targets(world.declaration)
+    assert "tool_block.color" in looks().targets(world.compiled)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_groups_fit_every_task(task: str) -> None:
     """No group is refused anywhere; what is a look is no physics, and everything has all."""
     world = World(task, backend="fake")
-    found = {group: set(matching(world.declaration, [f"@{group}"])) for group in GROUPS}
+    found = {group: set(matching(world.compiled, [f"@{group}"])) for group in GROUPS}
     assert not found["looks"] & found["physics"]
     assert not (found["looks"] | found["poses"]) - found["everything"]
     for group in GROUPS:

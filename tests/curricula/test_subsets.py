@@ -123,7 +123,7 @@ def test_draws_follow_the_regions_of_a_part_of_the_space() -> None:
     training = A["tool_block.*"] * B["*.mass"] * Subset({FRICTION: Box(0.5, 0.51)})
     part = everything(training, besides="joint_positions")
     world = World("pushing", backend="fake")
-    found = part.targets(world.declaration)
+    found = part.targets(world.compiled)
     assert "gravity" not in found
     env = under(Curriculum(part, space=training))
     for seed in range(5):

@@ -287,7 +287,7 @@ def test_the_range_is_that_of_the_observations(world: World) -> None:
     """A sensor has the same strength here as in the environment."""
     from scm_world.discovery.data.sensors import half_range
 
-    vector = observer(world, world.declaration, Observing(normalize=False), None)  # type: ignore[arg-type]
+    vector = observer(world, world.compiled, Observing(normalize=False), None)  # type: ignore[arg-type]
     for name, place in vector.layouts["observation"].items():
         if world.model.declared(name).role in ("state", "readout"):
             np.testing.assert_array_equal(

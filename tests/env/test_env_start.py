@@ -14,7 +14,7 @@ from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.world import World
-from scm_world.world.requests import merged
+from scm_world.world.plan import merged
 
 
 def test_start_is_applied_at_every_reset() -> None:
@@ -44,7 +44,7 @@ def test_what_is_done_at_a_reset_counts_more_than_the_start() -> None:
 
 def test_names_of_one_quantity_replace_each_other() -> None:
     """Of two coordinates of one pose the later one counts."""
-    declaration = World("pushing", backend="fake").declaration
+    declaration = World("pushing", backend="fake").compiled
     polar, cartesian = "tool_block.cylindrical_position", "tool_block.cartesian_position"
     found = merged(declaration, {polar: "A", "gravity": 1.0}, {cartesian: 2.0}, {"unheard_of": 3})
     assert found == {"gravity": 1.0, cartesian: 2.0, "unheard_of": 3}
@@ -91,7 +91,7 @@ def test_impossible_draws_are_followed_by_another_episode_if_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With attempts an impossible draw is followed by the next episode; without it is an error."""
-    monkeypatch.setattr("scm_world.world.commit.ATTEMPTS", 1)
+    monkeypatch.setattr("scm_world.world.feasibility.ATTEMPTS", 1)
     start = {"tool_block.cylindrical_position": "B"}
     once, often = make(start=start), make(start=start, attempts=20)
     episodes = []

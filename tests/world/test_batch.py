@@ -25,7 +25,7 @@ NAMES = ("reward", "success", "fractional_success", "end_effector_positions")
 def worlds(task: Any = "pushing", count: int = COUNT, **options: Any) -> list[World]:
     """Make worlds that share what is declared, each at the beginning of another episode."""
     first = World(task, **options)
-    found = [first, *(World(first.family, **options) for _ in range(count - 1))]
+    found = [first, *(World(first.structures, **options) for _ in range(count - 1))]
     for seed, world in enumerate(found):
         world.reset(seed=seed)
     return found
@@ -139,7 +139,7 @@ def test_bodies_come_and_go() -> None:
         if step == 2:
             alone[1].do(request)
             batch.world(1).do(request)
-            assert many[1].declaration is not many[0].declaration
+            assert many[1].compiled is not many[0].compiled
         for index, world in enumerate(alone):
             world.advance(asked[index].copy())
         batch.advance(asked)
@@ -204,8 +204,8 @@ def test_a_world_without_episode() -> None:
 
 def test_a_family_of_other_options() -> None:
     """A world cannot share what is declared for other options."""
-    family = World("pushing", backend="fake").family
-    with pytest.raises(UnknownOption, match="family"):
+    family = World("pushing", backend="fake").structures
+    with pytest.raises(UnknownOption, match="structures"):
         World(family, backend="fake", frame_skip=3)
 
 

@@ -20,7 +20,7 @@ COUNT = 3
 
 def _worlds() -> list[World]:
     first = World("pushing")
-    found = [first, *(World(first.family) for _ in range(COUNT - 1))]
+    found = [first, *(World(first.structures) for _ in range(COUNT - 1))]
     for seed, world in enumerate(found):
         world.reset(seed=seed)
     return found

@@ -113,7 +113,7 @@ def _nothing() -> float:
 
 def _worlds(terms: Terms) -> list[World]:
     first = World(Pushing(terms=terms(), weights={ONE: 1.0, OTHER: 1.0}))
-    found = [first, *(World(first.family) for _ in range(COUNT - 1))]
+    found = [first, *(World(first.structures) for _ in range(COUNT - 1))]
     for seed, world in enumerate(found):
         world.reset(seed=seed, do=FLOWN if seed else None)
     return found

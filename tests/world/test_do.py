@@ -32,8 +32,7 @@ from scm_world.errors import (
 )
 from scm_world.models import diff
 from scm_world.variables import Draw, Normal, Scale, Shift
-from scm_world.world.commit import difference
-from scm_world.world.proposal import propose
+from scm_world.world.plan import plan_intervention
 
 NAN = float("nan")
 HUGE = 1e308
@@ -225,9 +224,10 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
     for name in settable(shared(backend, task)):
         world = begin(backend, task)
         request = {name: other(world, name)}
-        proposal = propose(world, world._present(), request, None)
-        told = difference(world, proposal)
-        then = proposal.declaration.describe(proposal.static, proposal.state)
+        key = world.moment(world.index)
+        plan = plan_intervention(world.structures, world._step_base(), request, None, key)
+        told = world._present().difference(plan)
+        then = plan.compiled.describe(plan.static, plan.state)
         expected = diff(world.scene(), then)
         assert told.parameters.keys() == expected.parameters.keys()
         assert all(np.array_equal(told.parameters[k], v) for k, v in expected.parameters.items())

@@ -24,7 +24,7 @@ def test_a_control_step_evaluates_compiled_functions_only(task: str) -> None:
     """What an environment needs in every step is a kernel, or the weighted sum."""
     env = ScmWorldEnv(task, backend="fake")
     env.reset(seed=0)
-    for name in env.world.declaration.mechanisms.needed(env._needed):
+    for name in env.world.compiled.mechanisms.needed(env._needed):
         mechanism = env.world.model.declared(name).mechanism
         function = mechanism.bind()
         function = function.func if isinstance(function, partial) else function
@@ -39,7 +39,7 @@ def test_every_readout_is_that_of_the_model() -> None:
     for step in range(3):
         world.step(world.action_high * step / 3)
         world.do({"goal_tower.polar": [0.02 * step, 0.3], "tool_block_1.mass": 0.02 + 0.01 * step})
-        now, order = world.values(), world.declaration.computed
+        now, order = world.values(), world.compiled.computed
         known = {name: value for name, value in now.items() if name not in order}
         solved = world.model.solve(known, previous=world.previous(), only=order)
         for name in order:

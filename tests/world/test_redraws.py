@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 
 from scm_world import Draw, Mechanism, Shift, World
 from scm_world.variables import Box, Function
-from scm_world.world import commit
-from scm_world.world.proposal import Proposal, propose
+from scm_world.world import feasibility
+from scm_world.world.plan import InterventionPlan, plan_intervention
 
 
 def mean(color: Any) -> float:
@@ -48,20 +49,21 @@ def test_another_attempt_is_the_same_with_and_without_the_one_before(
     world = World(task, backend="fake")
     world.reset(seed=1)
     world.do({"light_intensity": 0.4} if "light_intensity" in world.model else {})
-    instant = world._instant or world._present()
-    last: Proposal | None = None
+    base = world._base or world._step_base()
+    last: InterventionPlan | None = None
     seen = set()
     for attempt in range(6):
-        fresh = propose(world, instant, request_, None, attempt=attempt, kept=kept)
-        again = propose(world, instant, request_, None, attempt=attempt, kept=kept, last=last)
-        assert fresh.declaration is again.declaration
+        key = replace(world.moment(base.index), attempt=attempt, kept=kept)
+        fresh = plan_intervention(world.structures, base, request_, None, key)
+        again = plan_intervention(world.structures, base, request_, None, key, last)
+        assert fresh.compiled is again.compiled
         assert fresh.static.keys() == again.static.keys()
         for name, value in fresh.static.items():
             np.testing.assert_array_equal(again.static[name], value, err_msg=name)
         np.testing.assert_array_equal(fresh.state.vector, again.state.vector)
-        assert (fresh.requests, fresh.asked) == (again.requests, again.asked)
+        assert (fresh.pending, fresh.asked) == (again.pending, again.asked)
         assert fresh.model == again.model
-        seen.add(str(fresh.requests))
+        seen.add(str(fresh.pending))
         last = again
     assert len(seen) > 1 or task == "towers"
 
@@ -79,12 +81,12 @@ def test_a_crowded_draw_is_made_with_few_computations(monkeypatch: pytest.Monkey
         computed.append(name)
         return evaluate(model, name, *rest)
 
-    def noted(*given: Any, **options: Any) -> Proposal:
-        attempts.append(options["attempt"])
-        return propose(*given, **options)
+    def noted(*given: Any) -> InterventionPlan:
+        attempts.append(given[4].attempt)
+        return plan_intervention(*given)
 
     monkeypatch.setattr(type(world.model), "evaluate", counted)
-    monkeypatch.setattr(commit, "propose", noted)
+    monkeypatch.setattr(feasibility, "plan_intervention", noted)
     world.do({"joint_positions": Draw("A"), **{name: Draw("A") for name in masses}})
     assert len(attempts) > 5
     assert [computed.count(name) for name in masses] == [1] * len(masses)

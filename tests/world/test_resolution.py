@@ -128,10 +128,10 @@ def test_the_default_has_the_variables_that_it_always_had() -> None:
     """Worlds, snapshots and copies are those of before where no resolution is asked for."""
     world = World("pushing", backend="fake")
     assert world.resolution == "vector"
-    assert not world.declaration.bundles
+    assert not world.compiled.bundles
     for resolution in FINER:
         finer = World("pushing", backend="fake", resolution=resolution)
-        assert [n for n in finer.model if n not in finer.declaration.parts] == list(world.model)
+        assert [n for n in finer.model if n not in finer.compiled.parts] == list(world.model)
     assert len(world.identity) == 6
     assert copy.copy(world).resolution == "vector"
     with pytest.raises(UnknownOption, match="finger"):
@@ -277,8 +277,8 @@ def test_worlds_that_are_stepped_together(resolution: str) -> None:
     """A batch does what single worlds do, and its tables know the names of the whole robot."""
     names = ("reward", *NAMES, "finger_60.end_effector_position")
     first = World("picking", resolution=resolution)
-    many = [first, *(World(first.family, resolution=resolution) for _ in range(2))]
-    alone = [World(first.family, resolution=resolution) for _ in range(3)]
+    many = [first, *(World(first.structures, resolution=resolution) for _ in range(2))]
+    alone = [World(first.structures, resolution=resolution) for _ in range(3)]
     for seed, (one, other) in enumerate(zip(many, alone, strict=True)):
         for world in (one, other):
             world.reset(seed=seed, do={"action": Draw(Box(-0.5, 0.5))} if seed == 1 else None)
@@ -386,9 +386,9 @@ def test_curricula_mean_the_same_variables(resolution: str) -> None:
     """Every group of variables has the same names, and what is drawn for them is the same."""
     coarse, fine = (World("pushing", resolution=r, backend="fake") for r in ("vector", resolution))
     for group in GROUPS:
-        found = [matching(world.declaration, [f"@{group}"]) for world in (coarse, fine)]
+        found = [matching(world.compiled, [f"@{group}"]) for world in (coarse, fine)]
         assert found[0] == found[1], group
-    names = [set(settable(world.declaration)) for world in (coarse, fine)]
+    names = [set(settable(world.compiled)) for world in (coarse, fine)]
     assert names[0] < names[1]
     assert "action" not in names[1]
 

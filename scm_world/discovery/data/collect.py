@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypedDict, Unpack, final
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.files import refusals, together
@@ -25,7 +26,6 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.work.executors import Executor, Serial, opened
 from scm_world.world import World
-from scm_world.world.start import whole_number
 
 ENOUGH = 20
 """After so many episodes it is told whether most of them are refused."""

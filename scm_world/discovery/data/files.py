@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Dataset, Regime
 from scm_world.discovery.data.folders import SHARD, Folder, Head, head_of, read_sidecar
 from scm_world.discovery.data.shards import check_kind, content_of
 from scm_world.discovery.data.sources import Part
 from scm_world.errors import ModelError, UnreadableFile
 from scm_world.output.locations import Location, located
-from scm_world.world.start import whole_number
 
 
 def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool = False) -> Dataset:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Column
 from scm_world.discovery.data.shards import Place, check_kind, check_names, decoded, encoded
 from scm_world.discovery.data.sources import FORMAT, Part
@@ -17,7 +18,6 @@ from scm_world.graph.structure import Edge
 from scm_world.output.durable import is_draft, locked, removed, write_durably
 from scm_world.output.locations import Location, located
 from scm_world.output.remote import PARTIAL, said
-from scm_world.world.start import whole_number
 
 SIDECAR = "dataset.json"
 SHARD = 100

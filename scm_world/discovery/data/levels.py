@@ -10,11 +10,11 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
-from scm_world.world.start import whole_number
 
 LEVELS = 5
 MOST = 100_000  # points: each has its own plan, and a row of the table

@@ -40,8 +40,8 @@ def default_causes(world: World) -> tuple[str, ...]:
         >>> "tool_block.mass" in found, "tool_block.color" in found, "floor_color" in found
         (True, True, False)
     """
-    colors = {f"{block}.color" for block in world.declaration.task.tools()}
-    structure = set(world.family.head)
+    colors = {f"{block}.color" for block in world.compiled.task.tools()}
+    structure = set(world.structures.head)
     return tuple(
         variable.name
         for variable in map(world.model.declared, world.model)
@@ -65,9 +65,9 @@ def default_outcomes(world: World, *, every_step: bool = False) -> tuple[Outcome
         every_step: Whether it is measured at every instant; then the joints are listed, too, since
             the robot is what moves the blocks.
     """
-    names = world.declaration.task.measured(every_step=every_step)
+    names = world.compiled.task.measured(every_step=every_step)
     if names is None:
-        names = (*world.declaration.slices, REWARD, SUCCESS)
+        names = (*world.compiled.slices, REWARD, SUCCESS)
     return tuple(Outcome(name) for name in names if name in world.model)
 
 
@@ -82,7 +82,7 @@ def settable(world: World, patterns: Iterable[str]) -> tuple[str, ...]:
         UnknownVariable: A pattern names nothing that can be set.
     """
     model = world.model
-    actions = world.declaration.commanded
+    actions = world.compiled.commanded
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
     for pattern in given:
@@ -223,7 +223,7 @@ class Instants:
     @property
     def watched(self) -> tuple[str, ...]:
         """Variables to write down on the way; the actions are always among them."""
-        return tuple(dict.fromkeys((*self.names, *self.world.declaration.actions)))
+        return tuple(dict.fromkeys((*self.names, *self.world.compiled.actions)))
 
     def targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
         """Name what is set in the row of a control step: a state is at the first one only."""
@@ -235,7 +235,7 @@ class Instants:
         parts = [
             # At an instant the world still has the action of the step before.
             np.asarray(episode[name], float)[1:]
-            if name in self.world.declaration.commanded
+            if name in self.world.compiled.commanded
             else sensors.instants(episode, name)[:-1]
             for name in self.watched
         ]

@@ -87,7 +87,7 @@ def half_range(world: World, name: str) -> Floats:
     if variable.role not in ("state", "readout") or variable.dtype != "real":
         return np.zeros(int(np.prod(variable.shape)))
     low, high = bounds(world.model, name)
-    observed = published(world, world.declaration).get(name)
+    observed = published(world, world.compiled).get(name)
     if observed is not None and observed.low is not None:
         low, high = spread(observed.low, variable.shape), spread(observed.high, variable.shape)
     return np.where((low > -WIDE) & (high < WIDE), (high - low) / 2.0, 0.0)

@@ -12,11 +12,11 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import load as load_library
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
 from scm_world.discovery.data.sources import Part
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.graph.exchange.libraries import load as load_library
 from scm_world.queries.plans import FORMAT as PLAN
 from scm_world.queries.plans import Plan
 

@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset
 from scm_world.discovery.data.designs import Design
@@ -24,7 +25,6 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.work.executors import Executor
 from scm_world.world import World
-from scm_world.world.start import whole_number
 
 
 def sweep(

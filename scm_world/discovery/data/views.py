@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
 from scm_world.discovery.data.shards import NUMBERS, TARGETS, check_names
 from scm_world.errors import ModelError
-from scm_world.graph.exchange.libraries import load
 
 KEY = "scm_world"
 

@@ -33,7 +33,7 @@ from scm_world.queries.rollouts import Unit
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import twins_of
 from scm_world.world import World
-from scm_world.world.requests import merged
+from scm_world.world.plan import merged
 
 
 @final
@@ -147,7 +147,7 @@ class Episodes:
     @property
     def _written(self) -> tuple[str, ...]:
         """Name what has to be written down on the way: the rest is kept anyway."""
-        kept = {*self._world.declaration.slices, *self._world.static_names}
+        kept = {*self._world.compiled.slices, *self._world.static_names}
         return tuple(name for name in self._rows.watched if name not in kept)
 
     def _table(self, lived: Sequence[tuple[int, Regime, Floats]]) -> Dataset:

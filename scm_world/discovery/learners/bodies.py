@@ -12,6 +12,7 @@ from typing import Any
 import networkx as nx
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.discovery.learners.found import Found
 from scm_world.errors import ModelError
@@ -20,7 +21,6 @@ from scm_world.queries.local_graphs import LocalEpisode, LocalGraph, local_graph
 from scm_world.queries.local_truth import Pair, movers, paired_truth
 from scm_world.queries.rollouts import Schedule, Trace, begin
 from scm_world.world import World as Simulated
-from scm_world.world.start import whole_number
 
 STEPS = 60  # control steps of an episode, if nothing else is said
 BUDGET = 1000  # control steps

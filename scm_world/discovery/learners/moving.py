@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools
 from scm_world.discovery.design import bounds, coloring, culprits, pooled
@@ -14,7 +15,6 @@ from scm_world.discovery.learners.found import Found
 from scm_world.discovery.learners.simulators import SMALL, MultiTargetSimulator, PairedSimulator
 from scm_world.errors import ModelError
 from scm_world.queries.experiments.effects import EdgeKey
-from scm_world.world.start import whole_number
 
 TOLERANCE = 1e-4  # of the answers: what a linear account may leave, since moves are small
 CONFIRMED = 6  # experiments in a row that have to come out as foretold; 3 err in 1 of 200 runs

@@ -29,7 +29,7 @@ from scm_world.errors import ModelError
 from scm_world.queries import Episode, Plan, World
 from scm_world.queries.local_truth import Pair
 from scm_world.variables import Draw, Hard, Null
-from scm_world.world.declaration import Declaration
+from scm_world.world.compiled_task import CompiledTask
 
 THRESHOLD = 1e-9  # [m], [rad], [m/s] or [rad/s]; over many steps contacts amplify rounding
 
@@ -183,9 +183,9 @@ def _differences(one: Episode, other: Episode) -> dict[str, _Apart]:
     return found
 
 
-def _declaration_at(episode: Episode, step: int) -> Declaration:
+def _declaration_at(episode: Episode, step: int) -> CompiledTask:
     declared = reversed(episode.trace.declarations)
-    found: Declaration = next(one for start, one in declared if start <= step)
+    found: CompiledTask = next(one for start, one in declared if start <= step)
     return found
 
 

@@ -38,7 +38,7 @@ class Commands:
         self.names = () if self._reads is None else (self._reads,)
         # Where the joints were put since the last command: it is relative to them.
         self._are_set = np.zeros(num_envs, dtype=np.bool_)
-        self._found = np.empty((num_envs, env.world.declaration.n_actions))
+        self._found = np.empty((num_envs, env.world.compiled.n_actions))
 
     def read(self, rows: Integers, actions: NDArray[Any], batch: Batch) -> Floats:
         """Give the commands of some environments.

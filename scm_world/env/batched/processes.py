@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world.env.batched.memory import Bell, Carver, meeting_place, share
 from scm_world.env.batched.sheet import Form
 from scm_world.env.batched.station import DONE, RESET, STEP, Desk, Station
@@ -21,7 +22,6 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.work.processes import PROCESS, Ended, Worker
 from scm_world.work.threads import cores
 from scm_world.world import Audit
-from scm_world.world.start import whole_number
 
 ANEW = "make the environments anew"
 

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from scm_world._arguments import whole_number
 from scm_world.env.batched.asking import (
     MASK,
     actions_of,
@@ -31,7 +32,6 @@ from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOpt
 from scm_world.tasks import Task
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
-from scm_world.world.start import whole_number
 
 Stepped = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 

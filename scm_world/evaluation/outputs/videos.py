@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import load
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import SnapshotMismatch, UnknownOption, UnwritableFolder
 from scm_world.evaluation.outputs.labels import metric_words, protocol_words
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.results import DRAWN, KEYS, Evaluation
 from scm_world.evaluation.setups import Setup
-from scm_world.graph.exchange.libraries import load
 from scm_world.models.camera import Camera
 from scm_world.output.durable import write_durably
 from scm_world.output.locations import Location, located

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, final
 
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.errors import MissingExtra, UnknownOption
+from scm_world._arguments import load
+from scm_world.errors import UnknownOption
 from scm_world.graph.exchange.model import CausalGraph, Node, causal_graph
 from scm_world.graph.exchange.networks import bare, from_digraph
 from scm_world.graph.exchange.registry import reading
@@ -20,23 +20,6 @@ from scm_world.graph.scm import SCM
 from scm_world.graph.structure import Edge
 
 RIGHT, LEFT, NONE = "-->", "<--", ""
-
-
-def load(module: str, library: str, extra: str = "") -> Any:
-    """Import a module of an optional library.
-
-    Args:
-        module: Its full name.
-        library: As it is called on the package index.
-        extra: The optional dependency of this package that brings it; named like it if empty.
-
-    Raises:
-        MissingExtra: It is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise MissingExtra(library, extra or library) from error
 
 
 def _acyclic(source: CausalGraph | SCM, view: View, library: str) -> CausalGraph:

@@ -60,9 +60,9 @@ class _Kept:
         self.values = world.values()
         now, state = world.current()
         self._vector = state.vector.copy()
-        self._slices = tuple(world.declaration.slices.items())
+        self._slices = tuple(world.compiled.slices.items())
         self._compared = (CONTROL_INDEX, *world.computed)  # the clock counts in place
-        moving = {*world.declaration.slices, *self._compared}
+        moving = {*world.compiled.slices, *self._compared}
         self._rest = {name: now[name] for name in world.model if name not in moving}
 
     def differing(self, world: World) -> list[str]:
@@ -120,9 +120,9 @@ class Paired:
             if causes is None or v.name in causes
         )
         self.actions = tuple(
-            name for name in world.declaration.actions if causes is None or name in causes
+            name for name in world.compiled.actions if causes is None or name in causes
         )
-        self._declaration = world.declaration
+        self._declaration = world.compiled
         self._computed = world.computed
         self._states = frozenset(
             v.name for v in model.variables if isinstance(v, Measured) and v.mechanism is None
@@ -217,7 +217,7 @@ class Paired:
         """
         deciding: tuple[str, ...] = ()
         self._hold(target, value, ())
-        if self._world.declaration is not self._declaration:
+        if self._world.compiled is not self._declaration:
             deciding = self._world.task.decided_by
             if target in deciding:
                 self._in_another_structure(target, value)
@@ -364,7 +364,7 @@ class Paired:
     def _vary_action(self, name: str) -> None:
         """Find the effects of another value of one action, within its range."""
         self._world.restore(self._probe.snapshot)
-        where = self._world.declaration.actions[name]
+        where = self._world.compiled.actions[name]
         low, high = self._world.action_low[where], self._world.action_high[where]
         unit = self._noise.uniforms(name, n=len(low), episode=self._number)[0]
         action = np.array(self._probe.action)

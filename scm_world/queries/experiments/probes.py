@@ -101,7 +101,7 @@ def _made(world: World, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
     action = scenario.act(world, extra, dice)
     snapshot = world.snapshot()
     if scenario.fresh:
-        snapshot = replace(snapshot, instant=None)
+        snapshot = replace(snapshot, base=None)
     world.step(action)
     if not np.isfinite(world.current()[1].vector).all():
         raise EngineFailure("the state is lost", world.backend.name)
@@ -164,7 +164,7 @@ def touching(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
 def _way(world: World, dice: Dice, steps: int) -> Iterator[Floats]:
     """Draw actions, each kept for a while."""
     kept = 1 + int(dice.between(0.0, KEPT))
-    shares = dice.of("probe way", steps * world.declaration.n_actions).reshape(steps, -1)
+    shares = dice.of("probe way", steps * world.compiled.n_actions).reshape(steps, -1)
     for step in range(steps):
         yield _within(world, shares[step // kept])
 
@@ -276,7 +276,7 @@ def _within(world: World, share: Floats) -> Floats:
 
 def _at_random(world: World, extra: None, dice: Dice) -> Floats:
     """Draw an action."""
-    return _within(world, dice.of("probe action", world.declaration.n_actions))
+    return _within(world, dice.of("probe action", world.compiled.n_actions))
 
 
 def _at_rest(world: World, extra: None, dice: Dice) -> Floats:

@@ -9,13 +9,13 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError
 from scm_world.queries.twins import Twins
 from scm_world.work.threads import cores
 from scm_world.world import World, WorldSnapshot
 from scm_world.world.batch import Batch
-from scm_world.world.start import whole_number
 
 STREAM = "what a planner expects"
 """The stream from which the noise of a model that does not foresee it is seeded."""
@@ -64,7 +64,7 @@ class Model:
         options = {**twins.options, "backend": backend or world.backend.name}
         options["variables_space"] = None  # what is believed may lie anywhere
         first = World(copy.copy(twins.task), **options)
-        self._copies = [first, *(World(first.family, **options) for _ in range(count - 1))]
+        self._copies = [first, *(World(first.structures, **options) for _ in range(count - 1))]
         self._is_foreign = first.engine != world.engine
         self._do, self._foresees = dict(do or {}), foresees
         self.names = tuple(dict.fromkeys(names))
@@ -119,7 +119,7 @@ class Model:
             ActionError: Actions have another shape.
             EngineFailure: The engine lost a state.
         """
-        size = self._copies[0].declaration.n_actions
+        size = self._copies[0].compiled.n_actions
         if actions.ndim != 3 or actions.shape[2] != size or len(actions) > len(self):
             allowed = f"(n, steps, {size}), with n up to {len(self)}"
             raise ActionError(f"actions have shape {allowed}, got {actions.shape}", actions)

@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
@@ -16,7 +17,6 @@ from scm_world.queries.planning.model import Model
 from scm_world.queries.planning.scores import Score, as_score, nearness
 from scm_world.queries.planning.search import Found, Search, search
 from scm_world.world import World
-from scm_world.world.start import whole_number
 
 
 @final
@@ -116,7 +116,7 @@ class _Program:
     """The plans for one world, episode after episode."""
 
     def __init__(self, policy: CrossEntropy, world: World) -> None:
-        self._policy, self._plan = policy, world.declaration.plan
+        self._policy, self._plan = policy, world.compiled.plan
         self._objective, self._terminal = policy.score(world)
         names = (*self._objective.names, *(self._terminal.names if self._terminal else ()))
         self._model = Model(
@@ -134,7 +134,7 @@ class _Program:
 
     def fits(self, world: World) -> bool:
         """Tell whether the same bodies are there."""
-        return bool(world.declaration.plan == self._plan)
+        return bool(world.compiled.plan == self._plan)
 
     def action(self, world: World) -> Floats:
         """Give the action of the present step."""
@@ -161,7 +161,7 @@ class _Program:
 
         def drawn(round_: int) -> Floats:
             stream = f"planning {seed}, round {round_}"
-            n, noise = world.declaration.n_actions, world.noise
+            n, noise = world.compiled.n_actions, world.noise
             return setting.noise(noise, stream, n, episode=world.episode, step=world.index)
 
         def evaluated(actions: Floats) -> Floats:

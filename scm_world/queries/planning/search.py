@@ -15,10 +15,10 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.variables import Noise, Normal
-from scm_world.world.start import whole_number
 
 KEPT = 0.3
 """Share of the elites that take part in the next round again."""

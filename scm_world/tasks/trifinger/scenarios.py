@@ -182,7 +182,7 @@ def obstacle_ahead(world: Any, dice: Dice) -> Setting:
     tips = present_tips(world).reshape(3, 3)
     places = np.array(world[PLACES])
     inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
-    each = bool(world.declaration.bundles)  # then it matters in front of which finger one comes
+    each = bool(world.compiled.bundles)  # then it matters in front of which finger one comes
     ahead = tips + inward * (TIP + dice.between(0.0056, 0.008 if each else 0.006))
     places[:3] = np.roll(ahead, int(dice.between(0.0, 3.0)), axis=0) if each else ahead
     return {PLACES: places}, (tips + 0.05 * inward).ravel()
@@ -245,7 +245,7 @@ def scenarios(world: Any) -> tuple[Scenario, ...]:
         found = ((on_coming_obstacle, 0), *found)
     if PLACES in world.model:
         found = (*found, (obstacle_ahead, 0))
-    if world.declaration.bundles and not made.blocks:  # else they act through blocks, too
+    if world.compiled.bundles and not made.blocks:  # else they act through blocks, too
         found = (*found, (fingers_together, None))
     return tuple(Scenario(prepare.__name__, prepare, driven, steps) for prepare, steps in found)
 

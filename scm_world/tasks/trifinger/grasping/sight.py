@@ -61,7 +61,7 @@ class Sight:
         """See what moves only when someone intervenes."""
         self.hand = Hand(self._values, world.control_period)
         self._solid = (*world.composition.blocks, *world.composition.obstacles)
-        task = world.declaration.task
+        task = world.compiled.task
         targets = task.targets()
         self.pairs = tuple(
             (tool, goal)

@@ -1,4 +1,4 @@
-"""What one can ask a world about its declaration."""
+"""What a world says about its task and its options."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scm_world.graph import SCM
 from scm_world.models import ParameterKey, Scene, State
 from scm_world.tasks import Conventions, Task
 from scm_world.tasks.composition import Composition
-from scm_world.world.declaration import Declaration, Options
-from scm_world.world.family import Family
+from scm_world.world.compiled_task import CompiledTask, Options
+from scm_world.world.structures import StructureCache
 
 
 def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:
@@ -22,18 +22,21 @@ def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) ->
     return world
 
 
-class Declared:
-    """The declaration of the present structure, and the options, under short names.
+class WorldAttributes:
+    """The task of a world and its options, under short names.
 
     Attributes:
         options: What the world was made with.
-        family: All structures of its task.
-        declaration: Of the present one.
+        structures: All structures of its task.
     """
 
     options: Options
-    family: Family
-    declaration: Declaration
+    structures: StructureCache
+
+    @property
+    def compiled(self) -> CompiledTask:
+        """The task in the structure that there is."""
+        return self.structures.natural(None)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle through a snapshot: another engine, the same future bit for bit."""
@@ -53,7 +56,7 @@ class Declared:
         }
         if self.resolution != self.task.resolutions[0]:  # logs and files of before have none
             options["resolution"] = self.resolution
-        return _copied, (type(self), self.family.task, options, snapshot)
+        return _copied, (type(self), self.structures.task, options, snapshot)
 
     @property
     def engine(self) -> str:
@@ -64,37 +67,37 @@ class Declared:
     @property
     def task(self) -> Task:
         """The task, with its present plan."""
-        return self.declaration.task
+        return self.compiled.task
 
     @property
     def model(self) -> SCM:
         """The causal model of the present structure, without interventions."""
-        return self.declaration.model
+        return self.compiled.model
 
     @property
     def composition(self) -> Composition:
         """The entities."""
-        return self.declaration.composition
+        return self.compiled.composition
 
     @property
     def slices(self) -> Mapping[str, slice]:
         """Where each state stands in the state vector."""
-        return self.declaration.slices
+        return self.compiled.slices
 
     @property
     def parameter_keys(self) -> Mapping[str, ParameterKey]:
         """Which physical parameter each variable sets."""
-        return self.declaration.parameter_keys
+        return self.compiled.parameter_keys
 
     @property
     def static_names(self) -> tuple[str, ...]:
         """Everything that interventions alone decide, causes before effects."""
-        return self.declaration.static_names
+        return self.compiled.static_names
 
     @property
     def computed(self) -> tuple[str, ...]:
         """Variables that are computed from what moves, causes before effects."""
-        return self.declaration.computed
+        return self.compiled.computed
 
     @property
     def conventions(self) -> Conventions:
@@ -129,17 +132,17 @@ class Declared:
     @property
     def max_episode_length(self) -> int:
         """Length of an episode in control steps."""
-        return self.family.steps
+        return self.structures.steps
 
     @property
     def action_low(self) -> Floats:
         """Lower end of all actions, shape (n_actions,)."""
-        return self.declaration.action_bounds[0]
+        return self.compiled.action_bounds[0]
 
     @property
     def action_high(self) -> Floats:
         """Upper end of all actions, shape (n_actions,)."""
-        return self.declaration.action_bounds[1]
+        return self.compiled.action_bounds[1]
 
     @property
     def identity(self) -> tuple[Any, ...]:
@@ -151,12 +154,12 @@ class Declared:
 
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""
-        return self.declaration.describe(values, state)
+        return self.compiled.describe(values, state)
 
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
         """Name some variables and what follows them at once, without physics, causes first."""
-        return self.declaration.static_order(targets)
+        return self.compiled.static_order(targets)
 
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""
-        return self.declaration.in_coordinates(name, *values)
+        return self.compiled.in_coordinates(name, *values)

@@ -1,24 +1,49 @@
-"""A compiled task: its variables, what they mean to an engine, and its options."""
+"""A task compiled for one structure: its variables and what they mean to a backend."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value, Values
-from scm_world.errors import UnknownOption
-from scm_world.graph import SCM
+from scm_world._arguments import whole_number
+from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
+from scm_world.geometry.clipping import clip_kernel
+from scm_world.graph import SCM, Moment
 from scm_world.models import ParameterKey, Scene, State, Structure
+from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Conventions, Task, Timing, conventions
-from scm_world.variables import Action, Derived, Exogenous, Measured
-from scm_world.world.absence import put_together
-from scm_world.world.mechanisms import Mechanisms
-from scm_world.world.start import whole_number
+from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
+from scm_world.variables.checks import check_bounds, coerce
+from scm_world.world.mechanisms import Mechanisms, wrong_value
+
+Plan = tuple[Hashable, frozenset[str]]
+"""A structure: which bodies the task asks for, and the names of those that were taken away."""
+
+PendingInterventions = dict[str, tuple[str, Intervention]]
+"""By target: the name that was asked for (the target, or coordinates of it), and what for."""
+
+
+def clipped(action: ArrayLike, low: Floats, high: Floats, unit: str) -> Floats:
+    """Return an action clipped to its range, shape (n,).
+
+    Raises:
+        ActionError: It is not n finite numbers.
+    """
+    try:
+        given = np.ascontiguousarray(action, dtype=np.float64)
+    except (TypeError, ValueError):  # text, or a ragged list
+        given = np.full(low.size + 1, np.nan)
+    command = np.empty(low.shape)
+    if given.shape != low.shape or not clip_kernel(given, low, high, command):
+        numbers = "a finite number" if low.size == 1 else f"{low.size} finite numbers"
+        raise ActionError(f"an action is {numbers} [{unit}], got {action!r}", action)
+    return command
 
 
 @final
@@ -83,7 +108,7 @@ class Options:
         return self.time_unit * self.frame_skip
 
 
-class Declaration:
+class CompiledTask:
     """Everything about a world that stays the same as long as its structure does.
 
     Args:
@@ -145,9 +170,9 @@ class Declaration:
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
 
     @property
-    def plan(self) -> Hashable:
-        """What stands in the world, and what was taken out of it."""
-        return put_together(self.task.plan, self.task.absent)
+    def plan(self) -> Plan:
+        """Which bodies the task asks for, and the names of those that were taken away."""
+        return self.task.plan, self.task.absent
 
     @cached_property
     def mechanisms(self) -> Mechanisms:
@@ -183,6 +208,14 @@ class Declaration:
         """Unit of the actions, if they have one in common."""
         units = {self.model.declared(name).unit for name in self.actions}
         return units.pop() if len(units) == 1 else "1"
+
+    def clipped(self, action: ArrayLike) -> Floats:
+        """Return an action clipped to its range, shape (n_actions,).
+
+        Raises:
+            ActionError: It is not as many finite numbers.
+        """
+        return clipped(action, *self.action_bounds, self.action_unit)
 
     def split(self, action: Floats) -> dict[str, Value]:
         """Give every action variable its part of a vector of all, as views."""
@@ -280,3 +313,108 @@ def _in_a_row(
         if whole and all(one.stop == other.start for one, other in pairwise(there)):
             found[name] = slice(there[0].start, there[-1].stop)
     return found
+
+
+@final
+@dataclass(frozen=True)
+class StepBase:
+    """A world as physics left it at a control step, before anyone intervened.
+
+    All interventions at one control step are computed from here, as one. So taking one back leaves
+    no trace, and their order does not matter.
+
+    Attributes:
+        compiled: The task in the structure that there is.
+        model: With the interventions of earlier steps.
+        static: Values of everything that physics does not move.
+        state: Where everything is.
+        index: The control step.
+        pending: The interventions at this step so far.
+        at_start: Whether an episode is just beginning.
+        fresh: States of bodies that come into being.
+    """
+
+    compiled: CompiledTask
+    model: SCM
+    static: Mapping[str, Value]
+    state: State
+    index: int
+    pending: PendingInterventions = field(default_factory=dict)
+    at_start: bool = False
+    fresh: frozenset[str] = frozenset()
+
+
+def beginning(compiled: CompiledTask, key: Moment | None) -> tuple[dict[str, Value], State]:
+    """Compute where an episode begins when nobody intervenes.
+
+    Args:
+        compiled: The task.
+        key: Where to draw what is random by declaration; its default if None.
+
+    Returns:
+        The values of everything that physics does not move, and the state of the rest.
+    """
+    static = compiled.model.solve(only=compiled.static_names, moment=key)
+    state = compiled.empty_state()
+    for variable in compiled.model.variables:
+        where = compiled.slices.get(variable.name)
+        if where is not None and isinstance(variable, Measured) and not variable.parts:
+            state.vector[where] = np.ravel(_first(compiled, variable, static))
+    return static, state
+
+
+def _first(compiled: CompiledTask, variable: Measured, static: Values) -> Value:
+    if variable.start is None:
+        return variable.array(variable.default)
+    known = {**static}
+    for name in variable.set_parents():
+        parent = compiled.model.declared(name)
+        if isinstance(parent, Measured):
+            known[name] = parent.array(parent.default)
+    parents = [known[name] for name in variable.set_parents()]
+    return np.asarray(variable.start.bind()(*parents))
+
+
+def refuse_impossible(compiled: CompiledTask) -> None:
+    """Refuse a world that cannot begin.
+
+    Raises:
+        ModelError: A default is out of bounds, or two bodies are in one place.
+    """
+    static, state = beginning(compiled, None)
+    values = {**static, **compiled.states(state)}
+    problems = []
+    for variable in compiled.model.variables:
+        if variable.name in values:
+            try:
+                coerce(variable, values[variable.name])
+                check_bounds(variable, values[variable.name], values)
+            except InterventionError as problem:
+                problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
+    found = compiled.composition.overlaps(compiled.describe(static, state), TOLERANCE)
+    problems += map(str, found)
+    if problems:
+        advice = f"choose other arguments of the task {compiled.task.name!r}"
+        raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
+
+
+def check_functions(compiled: CompiledTask, values: Values) -> None:
+    """Check what the functions of readouts give at the beginning.
+
+    Raises:
+        ModelError: One gives no finite numbers of the declared shape, or is out of bounds.
+    """
+    problems = []
+    for variable in compiled.model.variables:
+        given = isinstance(variable, Measured) and variable.mechanism is not None
+        if not given or variable.name in compiled.bundles:
+            continue
+        value = values[variable.name]
+        problem = wrong_value(variable, value)
+        if problem:
+            problems.append(f"the function of {variable.name!r} {problem}")
+        elif variable.bounds is not None and not variable.bounds.contains(value, values):
+            allowed = variable.bounds.describe(variable.shape, values)
+            problems.append(f"the function of {variable.name!r} gives {value!r}, not in {allowed}")
+    if problems:
+        raise ModelError(problems)

@@ -1,9 +1,9 @@
-"""A world on paper: what the values would be after an intervention."""
+"""What the values of a world would be after an intervention, computed without touching it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, final
+from collections.abc import Iterable, Mapping
+from typing import Any, final
 
 import numpy as np
 
@@ -21,75 +21,91 @@ from scm_world.variables import (
     Null,
     Rotations,
     Shift,
+    Variable,
     whole_of,
 )
-from scm_world.variables.checks import check_bounds, check_space
+from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.compare import same
-from scm_world.world.following import followed, refuse_continuous, what_follows
+from scm_world.world.compiled_task import PendingInterventions, StepBase
 
-if TYPE_CHECKING:
-    from scm_world.world.proposal import Accepted, Instant
 
-Requests = dict[str, tuple[str, Intervention]]
-"""By target: the name that was asked for (the target, or coordinates of it) and the act."""
+def same(a: Value, b: Value) -> bool:
+    """Tell whether two arrays of one shape hold the same numbers."""
+    return a is b or bool((a == b).all())
 
 
 @final
-class Draft:
-    """A world on paper.
+class Solver:
+    """Solves a causal model for the values and the state after an intervention.
 
     Args:
-        instant: From where.
-        accepted: What is asked for now.
-        requests: What has been asked for at this instant, for what there is.
-        moment: Where to draw.
-        earlier: Another attempt at the same, if there was one.
+        base: Where the intervention starts from.
+        asked: The names of the present request.
+        pending: All interventions at this control step, by target. What was asked of bodies that
+            are gone waits for them, should they come back at once.
+        key: Where to draw.
+        earlier: The solver of another attempt at the same request, if there was one.
+
+    Attributes:
+        static: Values of everything that physics does not move.
+        state: Where everything would be.
+        index: The control step.
+        model: With the interventions that would hold.
+        problems: What is wrong with the request.
     """
 
     def __init__(
         self,
-        instant: Instant,
-        accepted: Accepted,
-        requests: Requests,
-        moment: Moment,
-        earlier: Draft | None,
+        base: StepBase,
+        asked: tuple[str, ...],
+        pending: PendingInterventions,
+        key: Moment,
+        earlier: Solver | None = None,
     ) -> None:
-        self._world, self._requests = instant.declaration, requests
-        self.instant = instant
-        self.accepted = accepted
+        self.base, self.asked, self.pending = base, asked, pending
+        self._task, self._key = base.compiled, key
+        self._pending = {t: named for t, named in pending.items() if t in base.compiled.model}
         self._earlier = earlier
         self._fixed: dict[str, Hard] = {}
         self._order: tuple[str, ...] = ()
         self._unchanged: frozenset[str] | None = None
-        self.static: dict[str, Value] = dict(instant.static)
-        self.model = self.drawn = instant.model
-        self.state = instant.state
-        self.index = instant.index
-        self._moment = moment
-        self._problems: list[InterventionError] = []
+        self.static: dict[str, Value] = dict(base.static)
+        self.model = self.drawn = base.model
+        self.state = base.state
+        self.index = base.index
+        self.problems: list[InterventionError] = []
         self._whole: dict[str, Value] = {}  # what bundles are to be
 
     def _is_state(self, target: str) -> bool:
-        return self._world.model.declared(target).role == "state"
+        return self._task.model.declared(target).role == "state"
 
-    @property
-    def is_impossible(self) -> bool:
-        """Whether a parameter cannot have the value that it would get."""
-        return bool(self._problems)
+    def again(self, key: Moment) -> Solver:
+        """Return a solver of the same request at another draw."""
+        return Solver(self.base, self.asked, self.pending, key, self)
 
-    def solve_parameters(self) -> None:
+    def solve(self, space: AnyRegion | None, *, stops: bool) -> list[InterventionError]:
+        """Solve for the parameters, then for the states; return what is wrong.
+
+        Args:
+            space: Every target has to lie in, if any.
+            stops: Whether impossible parameters end it, since bodies may not go with them.
+        """
+        self._solve_parameters()
+        problems = [] if self.problems and stops else self._set_states()
+        return problems + self._check(space)
+
+    def _solve_parameters(self) -> None:
         """Mutilate the model and recompute the descendants of the targets."""
-        acts = {t: na for t, na in self._requests.items() if not self._is_state(t)}
+        acts = {t: na for t, na in self._pending.items() if not self._is_state(t)}
         if not acts:
             return
         targets = tuple(target for target in acts if target in self.static)
         draws = [t for t in targets if isinstance(acts[t][1], Draw)]
         if self._earlier is None:
-            refuse_continuous(acts, self.static, self._world.actions)
-            self.model = self.instant.model.with_interventions(dict(acts.values()))
-            self._order = tuple(what_follows(self._world, self.model, self.static, targets))
+            _refuse_moving(acts, self.static, self._task.actions)
+            self.model = self.base.model.with_interventions(dict(acts.values()))
+            self._order = tuple(self._following(targets))
             if any(self._follows_others(*acts[target]) for target in draws):
                 follow = frozenset(self._order)
                 self._order = tuple(n for n in self.model.structure.order if n in follow)
@@ -101,31 +117,41 @@ class Draft:
         for target in targets:
             del known[target]
         if draws:  # and states among them
-            known |= self._world.states(self.instant.state)
+            known |= self._task.states(self.base.state)
         self._solve(self._order, known)
         if draws:
             self._fixed = {target: self._as_drawn(target) for target in draws}
             self.model = self.model.with_interventions(self._fixed)
         self._earlier = None  # attempts are no chain
 
+    def _following(self, targets: tuple[str, ...]) -> tuple[str, ...]:
+        """Name what has to be computed anew, causes first; mechanisms may have added edges."""
+        held = self.model.interventions.items()
+        actions = self._task.actions
+        if not any(isinstance(act, Mechanism) and name not in actions for name, act in held):
+            return self._task.static_order(targets)
+        structure = self.model.structure
+        follow = {*targets, *structure.instant_descendants(targets)}
+        return tuple(n for n in structure.order if n in follow and n in self.static)
+
     def _follows_others(self, name: str, act: Intervention) -> bool:
         """Tell whether what a variable is drawn from depends on other variables."""
-        requested: Any = self._world.model.declared(whole_of(act, name))
+        requested: Any = self._task.model.declared(whole_of(act, name))
         source = act.source if isinstance(act, Draw) else None
         found = requested.space(source) if isinstance(source, str) else source
         return found is not None and bool(found.parents())
 
-    def _same_again(self, earlier: Draft) -> frozenset[str]:
+    def _same_again(self, earlier: Solver) -> frozenset[str]:
         """Name what does not follow from anything that is drawn anew."""
         if earlier._unchanged is not None:
             return earlier._unchanged
         anew = {
             target
-            for target, (name, act) in self._requests.items()
-            if isinstance(act, Draw) and whole_of(act, name) not in self._moment.kept
+            for target, (name, act) in self._pending.items()
+            if isinstance(act, Draw) and whole_of(act, name) not in self._key.kept
         }
         for name in self._order:
-            bounds = self._world.model.declared(name).bounds
+            bounds = self._task.model.declared(name).bounds
             is_bound = bounds is not None and bounds.parents()
             if is_bound or not anew.isdisjoint(earlier.drawn.structure.parents(name)):
                 anew.add(name)
@@ -148,52 +174,52 @@ class Draft:
             if earlier is not None and name in unchanged:
                 known[name] = self.static[name] = earlier.static[name]
                 continue
-            variable = self._world.model.declared(name)
+            variable = self._task.model.declared(name)
             if impossible and not impossible.isdisjoint(p.name for p in variable.all_parents):
                 impossible.add(name)
                 continue
-            known[name] = value = self.model.evaluate(name, known, self._moment)
+            known[name] = value = self.model.evaluate(name, known, self._key)
             if np.shape(value) != variable.shape:  # of a mechanism that a user gave
                 raise WrongShape(name, value, variable.shape, np.shape(value))
             follows = variable.bounds is not None and variable.bounds.parents()
             try:
                 check_bounds(variable, value, self._context() if follows else {})
             except InterventionError as problem:
-                self._problems.append(problem)
+                self.problems.append(problem)
                 impossible.add(name)
             else:
                 self.static[name] = value
 
     def _coordinates(self, name: str) -> Value:
         """Give the value that something has which was asked for, such as other coordinates."""
-        targets = self._world.model.targets(name)
+        targets = self._task.model.targets(name)
         values = [self._value(target) for target in targets]
         if targets == (name,):
             return np.asarray(values[0])
-        return self._world.in_coordinates(name, *values)
+        return self._task.in_coordinates(name, *values)
 
     def _value(self, target: str) -> Value:
         if target == CONTROL_INDEX:
             return np.asarray(self.index)
-        if target in self._world.slices:
-            return self._world.view(target, self.state)
+        if target in self._task.slices:
+            return self._task.view(target, self.state)
         return self.static[target]
 
-    def set_states(self) -> list[InterventionError]:
+    def _set_states(self) -> list[InterventionError]:
         """Set states, and carry along those whose parents were set.
 
         States that others follow come first; a shift or scale starts from where its state was
         carried to.
         """
-        self.state = self.instant.state.copy()
+        self.state = self.base.state.copy()
         problems: list[InterventionError] = []
-        followed = {variable.name for variable in self._world.carried}
-        acts = [t for t in self._requests if self._is_state(t)]
+        followed = {variable.name for variable in self._task.carried}
+        acts = [t for t in self._pending if self._is_state(t)]
         for target in sorted(acts, key=lambda name: name in followed):
             if target not in followed:
                 problems += self._set(target)
-        for variable in self._world.carried:
-            name, act = self._requests.get(variable.name, (None, None))
+        for variable in self._task.carried:
+            name, act = self._pending.get(variable.name, (None, None))
             if name is None or isinstance(act, SOFT):
                 self._carry(variable)
             if name is not None:
@@ -201,13 +227,13 @@ class Draft:
         return problems
 
     def _set(self, target: str) -> list[InterventionError]:
-        value = self._wish(target, *self._requests[target])
-        where = self._world.slices.get(target)
-        if where is not None and same(value, self._world.view(target, self.instant.state)):
+        value = self._wish(target, *self._pending[target])
+        where = self._task.slices.get(target)
+        if where is not None and same(value, self._task.view(target, self.base.state)):
             self.state.vector[where] = np.ravel(value)
             return []
         try:
-            check_bounds(self._world.model.declared(target), value, self.static)
+            check_bounds(self._task.model.declared(target), value, self.static)
         except InterventionError as problem:
             return [problem]
         if where is None:
@@ -218,13 +244,13 @@ class Draft:
 
     def _exact(self, target: str, value: Value) -> Value:
         """Make a quaternion one of norm 1; other values are as exact as they were given."""
-        bounds = self._world.model.declared(target).bounds
+        bounds = self._task.model.declared(target).bounds
         return bounds.nearest(value) if isinstance(bounds, Rotations) else value
 
     def _wish(self, target: str, name: str, act: Intervention) -> Value:
         """Give the value that a state is to have."""
         whole = whole_of(act, name)
-        requested: Any = self._world.model.declared(whole)
+        requested: Any = self._task.model.declared(whole)
         if whole == name:
             value = self._wanted(name, act)
             return np.asarray(value if name == target else requested.inverse.bind()(value))
@@ -236,18 +262,18 @@ class Draft:
 
     def _wanted(self, name: str, act: Intervention) -> Value:
         """Give the value that is asked of a state, of other coordinates or of a bundle."""
-        requested: Any = self._world.model.declared(name)
+        requested: Any = self._task.model.declared(name)
         if isinstance(act, Hard):
             value = requested.array(act.value)
         elif isinstance(act, Mechanism):
-            values = {**self.static, **self._world.states(self.instant.state)}
-            value = followed(requested, act, values)
+            values = {**self.static, **self._task.states(self.base.state)}
+            value = _followed(requested, act, values)
         elif isinstance(act, Natural | Null):
             value = self._coordinates(name)
         elif isinstance(act, Draw):
             source = requested.space(act.source) if isinstance(act.source, str) else act.source
-            values = {**self.static, **self._world.states(self.state)}
-            value = self._moment.draw(source, name, requested.shape, values, act.stream)
+            values = {**self.static, **self._task.states(self.state)}
+            value = self._key.draw(source, name, requested.shape, values, act.stream)
         else:
             present = self._coordinates(name)
             by = np.asarray(act.by)
@@ -258,15 +284,15 @@ class Draft:
         """Let a state follow the parents that act on it when set (a block that grows)."""
         parents = variable.set_parents()
         new = [self._value(parent) for parent in parents]
-        where = self._world.slices[variable.name]
-        if variable.name in self.instant.fresh:
+        where = self._task.slices[variable.name]
+        if variable.name in self.base.fresh:
             if variable.start is not None:
                 self.state.vector[where] = np.ravel(variable.start.bind()(*new))
             return
         old = [self._before(parent) for parent in parents]
         moved = {p for p, a, b in zip(parents, old, new, strict=True) if not same(a, b)}
         if moved:
-            again = self.instant.at_start or not moved.isdisjoint(variable.restart)
+            again = self.base.at_start or not moved.isdisjoint(variable.restart)
             self.state.vector[where] = np.ravel(self._moved(variable, old, new, again=again))
 
     def _moved(
@@ -274,24 +300,24 @@ class Draft:
     ) -> Value:
         if again and variable.start is not None:
             return np.asarray(variable.start.bind()(*new))
-        present = self._world.view(variable.name, self.instant.state)
+        present = self._task.view(variable.name, self.base.state)
         if variable.carry is None:
             return present
         return np.asarray(variable.carry.bind()(present, *old, *new))
 
     def _before(self, name: str) -> Value:
-        if name in self._world.slices:
-            return self._world.view(name, self.instant.state)
-        return self.instant.static[name]
+        if name in self._task.slices:
+            return self._task.view(name, self.base.state)
+        return self.base.static[name]
 
-    def check(self, space: AnyRegion | None) -> list[InterventionError]:
+    def _check(self, space: AnyRegion | None) -> list[InterventionError]:
         """Check bounds and the asked space, now that all other values are known."""
-        problems = self._problems
+        problems = self.problems
         if space is None or problems:
             return problems
         context = self._context()
-        for name in self.accepted.asked:
-            requested = self._world.model.declared(name)
+        for name in self.asked:
+            requested = self._task.model.declared(name)
             try:
                 value = self._held(name) if self._is_action(name) else self._coordinates(name)
                 check_space(requested, value, space, context)
@@ -302,8 +328,8 @@ class Draft:
     def as_asked(self, problems: list[InterventionError]) -> list[InterventionError]:
         """Say of a bundle, if that was asked for, what is wrong with its parts."""
         found = list(problems)
-        for name in self.accepted.asked:
-            bundle = self._world.model.declared(name)
+        for name in self.asked:
+            bundle = self._task.model.declared(name)
             wrong = {p.variable: p for p in found if isinstance(p, OutOfBounds | NotFinite)}
             if wrong.keys().isdisjoint(bundle.parts):
                 continue
@@ -311,21 +337,21 @@ class Draft:
                 np.asarray(wrong[p].value) if p in wrong else self._value(p) for p in bundle.parts
             ]
             try:
-                check_bounds(bundle, self._world.in_coordinates(name, *parts), self.static)
+                check_bounds(bundle, self._task.in_coordinates(name, *parts), self.static)
             except InterventionError as problem:
                 found = [p for p in found if p not in [wrong.get(part) for part in bundle.parts]]
                 found.append(problem)
         return found
 
     def _context(self) -> Values:
-        return {**self.static, **self._world.states(self.state)}
+        return {**self.static, **self._task.states(self.state)}
 
     def _is_action(self, name: str) -> bool:
-        return self._world.model.target(name) in self._world.actions
+        return self._task.model.target(name) in self._task.actions
 
     def _held(self, name: str) -> Value:
         """Give the action that is to be taken from now on."""
-        acts = [self.accepted.requests[target][1] for target in self._world.model.targets(name)]
+        acts = [self._pending[target][1] for target in self._task.model.targets(name)]
         if all(isinstance(act, Hard) for act in acts):
             values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
             return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
@@ -338,8 +364,54 @@ class Draft:
     def frozen(self, target: str, name: str, act: Intervention) -> tuple[str, Intervention]:
         """Replace a draw, or a change of a state, by the value that came out."""
         keeps = isinstance(act, (*SOFT, Mechanism, Natural)) and not self._is_state(target)
-        if isinstance(act, Hard) or target in self._world.actions or keeps:
+        if isinstance(act, Hard) or target in self._task.actions or keeps:
             return name, act
         if target in self._fixed:
             return target, self._fixed[target]
         return target, Hard(self._value(target).tolist())
+
+
+def _refuse_moving(
+    acts: Mapping[str, tuple[str, Intervention]],
+    static: Mapping[str, Value],
+    actions: Iterable[str],
+) -> None:
+    """Refuse parameters that should follow what moves: they change at interventions only.
+
+    Raises:
+        InterventionError: With the parents that move, or, of an action, those of earlier.
+    """
+    for target, (name, act) in acts.items():
+        if not isinstance(act, Mechanism):
+            continue
+        moving = [p.name for p in act.parents if p.lag or p.name not in static]
+        who, what = "a parameter", "parameters of the same instant"
+        if target in actions:
+            moving, who, what = [p.name for p in act.parents if p.lag], "an action", "the present"
+        if moving:
+            asked = whole_of(act, name)
+            raise InterventionError(
+                f"do({asked}): {who} can follow {what} only, not {', '.join(moving)}; let a plan "
+                "set it step by step instead",
+                variable=asked,
+                value=act,
+            )
+
+
+def _followed(requested: Variable, act: Mechanism, values: Values) -> Value:
+    """Compute the value that a state is set to.
+
+    Raises:
+        InterventionError: It should follow what is neither a parameter nor a state, or the
+            function gives something of another shape or type.
+    """
+    unknown = [p.name for p in act.parents if p.lag or p.name not in values]
+    if unknown:
+        raise InterventionError(
+            f"do({requested.name}): a state can be set to a function of parameters and states, "
+            f"not of {', '.join(unknown)}",
+            variable=requested.name,
+            value=act,
+        )
+    found: Any = act.function.bind()(*(np.array(values[p.name]) for p in act.parents))
+    return coerce(requested, found)

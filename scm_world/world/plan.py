@@ -1,0 +1,170 @@
+"""Interventions as plans: what is asked for, and what the world would be; nothing changes here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Value
+from scm_world.errors import (
+    ConflictingTargets,
+    InterventionError,
+    NotIntervenable,
+    OutOfBounds,
+    UnknownVariable,
+    raise_all,
+)
+from scm_world.graph import SCM, Moment
+from scm_world.models import State
+from scm_world.variables import Draw, Hard, Intervention, Natural, Null, divided
+from scm_world.variables.subsets import AnyRegion, as_region
+from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
+from scm_world.world.solver import Solver
+from scm_world.world.structures import StructureCache, restructured
+
+
+@final
+@dataclass(frozen=True)
+class InterventionPlan:
+    """What a world would be after an intervention.
+
+    Attributes:
+        compiled: The task in the structure that there would be.
+        model: With the interventions that would hold.
+        static: Values of everything that physics does not move.
+        state: Where everything would be.
+        index: The control step.
+        pending: The interventions at this control step, draws as values.
+        asked: The names that were asked for now.
+        solver: How it was computed, for another attempt.
+    """
+
+    compiled: CompiledTask
+    model: SCM
+    static: Mapping[str, Value]
+    state: State
+    index: int
+    pending: PendingInterventions
+    asked: tuple[str, ...] = ()
+    solver: Solver | None = None
+
+
+def plan_intervention(
+    structures: StructureCache,
+    base: StepBase,
+    request: Mapping[str, Any],
+    space: AnyRegion | None,
+    key: Moment,
+    last: InterventionPlan | None = None,
+) -> InterventionPlan:
+    """Compute what the world would be after an intervention.
+
+    Args:
+        structures: Of the task.
+        base: The world as physics left it.
+        request: The intervention, with dotted names.
+        space: Every target has to lie in, if any.
+        key: Where to draw.
+        last: An earlier attempt at the same. What is the same again is taken from there; nothing
+            comes out differently for that.
+
+    Raises:
+        InterventionError: With every problem of the request.
+        UnknownOption: There is no such space.
+    """
+    space = as_region("space", space)
+    draws = (name for name, act in request.items() if isinstance(act, Draw))
+    earlier = None if last is None else last.solver
+    if earlier is None or any(name in structures.head for name in draws):
+        base = restructured(structures, base, request, key)
+        accepted, asked, problems = _accepted(base, request)
+        solver = Solver(base, asked, {**base.pending, **accepted}, key)
+    else:  # another draw from the same spaces
+        solver, problems = earlier.again(key), []
+    base, model = solver.base, solver.base.compiled.model
+    with np.errstate(all="ignore"):  # what is not finite is refused by name
+        problems += solver.solve(space, stops=len(structures.head) > 0)
+    raise_all(solver.as_asked(problems) if problems else problems)
+    nulls = {name: (name, act) for name, act in request.items() if isinstance(act, Null)}
+    kept = {
+        target: solver.frozen(target, *named) if target in model else named
+        for target, named in {**solver.pending, **nulls}.items()
+    }
+    return InterventionPlan(
+        base.compiled,
+        solver.model,
+        solver.static,
+        solver.state,
+        solver.index,
+        kept,
+        solver.asked,
+        solver,
+    )
+
+
+def _accepted(
+    base: StepBase, request: Mapping[str, Any]
+) -> tuple[PendingInterventions, tuple[str, ...], list[InterventionError]]:
+    """Check names, types and shapes: what is right, under which names it was asked, problems.
+
+    What is asked of a bundle is asked of its parts.
+    """
+    compiled = base.compiled
+    model = compiled.model
+    accepted: PendingInterventions = {}
+    asked: dict[str, str] = {}
+    problems: list[InterventionError] = []
+    for name, value in request.items():
+        if isinstance(value, Null):  # of an entity, not of a variable; see ``restructured``
+            continue
+        if isinstance(value, Natural) and name in compiled.entity_names:
+            continue  # it is there
+        try:
+            act = _checked(base, name, value)
+            targets = model.targets(name)
+            twice = next((target for target in targets if target in asked), None)
+            if twice is not None:
+                raise ConflictingTargets((asked[twice], name), twice)
+            asked |= dict.fromkeys(targets, name)
+            for part, own in divided(model.declared(name), act).items():
+                accepted[model.target(part)] = (part, own)
+        except InterventionError as problem:
+            reason = compiled.task.refusal(name)
+            if reason is not None and isinstance(problem, UnknownVariable):
+                problem = NotIntervenable(name, reason)
+            problems.append(problem)
+    return accepted, tuple(dict.fromkeys(asked.values())), problems
+
+
+def _checked(base: StepBase, name: str, value: Any) -> Intervention:
+    compiled = base.compiled
+    try:
+        return compiled.model.accept(name, value)
+    except OutOfBounds as problem:
+        # What physics did is possible: a state can always be put back to where it is.
+        present = compiled.view(name, base.state) if name in compiled.slices else None
+        if present is not None and np.array_equal(problem.value, present):
+            return Hard(problem.value)
+        raise
+
+
+def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
+    """Combine interventions; the last one that sets a quantity counts.
+
+    Args:
+        model: Knows which names are coordinates of one quantity, and which are bundles.
+        requests: With dotted names.
+    """
+    found: dict[str, Any] = {}
+    for acts in requests:
+        mine = {target for name in acts for target in _targets(model, name)}
+        kept = {n: a for n, a in found.items() if not mine.issuperset(_targets(model, n))}
+        found = {**kept, **acts}
+    return found
+
+
+def _targets(model: SCM, name: str) -> tuple[str, ...]:
+    return model.targets(name) if name in model else (name,)

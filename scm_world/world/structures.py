@@ -1,0 +1,279 @@
+"""The structures of a task: which bodies there are, and the compiled task of each."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from os import PathLike
+from typing import Any, final
+
+import numpy as np
+from pydantic import ValidationError
+
+from scm_world._types import Values
+from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
+from scm_world.graph import SCM, Moment
+from scm_world.models import Model, State
+from scm_world.tasks import ModelTask, Task, make_task, tasks
+from scm_world.tasks.composition import Entity
+from scm_world.variables import Exogenous, Intervention, Measured, Null, Variable
+from scm_world.world.compiled_task import (
+    CompiledTask,
+    Options,
+    Plan,
+    StepBase,
+    refuse_impossible,
+)
+
+KEPT = 8
+"""Compiled tasks that are kept for structures that come again."""
+
+
+@final
+class StructureCache:
+    """Compile a task for each of its structures, once.
+
+    Args:
+        task: Of any structure.
+        options: Of the world.
+
+    Attributes:
+        task: Without a plan.
+        head: The model of what decides which entities there are, on its own.
+        steps: Length of an episode in control steps, by the structure without interventions.
+    """
+
+    def __init__(self, task: Task, options: Options) -> None:
+        self.options = options
+        self.task = task.at(None, options.conventions)
+        with _refused(self.task):
+            self.head = _head(self.task)
+        self._compiled: OrderedDict[Plan, CompiledTask] = OrderedDict()
+        first = self.task.at(self.plan(self.head.solve())[0], options.conventions)
+        seconds = first.seconds
+        whole = math.floor(seconds / options.control_period + 1e-9)
+        self.steps = options.given_length or max(whole, 1)
+        refuse_impossible(self.natural(None))
+
+    def plan(self, values: Values) -> Plan:
+        """Give the structure that values of the head decide."""
+        return self.task.arrange(values) if len(self.head) else None, frozenset()
+
+    def compiled(self, plan: Plan) -> CompiledTask:
+        """Give the task compiled for a structure."""
+        found = self._compiled.get(plan)
+        if found is None:
+            task = self.task.at(plan[0], self.options.conventions, plan[1])
+            with _refused(task):
+                found = self._compiled[plan] = CompiledTask(task, self.options, self.steps)
+            while len(self._compiled) > KEPT:
+                self._compiled.popitem(last=False)
+        self._compiled.move_to_end(plan)
+        return found
+
+    def natural(self, key: Moment | None) -> CompiledTask:
+        """Give the structure that an episode has when nobody intervenes."""
+        return self.compiled(self.plan(self.head.solve(moment=key)))
+
+    def after(
+        self, acts: dict[str, Intervention], held: SCM, static: Values, key: Moment
+    ) -> CompiledTask | None:
+        """Give the structure after an intervention; None where it has nothing to do with it.
+
+        Args:
+            acts: What is asked for now, by requested name.
+            held: The present model, with the interventions that hold.
+            static: Present values.
+            key: Where to draw.
+        """
+        mine = {name: act for name, act in acts.items() if name in self.head}
+        if not mine:
+            return None
+        kept = {name: act for name, act in held.interventions.items() if name in self.head}
+        model = self.head.with_interventions(kept).with_interventions(mine)
+        targets = {target for name in (*kept, *mine) for target in self.head.targets(name)}
+        known = {
+            v.name: static[v.name]
+            for v in self.head.variables
+            if v.kind == "exogenous" and v.name not in targets  # type: ignore[attr-defined]
+        }
+        values = model.solve(known, moment=key)
+        if not all(_possible(variable, values) for variable in self.head.variables):
+            return None  # the intervention will be refused, with the reason
+        return self.compiled(self.plan(values))
+
+
+def as_task(task: Any) -> Task:
+    """Take a task, or make the one of a name.
+
+    Raises:
+        UnknownOption: There is none of this name, or it is neither.
+    """
+    if isinstance(task, Task):
+        return task
+    if isinstance(task, str):
+        return make_task(task)
+    if isinstance(task, Model | PathLike) or type(task).__name__ in ("MjSpec", "MjModel"):
+        return ModelTask(task)
+    made = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
+    raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {made}"))
+
+
+def as_structures(task: Task | StructureCache | str, options: Options) -> StructureCache:
+    """Return the structures of a task, or those that are given.
+
+    Raises:
+        UnknownOption: There is no such task, or the structures are those of other options.
+    """
+    if not isinstance(task, StructureCache):
+        return StructureCache(as_task(task), options)
+    if task.options != options:
+        name = "options of a world with these structures"
+        raise UnknownOption(name, options, (str(task.options),))
+    return task
+
+
+@contextmanager
+def _refused(task: Task) -> Iterator[None]:
+    """Say of which task a variable cannot be declared."""
+    try:
+        yield
+    except ValidationError as error:
+        problems = [problem["msg"].removeprefix("Value error, ") for problem in error.errors()]
+        named = [f"a variable of the task {task.name!r}: {problem}" for problem in problems]
+        raise ModelError(named) from error
+
+
+def _possible(variable: Variable, values: Values) -> bool:
+    value = values[variable.name]
+    bounds = variable.bounds
+    return bool(np.isfinite(value).all()) and (bounds is None or bounds.contains(value, values))
+
+
+def _head(task: Task) -> SCM:
+    """Cut the model of what decides the structure out of what the task's entities share.
+
+    Raises:
+        ModelError: A deciding variable, or a cause of one, is not declared in ``shared``.
+    """
+    shared = {variable.name: variable for variable in task.shared()}
+    wanted = _with_causes(task.decided_by, shared)
+    missing = sorted(wanted - shared.keys())
+    if missing:
+        where = "decides what stands in the world: declare it in shared()"
+        raise ModelError([f"{name!r} {where}" for name in missing])
+    mine = (variable for name, variable in shared.items() if name in wanted)
+    return SCM(task.conventions.adapt(mine))
+
+
+def _with_causes(names: Iterable[str], declared: dict[str, Variable]) -> set[str]:
+    found: set[str] = set()
+    stack: list[Any] = list(names)
+    while stack:
+        name = stack.pop()
+        if name not in found:
+            found.add(name)
+            variable = declared.get(name)
+            stack.extend(p.name for p in (variable.all_parents if variable else ()))
+    return found
+
+
+def restructured(
+    structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: Moment
+) -> StepBase:
+    """Give a step base in the structure that a request asks for.
+
+    What exists before and after keeps its values, its state and the interventions on it; what is
+    new begins as at the start of an episode. Where the structure stays, so does the base.
+
+    Args:
+        structures: Of the task.
+        base: As physics left it.
+        request: With dotted names.
+        key: Where to draw.
+    """
+    present = base.compiled
+    gone = _taken_away(request, base.pending.values(), present.composition.entities)
+    compiled: CompiledTask | None = None
+    if len(structures.head):
+        acts = dict(base.pending.values())
+        for name, value in request.items():
+            if name in structures.head:
+                with suppress(InterventionError):  # what is wrong is reported later
+                    acts[name] = present.model.accept(name, value)
+        compiled = structures.after(acts, base.model, base.static, key)
+    absent = present.task.absent | gone
+    if absent:
+        compiled = structures.compiled(((compiled or present).task.plan, absent))
+    if compiled is None or compiled is present:
+        return base
+    kept = {n: act for n, act in base.model.interventions.items() if n in compiled.model}
+    model = compiled.model.with_interventions(kept)
+    held = {target for name in kept for target in model.targets(name)}
+    known = {
+        v.name: base.static[v.name]
+        for v in model.variables
+        if isinstance(v, Exogenous) and v.name in base.static and v.name not in held
+    }
+    solved = model.solve(known, moment=key, only=compiled.static_names)
+    return replace(
+        base,
+        compiled=compiled,
+        model=model,
+        static={name: solved[name] for name in compiled.static_names},
+        state=_state(base, compiled),
+        fresh=frozenset(compiled.slices.keys() - present.slices.keys()),
+    )
+
+
+def _state(base: StepBase, compiled: CompiledTask) -> State:
+    """Keep the states that both structures have; the others get their defaults."""
+    before, state = base.compiled.slices, compiled.empty_state()
+    for name, where in compiled.slices.items():
+        variable = compiled.model.declared(name)
+        if name in before:
+            state.vector[where] = base.state.vector[before[name]]
+        elif isinstance(variable, Measured) and variable.default is not None:
+            state.vector[where] = np.ravel(variable.array(variable.default))
+    return state
+
+
+def _taken_away(
+    request: Mapping[str, Any], requests: Iterable[Any], entities: Iterable[Entity]
+) -> frozenset[str]:
+    """Name what a request, and those of the same instant, take away.
+
+    Args:
+        request: What is asked for now, flat.
+        requests: What was asked for at this instant so far.
+        entities: That there are.
+
+    Raises:
+        InterventionError: It is no block, obstacle or goal.
+        UnknownVariable: There is nothing of this name.
+    """
+    asked = {name for name, act in request.items() if isinstance(act, Null)}
+    before = {name for name, act in requests if isinstance(act, Null)}
+    there = {entity.name: entity for entity in entities}
+    for name in sorted(asked - before):
+        entity = there.get(name)
+        if entity is None:
+            raise UnknownVariable(name, there)
+        if not (entity.is_block or entity.is_obstacle or _is_goal(entity)):
+            raise InterventionError(
+                f"do({name}): it cannot be taken away; blocks, obstacles and goals can: "
+                + ", ".join(
+                    n for n, e in there.items() if e.is_block or e.is_obstacle or _is_goal(e)
+                ),
+                variable=name,
+                value=Null(),
+            )
+    return frozenset(asked | before)
+
+
+def _is_goal(entity: Entity) -> bool:
+    """Tell whether an entity is a place where something should be."""
+    return type(entity).goal is not Entity.goal
