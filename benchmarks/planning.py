@@ -21,9 +21,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from scm_world.policies.planning import CrossEntropy
 from scm_world.queries import World
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.planning import CrossEntropy
 
 HERE = Path(__file__).parent
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

@@ -71,7 +71,7 @@ def clone(
     """
     from scm_world.cli.console import RESULTS, check_writable, console
     from scm_world.cli.questions import shown_episodes
-    from scm_world.queries.policies import NAMED
+    from scm_world.policies.scripted import NAMED
     from scm_world.training import imitation
 
     given = {

@@ -142,8 +142,8 @@ def _played(run: Run, folder: Any) -> int:
     from scm_world.cli.console import console, staged, written
     from scm_world.cli.questions import shown_episodes
     from scm_world.cli.tasks import build
+    from scm_world.policies.planning import CrossEntropy
     from scm_world.queries import World, save_episode
-    from scm_world.queries.planning import CrossEntropy
 
     policy = CrossEntropy(do=run.believed, **run.planner)
     world = World(build(run.task, run.arguments), backend=run.backend, preset=run.preset)

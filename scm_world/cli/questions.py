@@ -17,6 +17,7 @@ from scm_world.cli.console import RESULTS, check_writable, console, show, staged
 from scm_world.cli.tasks import build, suffix, system, tag
 from scm_world.errors import UnknownOption
 from scm_world.output.locations import Location
+from scm_world.policies.scripted import NAMED
 from scm_world.queries import (
     SCM,
     Difference,
@@ -27,7 +28,6 @@ from scm_world.queries import (
     compare,
     save_episode,
 )
-from scm_world.queries.policies import NAMED
 
 POLICIES = (*NAMED, "still")
 FORMAT = "scm_world/counterfactual/1"

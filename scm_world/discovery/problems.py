@@ -26,10 +26,10 @@ from scm_world.discovery.learners.simulators import (
 )
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json, to_json
+from scm_world.policies.scripted import as_policy
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.identification import nature_graph
 from scm_world.queries.outcomes import as_outcome
-from scm_world.queries.policies import as_policy
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.tasks import TASKS, TriFingerTask, make_task
 from scm_world.tasks.factories import load_factory

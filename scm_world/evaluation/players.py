@@ -22,10 +22,10 @@ from scm_world.env.given import action_scale
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.recording_files import Recorded, from_parquet
 from scm_world.policies import MlpPolicy, OnnxPolicy, PolicyAbout, file_of, load_policy, load_sb2
+from scm_world.policies.scripted import NAMED, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
-from scm_world.queries.policies import NAMED, Policy
 from scm_world.tasks.policies import Blind
 from scm_world.variables import Function
 from scm_world.world import World

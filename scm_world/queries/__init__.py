@@ -1,5 +1,6 @@
 """Questions to a world: what follows, what would have followed, and whether the graph is right."""
 
+from scm_world.policies.scripted import Random
 from scm_world.queries.agreement import Agreement
 from scm_world.queries.differences import ButFor, Difference, Divergence, but_for, compare
 from scm_world.queries.episode_files import load_episode, save_episode
@@ -15,7 +16,6 @@ from scm_world.queries.identification import (
 from scm_world.queries.laboratory import Laboratory, intervention_data
 from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
-from scm_world.queries.policies import Random
 from scm_world.queries.questions import SCM
 from scm_world.queries.samples import Samples, Setting
 from scm_world.queries.timed import At, Clamp, Contact, On, Reaches

@@ -14,10 +14,10 @@ import numpy as np
 
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_durably
+from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
-from scm_world.queries.policies import Sequence as Given
 from scm_world.queries.rollouts import Schedule, Trace, begin, run
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.tasks import ModelTask, Task, make_task, tasks

@@ -11,10 +11,10 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption, UnknownVariable
+from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.parallel import Ending, lived
 from scm_world.queries.plans import Plan
-from scm_world.queries.policies import Sequence as Given
 from scm_world.queries.rollouts import (
     ALL,
     EVERY,

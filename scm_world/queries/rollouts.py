@@ -11,9 +11,9 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value
 from scm_world.errors import ActionError, InterventionError
+from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.plans import Plan
-from scm_world.queries.policies import Policy, as_policy
 from scm_world.queries.timed import ACTS, At, Clamp, On
 from scm_world.variables import Hard, Intervention, Mechanism, Natural
 from scm_world.world import Audit, World

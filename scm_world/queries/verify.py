@@ -9,6 +9,7 @@ from typing import Any, final
 
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
+from scm_world.policies.scripted import Random
 from scm_world.queries.agreement import Agreement, Sign
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.models import PairedEquations
@@ -18,7 +19,6 @@ from scm_world.queries.experiments.series import Series, checked_count
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import local_report
 from scm_world.queries.local_truth import has_local_graphs
-from scm_world.queries.policies import Random
 from scm_world.queries.progress import Progress
 from scm_world.queries.signs import compare_signs
 from scm_world.queries.verification import Fired, LocalShare, Undeclared, Verification

@@ -26,8 +26,8 @@ from scm_world.evaluation.recording import Recording
 from scm_world.output.durable import locked, made, write_durably
 from scm_world.policies import NetworkPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
+from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.policies import NAMED
 from scm_world.queries.progress import Progress
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words

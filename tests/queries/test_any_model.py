@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scm_world.errors import ActionError, SnapshotMismatch, UnknownOption
+from scm_world.policies.planning import CrossEntropy
 from scm_world.queries import (
     At,
     Clamp,
@@ -25,7 +26,6 @@ from scm_world.queries import (
     save_episode,
 )
 from scm_world.queries.local import local_graph
-from scm_world.queries.planning import CrossEntropy
 from scm_world.variables import Box
 
 CART_POLE = """

@@ -10,8 +10,8 @@ import pytest
 
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.geometry import from_rotation_vector
+from scm_world.policies.scripted import as_policy
 from scm_world.queries import World
-from scm_world.queries.policies import as_policy
 from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Grasp, Pace

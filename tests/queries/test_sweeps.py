@@ -12,8 +12,8 @@ import pytest
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
+from scm_world.policies.scripted import NAMED, as_policy
 from scm_world.queries import World, nature_graph
-from scm_world.queries.policies import NAMED, as_policy
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.policies import Sweep

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world.discovery.data.dataset import Column, Dataset
 from scm_world.graph.structure import Edge
-from scm_world.queries.policies import Sequence as Given
+from scm_world.policies.scripted import Sequence as Given
 
 FORMAT = "scm_world/dataset/1"
 

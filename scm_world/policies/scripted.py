@@ -1,4 +1,4 @@
-"""Who acts in a rollout."""
+"""Policies without a network: random, given, idle, and those that have a name."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.queries.equations import Equations, System, action_range
-from scm_world.queries.planning import CrossEntropy
+from scm_world.policies.planning import CrossEntropy
 from scm_world.tasks import TASKS
-from scm_world.tasks.policies import Blind, kept_rows
+from scm_world.tasks.policies import Blind, action_range, kept_rows
+from scm_world.world import World
 
 Policy = Callable[[Any], Any]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
@@ -41,7 +41,7 @@ class Random(Blind):
         if not np.isfinite(self.share):
             raise UnknownOption("share", self.share, ("a finite number",))
 
-    def ahead(self, world: System, first: int, count: int) -> Floats:
+    def ahead(self, world: Any, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""
         n, noise, episode = world.compiled.n_actions, world.noise, world.episode
         drawn = np.empty((count, n))
@@ -76,7 +76,7 @@ class Sequence(Blind):
             raise ActionError("actions must be finite", actions)
         self.actions: Floats = given
 
-    def ahead(self, world: System, first: int, count: int) -> Floats:
+    def ahead(self, world: Any, first: int, count: int) -> Floats:
         """Give the actions of some control steps."""
         n = world.compiled.n_actions
         if self.actions.shape[1] != n:
@@ -96,7 +96,7 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 """Policies that have a name, those of the tasks of this package included."""
 
 
-def as_policy(given: Any, world: System | None = None) -> Policy:
+def as_policy(given: Any, world: Any = None) -> Policy:
     """Turn what a user gives into a policy for one rollout.
 
     Args:
@@ -112,8 +112,8 @@ def as_policy(given: Any, world: System | None = None) -> Policy:
     if given is None:
         return _Idle()
     if isinstance(given, str):
-        known = {"random": Random} if isinstance(world, Equations) else NAMED
-        if world is not None and not isinstance(world, Equations):
+        known = NAMED if world is None else {"random": Random}
+        if isinstance(world, World):
             known = {**ANY, **world.task.policies}
         if given in known:
             return known[given]()
@@ -127,11 +127,9 @@ class _Idle(Blind):
     def __init__(self) -> None:
         self._action: Floats | None = None
 
-    def ahead(self, world: System, first: int, count: int) -> Floats:
+    def ahead(self, world: Any, first: int, count: int) -> Floats:
         """Give the action of the first step, again and again."""
         if self._action is None:
-            if isinstance(world, Equations):
-                self._action = world.idle()
-            else:
-                self._action = world.task.idle(world)
+            idle = world.task.idle(world) if isinstance(world, World) else world.idle()
+            self._action = idle
         return np.tile(self._action, (count, 1))

@@ -15,10 +15,10 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.geometry import from_rotation_vector
+from scm_world.policies.planning import CrossEntropy, Model, Score, Search, nearness
+from scm_world.policies.planning.scores import as_score
+from scm_world.policies.scripted import NAMED
 from scm_world.queries import World
-from scm_world.queries.planning import CrossEntropy, Model, Score, Search, nearness
-from scm_world.queries.planning.scores import as_score
-from scm_world.queries.policies import NAMED
 from scm_world.tasks import Pushing, Reaching
 from scm_world.tasks.trifinger.building import corners
 from scm_world.variables import Noise

@@ -12,7 +12,6 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError
-from scm_world.queries.twins import Twins
 from scm_world.work.threads import cores
 from scm_world.world import World, WorldSnapshot
 from scm_world.world.batch import Batch
@@ -60,10 +59,10 @@ class Model:
         threads: int | None = None,
     ) -> None:
         count = whole_number("samples", n, least=1)
-        twins = Twins(world)
-        options = {**twins.options, "backend": backend or world.backend.name}
+        _, (_, task, given, _), *_ = world.__reduce__()
+        options = {**given, "backend": backend or world.backend.name}
         options["variables_space"] = None  # what is believed may lie anywhere
-        first = World(copy.copy(twins.task), **options)
+        first = World(copy.copy(task), **options)
         self._copies = [first, *(World(first.structures, **options) for _ in range(count - 1))]
         self._is_foreign = first.engine != world.engine
         self._do, self._foresees = dict(do or {}), foresees

@@ -12,10 +12,10 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
-from scm_world.queries.equations import action_range
-from scm_world.queries.planning.model import Model
-from scm_world.queries.planning.scores import Score, as_score, nearness
-from scm_world.queries.planning.search import Found, Search, search
+from scm_world.policies.planning.model import Model
+from scm_world.policies.planning.scores import Score, as_score, nearness
+from scm_world.policies.planning.search import Found, Search, search
+from scm_world.tasks.policies import action_range
 from scm_world.world import World
 
 

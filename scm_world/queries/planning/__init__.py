@@ -1,8 +1,0 @@
-"""Planning: a policy that tries actions out in copies of the world before it acts."""
-
-from scm_world.queries.planning.model import Model
-from scm_world.queries.planning.policy import CrossEntropy
-from scm_world.queries.planning.scores import Score, nearness
-from scm_world.queries.planning.search import Search
-
-__all__ = ["CrossEntropy", "Model", "Score", "Search", "nearness"]
