@@ -12,9 +12,9 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError
 from scm_world.curricula.situations import STREAM, Memory, Situation
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import flatten
-from scm_world.queries.plans import PACKAGE
 from scm_world.queries.timed import as_act
 from scm_world.variables import Draw, Function, Intervention
+from scm_world.variables.mechanisms import OWN_MECHANISMS
 from scm_world.variables.spaces import Frozen
 from scm_world.world.compiled_task import CompiledTask
 
@@ -234,7 +234,7 @@ def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str])
         f"it calls {function.reference!r}; pass trusted=(…) to read it"
         for part in made.part.walk()
         for function in part.functions()
-        if not function.is_defined_in((PACKAGE, *trusted))
+        if not function.is_defined_in((*OWN_MECHANISMS, *trusted))
     ]
     if problems:
         raise ModelError(problems)

@@ -12,7 +12,7 @@ from typing import Any, final
 from scm_world.curricula.base import AnyPart, as_part, read_from
 from scm_world.curricula.choices import Stages
 from scm_world.curricula.times import AtStep, Every
-from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
+from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Subset
 from scm_world.variables.checks import check_subset
@@ -88,7 +88,7 @@ class Curriculum(Frozen):
         """Read what ``to_json`` wrote; see ``from_dict``."""
         try:
             data = json.loads(text)
-        except json.JSONDecodeError as error:
+        except DAMAGED as error:
             raise ModelError([f"not a curriculum: {error}"]) from None
         return cls.from_dict(data, trusted=trusted)
 
@@ -102,7 +102,7 @@ class Curriculum(Frozen):
         advice = "give a file with the text of Curriculum.to_json()"
         try:
             return cls.from_json(Path(path).read_text(encoding="utf-8"), trusted=trusted)
-        except (OSError, UnicodeDecodeError, ModelError) as error:
+        except DAMAGED as error:
             raise UnreadableFile(str(path), str(error), advice) from None
 
     def check(self, world: World) -> None:

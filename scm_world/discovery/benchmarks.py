@@ -30,6 +30,7 @@ from scm_world.discovery.learners.registry import SOURCES, Learner, Source, lear
 from scm_world.discovery.metrics import effect_rmse, evaluate
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
+    DAMAGED,
     EngineFailure,
     MissingExtra,
     ModelError,
@@ -192,7 +193,7 @@ class BenchmarkResult:
             truths = _TRUTHS.validate_python(plain["problems"])
             runs = tuple(_RUN.validate_python(run) for run in plain["runs"])
             return cls({truth.name: truth for truth in truths}, runs, plain["settings"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except DAMAGED as error:
             reason = " ".join(str(error).split())
             raise UnreadableFile(str(path), reason, "run the benchmark again") from error
 
@@ -376,7 +377,7 @@ def _claim(folder: Location, settings: dict[str, Any]) -> None:
         try:
             there = json.loads(path.read_text(encoding="utf-8"))
             different = [key for key in settings if there[key] != settings[key]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except DAMAGED as error:
             reason, advice = f"it describes no benchmark: {error}", "give another folder"
             raise UnreadableFile(str(path), reason, advice) from None
         if different:
@@ -442,7 +443,7 @@ def _kept(folder: Location | None, run: Run) -> Run | None:
     advice = "delete it, and this run is done again"
     try:
         there = _RUN.validate_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except DAMAGED as error:
         raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from error
     if there.key != run.key:
         raise UnreadableFile(str(path), "it is of another run", advice)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any, final
 
-from scm_world.errors import UnreadableFile
+from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.output.durable import made, removed, write_durably
 from scm_world.output.locations import Location, located
 from scm_world.queries.experiments.effects import Effects
@@ -55,7 +55,7 @@ class Checkpoint:
             return int(data["done"])
         except FileNotFoundError:
             return 0
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except DAMAGED as error:
             raise UnreadableFile(str(self._path), str(error), ADVICE) from None
 
     def write(self, effects: Effects, done: int, paired: Paired) -> None:

@@ -57,6 +57,7 @@ from scm_world.errors.interventions import (
     raise_all,
 )
 from scm_world.errors.usage import (
+    DAMAGED,
     ActionError,
     BudgetExhausted,
     Diverged,
@@ -70,6 +71,7 @@ from scm_world.errors.usage import (
 )
 
 __all__ = [
+    "DAMAGED",
     "ActionError",
     "BudgetExhausted",
     "ConflictingTargets",
@@ -104,5 +106,6 @@ __all__ = [
 ]
 
 for _name in __all__:  # tracebacks and pickles name them as one imports them
-    globals()[_name].__module__ = __name__
+    if _name != "DAMAGED":
+        globals()[_name].__module__ = __name__
 del _name

@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from scm_world.errors.base import ScmWorldError, nearest, suggested
+
+DAMAGED: tuple[type[Exception], ...] = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    EOFError,
+    zlib.error,
+    zipfile.BadZipFile,
+)
+"""What the standard library and NumPy raise where a file is not what it should be."""
 
 
 class ActionError(ScmWorldError, ValueError):

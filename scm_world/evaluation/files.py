@@ -24,17 +24,6 @@ FORMAT = "scm_world/evaluation/1"
 RESULTS = "results.json"
 TABLE = "episodes"
 ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
-DAMAGED = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    RecursionError,
-)
-"""What reading a damaged file raises."""
-
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
 
 

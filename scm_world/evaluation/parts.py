@@ -8,7 +8,7 @@ from dataclasses import asdict
 from hashlib import blake2b
 from typing import Any
 
-from scm_world.errors import UnreadableFile
+from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.evaluation.arena import Row
 from scm_world.output.durable import made, write_whole
 from scm_world.output.locations import Location
@@ -61,7 +61,7 @@ def read_part(folder: Location, key: str, count: int) -> list[Row] | None:
         return [Row(**row) for row in data["rows"]]
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except DAMAGED as error:
         raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
 
 

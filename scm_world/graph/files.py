@@ -10,15 +10,15 @@ from typing import Any
 import networkx as nx
 from pydantic import TypeAdapter, ValidationError
 
-from scm_world.errors import InterventionError, ModelError
+from scm_world.errors import DAMAGED, InterventionError, ModelError
 from scm_world.graph.exchange import dot
 from scm_world.graph.exchange.model import causal_graph
 from scm_world.graph.scm import SCM
 from scm_world.graph.views import summary
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
+from scm_world.variables.mechanisms import OWN_MECHANISMS
 
 FORMAT = "scm_world/model/1"
-PACKAGE = "scm_world"
 
 _VARIABLES: TypeAdapter[Any] = TypeAdapter(list[AnyVariable])
 _INTERVENTIONS: TypeAdapter[Any] = TypeAdapter(dict[str, Intervention])
@@ -93,7 +93,8 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
 
     Args:
         data: Plain data.
-        trusted: Packages, besides this one, whose functions may serve as mechanisms.
+        trusted: Packages whose functions may serve as mechanisms, besides those of this package
+            that compute numbers.
 
     Raises:
         ModelError: The data is no model, or names a function outside the trusted packages.
@@ -108,9 +109,9 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         raise ModelError(
             [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
         ) from None
-    except (TypeError, KeyError) as error:  # a field too many, or too few
+    except DAMAGED as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
-    _check_trusted(variables, held, (PACKAGE, *trusted))
+    _check_trusted(variables, held, (*OWN_MECHANISMS, *trusted))
     model = SCM(variables)
     try:
         return model.hold(held)
@@ -127,7 +128,7 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     """Read a model that ``to_json`` wrote. See ``from_dict`` for ``trusted`` and errors."""
     try:
         data = json.loads(text)
-    except json.JSONDecodeError as error:
+    except DAMAGED as error:
         raise ModelError([f"not a model: {error}"]) from None
     return from_dict(data, trusted=trusted)
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_durably
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode
@@ -180,13 +179,22 @@ def load_episode(
 def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
     advice = "give a file that save_episode wrote"
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             about = json.loads(str(arrays["about"]))
             found = arrays["actions"], arrays["states"], arrays["lengths"]
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         raise UnreadableFile(str(file), str(error), advice) from None
     if not isinstance(about, dict) or about.get("format") != FORMAT or not about.keys() >= KEYS:
         raise UnreadableFile(str(file), "it is no episode", advice)
+    actions, states, lengths = found
+    steps = about["steps"]
+    whole = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 0
+    if not (whole and lengths.shape == (steps + 1,) and states.shape == (int(lengths.sum()),)):
+        reason = f"it says {steps!r} control steps, and holds states of {len(lengths) - 1}"
+        raise UnreadableFile(str(file), reason, advice)
+    if actions.ndim != 2 or len(actions) != steps:
+        reason = f"it says {steps} control steps, and holds actions of shape {actions.shape}"
+        raise UnreadableFile(str(file), reason, advice)
     return about, *found
 
 

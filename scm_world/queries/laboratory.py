@@ -15,7 +15,13 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.errors import BudgetExhausted, Forbidden, ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import (
+    DAMAGED,
+    BudgetExhausted,
+    Forbidden,
+    UnknownOption,
+    UnreadableFile,
+)
 from scm_world.queries.outcomes import Outcome, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, sample
@@ -142,7 +148,7 @@ class Journal:
                 reason = f"it is the log of other experiments: {', '.join(other)} differ"
                 raise UnreadableFile(str(path), reason, "give the laboratory another log")
             self.records = [_record(line, self._trusted) for line in lines]
-        except (ValueError, KeyError, TypeError, AttributeError, ModelError) as error:
+        except DAMAGED as error:
             if isinstance(error, UnreadableFile):
                 raise
             advice = "give the laboratory another log"

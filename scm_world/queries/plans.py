@@ -6,12 +6,13 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, final
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from scm_world.errors import ModelError
+from scm_world.errors import DAMAGED, ModelError
 from scm_world.graph import flatten
 from scm_world.queries.timed import ACTS, TIMED, At, Clamp, On, Timed, as_act
 from scm_world.variables import Function, Intervention, Mechanism
+from scm_world.variables.mechanisms import OWN_MECHANISMS
 
 FORMAT = "scm_world/plan/1"
 PACKAGE = "scm_world"
@@ -143,12 +144,12 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         plan = cls()
         try:
             plan._parts = _PARTS.validate_json(json.dumps(data["do"]))
-        except (ValidationError, KeyError, TypeError, ValueError) as error:
+        except DAMAGED as error:
             raise ModelError([f"not a plan: {error}"]) from None
         problems = [
             f"the mechanism of {name!r} is {function.reference!r}; pass trusted=(…) to read it"
             for name, function in plan._functions()
-            if not function.is_defined_in((PACKAGE, *trusted))
+            if not function.is_defined_in((*OWN_MECHANISMS, *trusted))
         ]
         if problems:
             raise ModelError(problems)
@@ -159,7 +160,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """Read a plan that ``to_json`` wrote; see ``from_dict``."""
         try:
             data = json.loads(text)
-        except json.JSONDecodeError as error:
+        except DAMAGED as error:
             raise ModelError([f"not a plan: {error}"]) from None
         return cls.from_dict(data, trusted=trusted)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
@@ -18,7 +17,7 @@ from pydantic import Field, ValidationError, field_validator
 from scm_world._arguments import load, whole_number
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
@@ -224,7 +223,7 @@ def _load(path: Path) -> Demonstrations:
             found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
         if len(found.observations) != len(found.actions):
             raise ValueError("observations and actions are not equally many")
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         advice = "remove it: the same call makes it again"
         raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
     return found

@@ -15,7 +15,7 @@ from typing import Any, final
 
 from scm_world._arguments import load, whole_number
 from scm_world.backends import backends
-from scm_world.errors import Diverged, UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
 from scm_world.evaluation.setups import Place
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.policies import file_of, load_policy
@@ -260,7 +260,7 @@ def open_folder(
             there = json.loads(path.read_text(encoding="utf-8"))
             if not isinstance(there, dict) or there.get("format") != form:
                 raise ValueError(f"it is not of the format {form!r}")
-        except (OSError, ValueError) as error:
+        except DAMAGED as error:
             raise UnreadableFile(str(path), str(error), "give another folder") from None
         before, now = _flat({n: there.get(n) for n in identity}), _flat(identity)
         if may_grow and before.get("recipe.steps", 0) < now["recipe.steps"]:

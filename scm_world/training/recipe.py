@@ -20,7 +20,7 @@ from pydantic import (
 
 from scm_world.curricula import Curriculum, as_curriculum, everything, goals
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
 from scm_world.tasks import TASKS, make_task, tasks
@@ -227,7 +227,7 @@ class Recipe(Frozen):
         """
         try:
             return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
-        except (OSError, ValueError, RecursionError) as error:
+        except DAMAGED as error:
             advice = "give a file with the text of Recipe.to_json()"
             raise UnreadableFile(str(path), str(error), advice) from None
 

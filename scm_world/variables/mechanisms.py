@@ -23,6 +23,14 @@ from scm_world.variables.spaces import Frozen
 Constant = float | tuple[float, ...]
 PACKAGE = __name__.partition(".")[0]
 
+OWN_MECHANISMS = (
+    "scm_world.geometry",
+    "scm_world.tasks.composition",
+    "scm_world.tasks.rewards",
+    "scm_world.tasks.trifinger",
+)
+"""Modules of this package whose functions a file may name as mechanisms. They compute numbers."""
+
 
 @final
 class Stacked:
@@ -81,6 +89,10 @@ def _number(value: Any) -> Any:
     return value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
 
 
+def _lies_in(module: str, packages: Iterable[str]) -> bool:
+    return any(module == package or module.startswith(f"{package}.") for package in packages)
+
+
 @final
 class Function(Frozen):
     """A Python function of the parents.
@@ -116,19 +128,18 @@ class Function(Frozen):
         return data if isinstance(data, dict) else {"reference": data}
 
     def is_defined_in(self, packages: Iterable[str]) -> bool:
-        """Tell whether the function is one of some packages, importing no other.
+        """Tell whether the function is one of some packages or modules, importing no other.
 
         What a module of theirs merely imports (``"my_package.module:os.system"``) is not.
         """
         packages = tuple(packages)
-        if self.reference.partition(".")[0].partition(":")[0] not in packages:
+        if not _lies_in(self.reference.partition(":")[0], packages):
             return False
         try:
             found = self._look_up()
         except (ModelError, AttributeError, ImportError):
             return False
-        home = getattr(found, "__module__", None) or ""
-        return home.partition(".")[0] in packages
+        return _lies_in(getattr(found, "__module__", None) or "", packages)
 
     def is_portable(self) -> bool:
         """Tell whether the function can be found again under its name."""

@@ -13,7 +13,7 @@ from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Column
 from scm_world.discovery.data.shards import Place, check_kind, check_names, decoded, encoded
 from scm_world.discovery.data.sources import FORMAT, Part
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
 from scm_world.output.durable import is_draft, locked, removed, write_durably
 from scm_world.output.locations import Location, located
@@ -109,7 +109,7 @@ class Folder:
             place, part = decoded(
                 data, head.kind, self._plan, head.columns, head.about, self._trusted
             )
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        except DAMAGED as error:
             if isinstance(error, ModelError) and "trusted" in str(error):
                 raise
             advice = f"delete it, and {self.again}: only it is made anew"
@@ -232,7 +232,7 @@ def read_sidecar(folder: Location) -> dict[str, Any]:
             and found["plan"] == head.plan
             and found["checksum"] == _checksum(found)
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except DAMAGED as error:
         raise UnreadableFile(str(path), f"it describes no dataset ({error})", advice) from None
     if not is_right:
         raise UnreadableFile(str(path), "it was changed, or has another format", advice)

@@ -11,19 +11,15 @@ from typing import final
 
 import networkx as nx
 
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.graph.exchange import dot, html, networks, table
 from scm_world.graph.exchange.model import CausalGraph, causal_graph
 from scm_world.graph.exchange.slices import VIEWS, View, read_as, seen_as
 from scm_world.graph.scm import SCM
 
 _WRONG = (
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
+    *DAMAGED,
     SyntaxError,  # what the standard library raises for XML
-    RecursionError,
     nx.NetworkXException,
     csv.Error,
 )
