@@ -122,7 +122,7 @@ def published(
             LIMITS: [*limits],
         }
     )
-    return NetworkPolicy(policy.layers, policy.log_std, about=about)
+    return NetworkPolicy(policy.layers, policy.log_std, made_for=about)
 
 
 def publish(

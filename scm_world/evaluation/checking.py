@@ -1,4 +1,4 @@
-"""Evaluations that are run again: in part, to see that they give the same bits."""
+"""Checks of evaluations: a random part is run again and compared bit for bit."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _TASK = ("task", "arguments", "class", "model")
 @final
 @dataclass(frozen=True)
 class Check:
-    """Some episodes that were played again.
+    """The result of a check.
 
     Attributes:
-        episodes: How many.
+        episodes: How many were run again.
         seed: With which they were chosen.
-        wrong: Where something else happened, in words.
+        wrong: Each difference, in words.
     """
 
     episodes: int
@@ -48,7 +48,7 @@ class Check:
     wrong: tuple[str, ...]
 
     def __bool__(self) -> bool:
-        """Whether everything happened again."""
+        """Whether there was no difference."""
         return not self.wrong
 
 
@@ -59,19 +59,19 @@ def bench_of(
     task: Task | str | None = None,
     trusted: Sequence[str] = (),
 ) -> Bench:
-    """Prepare to play episodes of an evaluation again.
+    """Prepare to run episodes of an evaluation again.
 
     Args:
         evaluation: That was run.
-        policy: Who acted, as it was given to ``evaluate``; if None the one that it was given in
-            this process, or one made again from what the evaluation says.
-        task: Where, if it is a task of the user's own class.
+        policy: As it was given to ``evaluate``; if None the one that was given in this process, or
+            one made again from its description.
+        task: If it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
 
     Raises:
         SnapshotMismatch: It was made with other versions.
         UnknownOption: A policy cannot be made again, or the task is not registered.
-        UnreadableFile: The file of a policy is another one by now.
+        UnreadableFile: The file of a policy has changed.
     """
     about = evaluation.about
     place = _place(about, task, trusted, known=bool(evaluation.policies))
@@ -92,17 +92,17 @@ def bench_of(
 def _place(
     about: Mapping[str, Any], task: Task | str | None, trusted: Sequence[str], *, known: bool
 ) -> Place:
-    """Find where the episodes happened.
+    """Make the task and the options of the environment again.
 
     Args:
-        about: What was evaluated.
-        task: Where, if that is given.
+        about: Description of the evaluation.
+        task: If it is given.
         trusted: Packages whose functions may be called.
         known: Whether it was evaluated in this process, so that its task may be made again.
 
     Raises:
         UnknownOption: Its task is one of the user's own, and is not given, or another one is.
-        ModelError: What is done at the start calls a function of no trusted package.
+        ModelError: An intervention at the start calls a function of no trusted package.
     """
     options = _acts(about["env"], trusted)
     if task is not None:
@@ -131,11 +131,22 @@ def _place(
 
 
 def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[Seat]:
-    """Find who acted: as given now, in a file, as given then, or by its name."""
-    agents = evaluation.about["agents"]
-    given = _given(policy, agents)
-    for one in agents:
-        who, what = (one["agent"], one["run"]), one["policy"]
+    """Find who acted: the policy given now, one in a file, one given then, or one by its name.
+
+    Raises:
+        UnknownOption: A given policy is of no agent of the evaluation.
+    """
+    agents = {(one["agent"], one["run"]): one for one in evaluation.about["agents"]}
+    names = list(dict.fromkeys(agent for agent, _ in agents))
+    if policy is not None and not isinstance(policy, Mapping):
+        if len(names) > 1:
+            raise UnknownOption("policy", policy, (f"one by the name of each of {names}",))
+        policy = {names[0]: policy}
+    given = {(str(agent), run): one for agent, run, one in listed(policy or {})}
+    for agent, run in given.keys() - agents.keys():
+        raise UnknownOption("policy", f"{agent}, run {run}", [f"{a}, run {r}" for a, r in agents])
+    for who, one in agents.items():
+        what = one["policy"]
         if who in given:
             player = as_player(given[who])
         elif who in evaluation.policies and "path" not in what:
@@ -179,22 +190,6 @@ def _same_versions(place: Place, made: Mapping[str, Mapping[str, str]]) -> None:
             )
 
 
-def _given(policy: Any, agents: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], Any]:
-    """Sort the policies that a user gives again by agent and run."""
-    if policy is None:
-        return {}
-    names = list(dict.fromkeys(one["agent"] for one in agents))
-    if not isinstance(policy, Mapping):
-        if len(names) > 1:
-            raise UnknownOption("policy", policy, (f"one by the name of each of {names}",))
-        policy = {names[0]: policy}
-    known = {(one["agent"], one["run"]) for one in agents}
-    found = {(str(agent), run): one for agent, run, one in listed(policy)}
-    for agent, run in found.keys() - known:
-        raise UnknownOption("policy", f"{agent}, run {run}", [f"{a}, run {r}" for a, r in known])
-    return found
-
-
 def check(
     evaluation: Evaluation,
     *,
@@ -205,15 +200,15 @@ def check(
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Check:
-    """Play a random part of an evaluation again, and compare it bit for bit.
+    """Run a random part of an evaluation again, and compare it bit for bit.
 
     Args:
         evaluation: That was run, here or elsewhere.
         episodes: How many.
-        seed: Which ones; by chance if None.
-        policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
-            what is no file and has no name.
-        task: Where, if it is a task of the user's own class.
+        seed: Chooses them; None: a random one.
+        policy: As it was given to ``evaluate``; only needed in another process, for a policy that
+            is no file and has no name.
+        task: If it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Told how many are done.
 
@@ -237,7 +232,7 @@ def check(
 
 
 def _compared(bench: Bench, evaluation: Evaluation, place: int) -> list[str]:
-    """Play one row again; say what is different."""
+    """Run the episode of one row again; name each difference."""
     row = {name: column[place].item() for name, column in evaluation.columns.items()}
     shard = bench.setup.shard_of(row)
     found = Evaluation.of({}, [bench.play(shard, shard.first)])
@@ -247,14 +242,9 @@ def _compared(bench: Bench, evaluation: Evaluation, place: int) -> list[str]:
         noisy = bench.setup.seats[shard.seat].about.get("repeats") == "no"
         why = "; the policy gives two actions for one observation" if noisy else ""
         return [f"{where}: other states or actions{why}"]
-    return [
-        f"{where}: {name} is {again.get(name)!r}, not {value!r}"
-        for name, value in row.items()
-        if not _same(again.get(name, math.nan), value)
-    ]
-
-
-def _same(one: Any, other: Any) -> bool:
-    """Compare two entries of a table; NaN says in both that a variable was not drawn."""
-    absent = [isinstance(value, float) and math.isnan(value) for value in (one, other)]
-    return all(absent) or bool(one == other)
+    wrong = []
+    for name, value in row.items():
+        now = again.get(name, math.nan)
+        if now != value and not (now != now and value != value):  # NaN: was not drawn
+            wrong.append(f"{where}: {name} is {again.get(name)!r}, not {value!r}")
+    return wrong

@@ -315,7 +315,7 @@ class _Episode:
     number: int
     observations: list[Observation] = field(default_factory=list)
     infos: list[dict[str, Any]] = field(default_factory=list)
-    states: list[int] = field(default_factory=list)
+    states: list[Floats] = field(default_factory=list)
     actions: list[NDArray[Any]] = field(default_factory=list)
     returns: list[tuple[float, bool, bool]] = field(default_factory=list)
     interventions: tuple[tuple[int, Mapping[str, Any]], ...] = ()
@@ -422,15 +422,20 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Record an instant; ``before`` are its infos before an intervention."""
         world = self._inner.world
         self._version = world.version
-        numbers = {**(before or {}), **dict(_numbers(info))}
-        for name in () if self._wanted == ALL else self._wanted:
+        numbers, names = info, self._wanted
+        if names == ALL or any(type(info.get(name)) not in (bool, int, float) for name in names):
+            numbers = {**(before or {}), **dict(_numbers(info))}
+            names = tuple(numbers) if names == ALL else names
+        for name in names:
             if name not in numbers:
                 raise UnknownOption("info", name, numbers)
-        names = numbers if self._wanted == ALL else self._wanted
         episode.infos.append({name: numbers[name] for name in names})
-        copied = {name: np.array(part) for name, part in parts(observation).items()}
-        episode.observations.append(copied if isinstance(observation, dict) else copied[""])
-        episode.states.append(_digest(world.current()[1].vector))
+        if isinstance(observation, dict):
+            copied: Observation = {name: np.array(part) for name, part in observation.items()}
+        else:
+            copied = np.array(observation)
+        episode.observations.append(copied)
+        episode.states.append(world.current()[1].vector.copy())
         episode.interventions = self._inner.interventions
 
     def _update(self, episode: _Episode) -> None:
@@ -470,7 +475,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             terminations=np.array(ends, dtype=np.bool_),
             truncations=np.array(cuts, dtype=np.bool_),
             infos=infos,
-            states=np.array(episode.states, dtype=np.int64),
+            states=np.array([*map(_digest, episode.states)], dtype=np.int64),
         )
 
 

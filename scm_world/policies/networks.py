@@ -47,6 +47,7 @@ from scm_world.tasks import tasks
 Weights = NDArray[np.float32]
 
 LARGEST = 2**28  # [bytes] of a file: more is no policy, and might fill the memory
+_ANY = PolicyAbout(task="any")  # tanh, clip, one array
 _SAVED = "give a file that scm_world.policies.save_policy has written"
 _ARCHIVE = "only multilayer perceptrons of PPO2 (MlpPolicy) can be loaded"
 _ENV = (
@@ -70,6 +71,7 @@ class MlpPolicy:
         layers: From the observation to the action; all but the last are hidden.
         log_std: Logarithm of the standard deviations of the actions, shape (n,), if known.
         value: The layers of the network for the value of the state, if known.
+        made_for: What it was trained for, if known.
 
     Raises:
         ModelError: Layers do not fit one another, or are no finite numbers; all problems.
@@ -78,9 +80,12 @@ class MlpPolicy:
     layers: tuple[Layer, ...]
     log_std: Weights | None = field(default=None, repr=False)
     value: tuple[Layer, ...] = field(default=(), repr=False)
+    made_for: PolicyAbout | None = None
 
     def __post_init__(self) -> None:
-        problems = [*_misfits("layers", self.layers, None, self._wanted())]
+        kind = tasks().get(self._form.task)
+        wanted = len(kind.rest) or None if kind is not None else None
+        problems = [*_misfits("layers", self.layers, None, wanted)]
         if self.value and not problems:
             problems = [*_misfits("value.layers", self.value, self.n_observed, 1)]
         if self.log_std is not None and not problems:
@@ -90,29 +95,9 @@ class MlpPolicy:
         if problems:
             raise ModelError(problems)
 
-    def _wanted(self) -> int | None:
-        """Return how many numbers an action must have, if that is known."""
-        return None
-
     @property
-    def activation(self) -> str:
-        """Function after each hidden layer."""
-        return "tanh"
-
-    @property
-    def output(self) -> str:
-        """Function that keeps actions in [-1, 1]."""
-        return "clip"
-
-    @property
-    def inputs(self) -> tuple[str, ...] | None:
-        """Parts of a dictionary observation in their order; None: it is one array."""
-        return None
-
-    @property
-    def made_for(self) -> PolicyAbout | None:
-        """What the policy was trained for, if known."""
-        return None
+    def _form(self) -> PolicyAbout:
+        return self.made_for or _ANY
 
     @property
     def n_observed(self) -> int:
@@ -130,7 +115,7 @@ class MlpPolicy:
         """Choose the action.
 
         Args:
-            observation: Shape (..., n), or arrays by name, those of ``inputs``.
+            observation: Shape (..., n), or arrays by name, those of ``made_for.inputs``.
             generator: Draws the action from the distribution; None: the action is the mean.
 
         Returns:
@@ -146,7 +131,7 @@ class MlpPolicy:
             if self.log_std is None:
                 raise UnknownOption("generator", generator, ("None: there is no log_std",))
             found = found + np.exp(self.log_std) * generator.standard_normal(found.shape)
-        found = np.tanh(found) if self.output == "tanh" else np.clip(found, -1.0, 1.0)
+        found = np.tanh(found) if self._form.output == "tanh" else np.clip(found, -1.0, 1.0)
         return found.astype(np.float32)
 
     def mean(self, observation: Any) -> Floats:
@@ -167,7 +152,7 @@ class MlpPolicy:
     def _computed(self, layers: tuple[Layer, ...], seen: NDArray[Any]) -> Floats:
         x = np.ascontiguousarray(seen.reshape(-1, self.n_observed), dtype=np.float64)
         doubles = self._doubles if layers is self.layers else _in_doubles(layers)
-        hidden = 1 if self.activation == "tanh" else 2
+        hidden = 1 if self._form.activation == "tanh" else 2
         for number, (weight, bias) in enumerate(doubles, start=1):
             x = _dense(x, weight, bias, hidden if number < len(layers) else 0)
         return x.reshape(*seen.shape[:-1], x.shape[1])
@@ -178,7 +163,7 @@ class MlpPolicy:
 
     def joined(self, observation: Any) -> NDArray[Any]:
         """Join the parts of an observation, shape (..., n); errors as above."""
-        inputs = self.inputs
+        inputs = self._form.inputs
         if isinstance(observation, Mapping):
             if inputs is None or not observation.keys() >= set(inputs):
                 wanted = "one array" if inputs is None else f"the parts {[*inputs]}"
@@ -245,8 +230,8 @@ class MlpPolicy:
 
     def content(self) -> bytes:
         """Return the content of a safetensors file."""
-        about = self.made_for
-        return safetensors.numpy.save(self.tensors(), about and {KEY: about.text()})
+        text = {KEY: self.made_for.text()} if self.made_for else None
+        return safetensors.numpy.save(self.tensors(), text)
 
     @property
     def sha256(self) -> str:
@@ -254,7 +239,7 @@ class MlpPolicy:
         return hashlib.sha256(self.content()).hexdigest()
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Any], **more: Any) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Any], made_for: PolicyAbout | None = None) -> Self:
         """Make a policy from tensors by name, 32-bit floats; a weight has shape (outputs, inputs).
 
         Raises:
@@ -279,43 +264,17 @@ class MlpPolicy:
         wrong += [f"{name!r} is no tensor of a policy" for name in left]
         if wrong:
             raise ModelError(wrong)
-        return cls(networks[0], log_std, networks[1], **more)
+        return cls(networks[0], log_std, networks[1], made_for)
 
 
 @final
-@dataclass(frozen=True, eq=False)
 class NetworkPolicy(MlpPolicy):
-    """A multilayer perceptron with the metadata of a policy file.
-
-    Attributes:
-        about: What it was trained for, and how.
-    """
-
-    about: PolicyAbout = field(kw_only=True)
-
-    def _wanted(self) -> int | None:
-        kind = tasks().get(self.about.task)
-        return (len(kind.rest) or None) if kind is not None else None
+    """A multilayer perceptron with the metadata of a policy file."""
 
     @property
-    def activation(self) -> str:
-        """Function after each hidden layer."""
-        return self.about.activation
-
-    @property
-    def output(self) -> str:
-        """Function that keeps actions in [-1, 1]."""
-        return self.about.output
-
-    @property
-    def inputs(self) -> tuple[str, ...] | None:
-        """Parts of a dictionary observation in their order; None: it is one array."""
-        return self.about.inputs
-
-    @property
-    def made_for(self) -> PolicyAbout:
-        """What the policy was trained for."""
-        return self.about
+    def about(self) -> PolicyAbout:
+        """What the policy was trained for, and how."""
+        return self._form
 
     @classmethod
     def of(
@@ -326,7 +285,7 @@ class NetworkPolicy(MlpPolicy):
         Raises:
             ModelError: They do not fit; all problems.
         """
-        return cls.from_tensors(tensors, about=PolicyAbout.of(about))
+        return cls.from_tensors(tensors, PolicyAbout.of(about))
 
 
 def save_policy(

@@ -147,11 +147,15 @@ def test_nothing_of_an_earlier_evaluation_stays(tmp_path: Path) -> None:
 
 
 def test_forged_scores_are_found(tmp_path: Path) -> None:
-    """They are computed again from the table."""
+    """A checksum tells; without one they are computed again from the table."""
     found = tiny(protocols="P2")
     file, _ = found.save(tmp_path, kind="csv")
     assert false_scores(tmp_path, found) == []
-    file.write_text(file.read_text().replace('"value": 0.0', '"value": 0.99', 1))
+    forged = file.read_text().replace('"value": 0.0', '"value": 0.99', 1)
+    file.write_text(forged)
+    with pytest.raises(UnreadableFile, match="checksum"):
+        Evaluation.load(file)
+    file.write_text(forged.replace('"checksum"', '"removed"'))
     assert "0.99" in false_scores(file, Evaluation.load(file))[0]
 
 

@@ -53,7 +53,7 @@ def record_videos(
     real time, with at most 25 frames per second; what was drawn stands below the picture.
 
     Args:
-        given: What was evaluated; ``again.bench_of`` makes it from an evaluation.
+        given: What was evaluated; ``checking.bench_of`` makes it from an evaluation.
         evaluation: What came out.
         folder: Where the videos are put, under names such as ``worst-P6-episode17.mp4``; run and
             seed stand in them if there are several, agent and engine as well.
