@@ -27,8 +27,9 @@ class Conventions:
             leave, and a time feature in seconds minus steps where a length is given.
         distance_as_reward: In reaching, the mean tip error itself is added to the reward.
         published_spaces: The spaces of the code instead of those of the paper: bright floors,
-            blocks and goals in A, no space for gravity, blocks that begin in the air, and
-            ``A|B`` as the hull of A and B.
+            blocks and goals in A, no space for gravity, blocks that begin in the air,
+            ``A|B`` as the hull of A and B, and, in picking, cylindrical positions of goals of
+            which the height alone counts.
         static_counts: Obstacles count for the length of an episode, like blocks.
     """
 

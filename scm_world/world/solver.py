@@ -322,8 +322,22 @@ class Solver:
                 value = self._held(name) if self._is_action(name) else self._coordinates(name)
                 check_space(requested, value, space, context)
             except InterventionError as problem:
-                problems.append(problem)
+                if not self._asked_within(requested, space, context):
+                    problems.append(problem)
         return problems
+
+    def _asked_within(self, requested: Variable, space: AnyRegion, context: Values) -> bool:
+        """Tell whether what was asked of other coordinates lies in a space, whatever they keep."""
+        if getattr(requested, "inverse", None) is None:
+            return False
+        _, act = self.accepted.requests[self._world.model.target(requested.name)]
+        if not isinstance(act, Hard):
+            return isinstance(act, Draw) and act.source == space
+        try:
+            check_space(requested, requested.array(act.value), space, context)
+        except InterventionError:
+            return False
+        return True
 
     def as_asked(self, problems: list[InterventionError]) -> list[InterventionError]:
         """Say of a bundle, if that was asked for, what is wrong with its parts."""

@@ -98,6 +98,27 @@ def test_goals_are_drawn_above_the_middle(space: Any, low: float, high: float) -
     assert low <= min(heights) < max(heights) <= high
 
 
+@pytest.mark.parametrize("act", [Draw("A"), Draw("B"), [0.1, 1.0, 0.15]])
+def test_the_predecessor_puts_goals_above_the_center(act: Any) -> None:
+    """Under its conventions the height of a cylindrical position counts, drawn or set."""
+    world = picking("causal_world")
+    audit = world.do({"goal_block.cylindrical_position": act})
+    x, y, z = world[GOAL]
+    assert (x, y) == (0.0, 0.0)
+    assert 0.08 <= z <= 0.25
+    assert audit
+    world.do({GOAL: [0.1, 0.05, 0.15]})
+    np.testing.assert_array_equal(world[GOAL], [0.1, 0.05, 0.15])
+
+
+@pytest.mark.parametrize("space", ["A", "B"])
+def test_the_predecessors_goals_are_drawn_from_its_spaces(space: Any) -> None:
+    """A space holds what was drawn from it, before the radius and the angle are left out."""
+    world = picking("causal_world")
+    world.do({"goal_block.cylindrical_position": Draw(space)}, space=space)
+    np.testing.assert_array_equal(world[GOAL][:2], 0.0)
+
+
 def test_a_larger_block_does_not_move_its_goal() -> None:
     """Block and goal share their size, and only the block stands on the floor."""
     world = picking()

@@ -9,6 +9,7 @@ from typing import Unpack, final
 import numpy as np
 
 from scm_world._types import Floats, Value
+from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.tasks.arguments import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, term
@@ -34,6 +35,18 @@ def lifted(height: Value, *, place: Floats) -> Floats:
     """
     at = np.broadcast_to(place, (*np.shape(height), 2))
     return np.concatenate([at, np.asarray(height)[..., None]], axis=-1)
+
+
+def above_the_center(cylindrical: Floats) -> Floats:
+    """Put a goal above the centre of the arena, at the height of a cylindrical position.
+
+    Source: CausalWorld 1.2, ``task_generators/picking.py``,
+    ``_handle_contradictory_interventions``.
+
+    Args:
+        cylindrical: Radius [m] and azimuth [rad], which are ignored, and height [m]; shape (..., 3).
+    """
+    return np.asarray(cylindrical, dtype=np.float64) * (0.0, 0.0, 1.0)
 
 
 @final
@@ -103,12 +116,14 @@ class Picking(OneBlock):
                 mechanism=Function(lifted, constants={"place": self.place[:2]}),
             ),
             spaces=self._above(),
+            inverse=above_the_center if self.conventions.published_spaces else from_cylindrical,
         )
 
     def _above(self) -> tuple[Box, Box]:
         """Give the cylindrical positions above the block's place; at radius 0 any angle will do.
 
-        The predecessor publishes wider spaces, but puts whatever is drawn above the middle.
+        The predecessor publishes wider spaces, and puts whatever is drawn or set above the centre
+        of the arena; see ``above_the_center``.
         """
         if self.conventions.published_spaces:
             return (

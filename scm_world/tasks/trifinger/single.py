@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Unpack
 
 import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ModelError
+from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
 from scm_world.tasks.arguments import checked
 from scm_world.tasks.composition import Entity
@@ -157,17 +158,25 @@ class OneBlock(Building):
         )
         return shapes.Standing(block, orientation=self._turns[TOOL])
 
-    def goal(self, *place: Variable, spaces: tuple[Box, Box]) -> Entity:
+    def goal(
+        self,
+        *place: Variable,
+        spaces: tuple[Box, Box],
+        inverse: Callable[[Floats], Floats] = from_cylindrical,
+    ) -> Entity:
         """Describe the goal.
 
         Args:
             place: Its position, and the causes of it.
             spaces: A and B of its cylindrical position.
+            inverse: Cartesian position where a cylindrical one is set.
         """
         (a, b), box = spaces, self.shape is None
         pose = (*place, *self._goal_turn())
         size = self.size_of(GOAL)
-        return GoalBlock(GOAL, size=size, pose=pose, a=a, b=b, yaw=box, hull=self.shape)
+        return GoalBlock(
+            GOAL, size=size, pose=pose, a=a, b=b, yaw=box, hull=self.shape, inverse=inverse
+        )
 
     def _goal_turn(self) -> Iterable[Variable]:
         """Declare the orientation of the goal; a shape keeps to the side it rests on."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, final
 
 import numpy as np
@@ -57,7 +57,13 @@ def keep_lowest_point(position: Floats, *parents: Floats) -> Floats:
 
 
 def coordinates(
-    entity: str, *, a: Box | None, b: Box | None, orientation: bool = True, yaw: bool = True
+    entity: str,
+    *,
+    a: Box | None,
+    b: Box | None,
+    orientation: bool = True,
+    yaw: bool = True,
+    inverse: Callable[[Floats], Floats] = from_cylindrical,
 ) -> Iterable[Variable]:
     """Declare the other coordinates of a pose: cylindrical position and rotation vector.
 
@@ -67,6 +73,7 @@ def coordinates(
         b: Space B of it.
         orientation: Whether there is an orientation.
         yaw: Whether A and B of the rotation vector are the turns about z, or there are none.
+        inverse: Cartesian position where a cylindrical one is set.
     """
     yield Derived(
         name=f"{entity}.cylindrical_position",
@@ -76,7 +83,7 @@ def coordinates(
         b=b,
         parents=(f"{entity}.cartesian_position",),
         mechanism=to_cylindrical,
-        inverse=from_cylindrical,
+        inverse=inverse,
         doc="Position as radius, angle and height; setting it sets the Cartesian position.",
     )
     if orientation:

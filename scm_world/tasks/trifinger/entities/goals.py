@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import final
 
 import numpy as np
 
 from scm_world._types import Floats, Values
-from scm_world.geometry import rotation_matrix
+from scm_world.geometry import from_cylindrical, rotation_matrix
 from scm_world.geometry.hulls import Hull
 from scm_world.models import Goal
 from scm_world.tasks.composition import Entity
@@ -150,6 +150,7 @@ class GoalBlock(_Goal):
         b: Space B of it.
         yaw: Whether turns about z are in the spaces of the rotation vector.
         hull: Its shape, if it is no box.
+        inverse: Cartesian position where a cylindrical one is set.
     """
 
     def __init__(
@@ -162,9 +163,11 @@ class GoalBlock(_Goal):
         b: Box | None = None,
         yaw: bool = True,
         hull: Hull | None = None,
+        inverse: Callable[[Floats], Floats] = from_cylindrical,
     ) -> None:
         self.name = name
         self._size, self._pose = size, tuple(pose)
+        self._inverse = inverse
         self._a, self._b, self._yaw = a, b, yaw
         self._shape = hull
 
@@ -175,7 +178,9 @@ class GoalBlock(_Goal):
         yield self._size
         yield from self._pose
         yield color(self._v("color"), numbers.GOAL_COLOR)
-        yield from coordinates(self.name, a=self._a, b=self._b, yaw=self._yaw)
+        yield from coordinates(
+            self.name, a=self._a, b=self._b, yaw=self._yaw, inverse=self._inverse
+        )
 
     def goal(self, values: Values) -> Goal:
         """Describe the silhouette."""
