@@ -243,8 +243,11 @@ class Composition(ABC):
         """Give the physics step [s]."""
         return float(self.structure(values).timestep)
 
-    def overlaps(self, scene: Scene, tolerance: float) -> tuple[Overlap, ...]:
-        """List the bodies that lie deeper in one another than a tolerance [m]."""
+    def overlaps(self, scene: Scene, tolerance: float | None = None) -> tuple[Overlap, ...]:
+        """List the bodies that lie deeper in one another than a tolerance [m].
+
+        None stands for what the task allows after an intervention.
+        """
         return ()
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:

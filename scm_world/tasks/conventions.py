@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from scm_world.errors import UnknownOption
+from scm_world.models.scene import TOLERANCE
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.variables import Box, Integers, Space, Variable
 
@@ -31,6 +32,8 @@ class Conventions:
             ``A|B`` as the hull of A and B, and, in picking, cylindrical positions of goals of
             which the height alone counts.
         static_counts: Obstacles count for the length of an episode, like blocks.
+        tolerance: How deep two bodies may lie in one another after an intervention [m].
+        robot_tolerance: The same where one of them is a link of the robot [m].
     """
 
     name: str
@@ -41,6 +44,8 @@ class Conventions:
     distance_as_reward: bool = False
     published_spaces: bool = False
     static_counts: bool = False
+    tolerance: float = TOLERANCE
+    robot_tolerance: float = TOLERANCE
 
     def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
         """Give variables the spaces that these conventions have."""
@@ -50,7 +55,11 @@ class Conventions:
 
 CONVENTIONS = {
     "scm_world": Conventions("scm_world"),
-    "causal_world": Conventions("causal_world", True, True, True, True, True, True, True),
+    "causal_world": Conventions(
+        *("causal_world", True, True, True, True, True, True, True),
+        tolerance=0.03,
+        robot_tolerance=0.0095,
+    ),
 }
 
 

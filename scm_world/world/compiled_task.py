@@ -16,7 +16,6 @@ from scm_world.errors import ActionError, InterventionError, ModelError, Unknown
 from scm_world.geometry.clipping import clip_kernel
 from scm_world.graph import SCM, Moment
 from scm_world.models import ParameterKey, Scene, State, Structure
-from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Conventions, Task, Timing, conventions
 from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
 from scm_world.variables.checks import check_bounds, coerce
@@ -391,7 +390,7 @@ def refuse_impossible(compiled: CompiledTask) -> None:
                 check_bounds(variable, values[variable.name], values)
             except InterventionError as problem:
                 problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = compiled.composition.overlaps(compiled.describe(static, state), TOLERANCE)
+    found = compiled.composition.overlaps(compiled.describe(static, state))
     problems += map(str, found)
     if problems:
         advice = f"choose other arguments of the task {compiled.task.name!r}"

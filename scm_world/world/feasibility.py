@@ -12,7 +12,7 @@ from scm_world._types import Value
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.graph import Moment
 from scm_world.models import Difference, State, Structure
-from scm_world.models.scene import TOLERANCE, Overlap
+from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard
 from scm_world.variables.checks import coerce
 from scm_world.variables.subsets import AnyRegion
@@ -79,7 +79,7 @@ class Present:
         if not self._moves_surfaces(change):
             return []
         then = plan.compiled.describe(plan.static, plan.state)
-        found = plan.compiled.composition.overlaps(then, TOLERANCE)
+        found = plan.compiled.composition.overlaps(then)
         if not found:
             return []
         now = base.compiled

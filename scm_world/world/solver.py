@@ -330,7 +330,7 @@ class Solver:
         """Tell whether what was asked of other coordinates lies in a space, whatever they keep."""
         if getattr(requested, "inverse", None) is None:
             return False
-        _, act = self.accepted.requests[self._world.model.target(requested.name)]
+        _, act = self.pending[self._task.model.target(requested.name)]
         if not isinstance(act, Hard):
             return isinstance(act, Draw) and act.source == space
         try:

@@ -95,6 +95,26 @@ def test_d27_d50_nothing_is_put_into_something_else(backend: str) -> None:
     world.close()
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_d50_the_predecessor_takes_blocks_up_to_3_cm_in_one_another(backend: str) -> None:
+    """Under its conventions 2 cm are taken, 3.5 cm are not; of a link of the robot, 9.5 mm."""
+    world = World("stacking2", backend=backend, conventions="causal_world")
+    world.reset(seed=0)
+    block = "tool_block_2.cartesian_position"
+    world.do({"tool_block_1.cartesian_position": [0.0, 0.0, 0.0325], block: [0.045, 0.0, 0.0325]})
+    with pytest.raises(Infeasible, match="35 mm deep"):
+        world.do({block: [0.03, 0.0, 0.0325]})
+    x, y, z = world["end_effector_positions"][:3]
+    for depth, is_taken in ((0.008, True), (0.011, False)):
+        place = {block: [x, y, z - hardware.COLLISION["tip"].radius - 0.0325 + depth]}
+        if is_taken:
+            world.do(place)
+        else:
+            with pytest.raises(Infeasible, match="link_3"):
+                world.do(place)
+    world.close()
+
+
 def test_d28_names_that_do_not_exist_are_errors() -> None:
     """Each of them is told, whether it misses the body or the quantity."""
     with pytest.raises(SeveralProblems) as caught:

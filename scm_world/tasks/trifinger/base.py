@@ -141,7 +141,7 @@ class TriFingerTask(Task):
         )
         there = tuple(entity for entity in entities if entity.name not in self.absent)
         while True:
-            made = BlockWorld(there, tuple(self.shared()), self.decided_by, mode)
+            made = BlockWorld(there, tuple(self.shared()), self.decided_by, mode, self.conventions)
             variables: list[Variable] = [*made.variables(), *self.readouts()]
             if not self.absent:
                 return made, variables

@@ -44,7 +44,7 @@ def above_the_center(cylindrical: Floats) -> Floats:
     ``_handle_contradictory_interventions``.
 
     Args:
-        cylindrical: Radius [m] and azimuth [rad], which are ignored, and height [m]; shape (..., 3).
+        cylindrical: Radius [m] and azimuth [rad], both ignored, and height [m]; shape (..., 3).
     """
     return np.asarray(cylindrical, dtype=np.float64) * (0.0, 0.0, 1.0)
 

@@ -12,8 +12,15 @@ from scm_world.geometry.hulls import Hull
 from scm_world.models import ControlMode, Goal, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity, Mover
+from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps
-from scm_world.tasks.trifinger.hardware import FINGERS, N_JOINTS, NOMINAL_HEIGHT, link_name
+from scm_world.tasks.trifinger.hardware import (
+    FINGERS,
+    LINK_NAMES,
+    N_JOINTS,
+    NOMINAL_HEIGHT,
+    link_name,
+)
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.presets import PRESET_NAMES, preset
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
@@ -49,12 +56,14 @@ class BlockWorld(Composition):
         deciding: Variables that decide which entities there are. A body that comes or goes acts
             on the others by contact, so they do.
         mode: What a command means.
+        conventions: Say how deep bodies may lie in one another after an intervention.
     """
 
     entities: tuple[Entity, ...]
     shared: tuple[Variable, ...] = ()
     deciding: tuple[str, ...] = ()
     mode: ControlMode = ControlMode.JOINT_POSITIONS
+    conventions: Conventions = CONVENTIONS["scm_world"]
     solid: bool = field(init=False, default=True)
     blocks: tuple[str, ...] = field(init=False)
     obstacles: tuple[str, ...] = field(init=False)
@@ -82,9 +91,16 @@ class BlockWorld(Composition):
             self._structures[name] = made
         return self._structures[name]
 
-    def overlaps(self, scene: Scene, tolerance: float) -> tuple[Overlap, ...]:
+    def overlaps(self, scene: Scene, tolerance: float | None = None) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m]."""
-        return overlaps(scene, tolerance=tolerance)
+        if tolerance is not None:
+            return overlaps(scene, tolerance=tolerance)
+        robot, others = self.conventions.robot_tolerance, self.conventions.tolerance
+        return tuple(
+            overlap
+            for overlap in overlaps(scene, tolerance=min(robot, others))
+            if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
+        )
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
