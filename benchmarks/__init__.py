@@ -1,1 +1,1 @@
-"""Scripts that measure the package; see README.md."""
+"""Scripts that measure the package; see docs/benchmarks."""

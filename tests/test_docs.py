@@ -7,38 +7,100 @@ import re
 import runpy
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+import typer.main
 
+from scm_world.cli import app
 from scm_world.errors import MissingExtra
 
 ROOT = Path(__file__).parent.parent
+EXAMPLES_PAGE = ROOT / "docs" / "examples.md"
 DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-BLOCKS = [
-    pytest.param(block, id=f"{path.name}-{number}")
-    for path in DOCUMENTS
-    for number, block in enumerate(re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL))
-]
+BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```$)?", re.DOTALL | re.MULTILINE)
+PROGRAMS = [path for path in DOCUMENTS if BLOCK.search(path.read_text())]
 
 
-@pytest.mark.parametrize("block", BLOCKS)
-def test_python_in_documents_runs(block: str) -> None:
-    """Every Python block of the README and the docs runs as it stands."""
-    try:
-        exec(compile(block, "document", "exec"), {"__name__": "document"})  # noqa: S102 # our own text
-    except MissingExtra as missing:
-        if missing.extra != "train":
-            raise
-        pytest.skip(str(missing))
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.name)
+def test_python_in_documents_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The Python blocks of a page run in turn; a ``text`` block right after one is its output."""
+    text, names, missing = path.read_text(), {"__name__": "document"}, None
+    for found in BLOCK.finditer(text):
+        block = "\n" * text[: found.start(1)].count("\n") + found[1]  # line numbers of the page
+        try:
+            exec(compile(block, str(path), "exec"), names)  # noqa: S102 # our own text
+        except MissingExtra as error:
+            if error.extra != "train":
+                raise
+            missing = str(error)
+        printed = capsys.readouterr().out
+        if found[2] is not None:
+            assert printed == found[2]
+    if missing is not None:
+        pytest.skip(missing)
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 def test_links_lead_somewhere(path: Path) -> None:
-    """Every relative link of a document points to a file that exists."""
-    for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
+    """Every relative link leads to a file; those of the site lead to files of the site."""
+    text = path.read_text()
+    for target in re.findall(r"\]\(([^)#]+)\)", text) + re.findall(r'src="([^"]+)"', text):
         if "://" not in target:
-            assert (path.parent / target).exists(), target
+            found = (path.parent / target).resolve()
+            assert found.exists(), target
+            assert path.name == "README.md" or found.is_relative_to(ROOT / "docs"), target
+
+
+def test_every_page_is_in_the_navigation_once() -> None:
+    """``mkdocs.yml`` names every page of ``docs`` once, and no other."""
+    named = re.findall(r"(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    pages = (ROOT / "docs").rglob("*.md")
+    assert sorted(named) == sorted(str(path.relative_to(ROOT / "docs")) for path in pages)
+
+
+def test_modules_of_the_reference_exist() -> None:
+    """Every module that the reference documents can be imported."""
+    pages = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
+    modules = re.findall(r"^::: (\S+)$", pages, re.MULTILINE)
+    assert len(modules) > 10
+    for module in modules:
+        importlib.import_module(module)
+
+
+def test_every_example_is_shown() -> None:
+    """The page of examples shows every file of the folder once."""
+    shown = re.findall(r'^--8<-- "examples/(\w+)\.py"$', EXAMPLES_PAGE.read_text(), re.MULTILINE)
+    assert sorted(shown) == sorted(path.stem for path in (ROOT / "examples").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_commands_in_documents_exist(path: Path) -> None:
+    """Every ``scm-world`` command of a page has that name and those options."""
+    commands = typer.main.get_command(app).commands
+    text = path.read_text().replace("\\\n", " ")
+    for name, rest in re.findall(
+        r"(?:^|`|\$ |&& )scm-world ([a-z]+)([^\n`&#|]*)", text, re.MULTILINE
+    ):
+        known = {option for parameter in commands[name].params for option in parameter.opts}
+        given = {word.partition("=")[0] for word in rest.split() if word.startswith("--")}
+        assert given <= known | {"--help"}, f"scm-world {name}"
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_extras_in_documents_exist(path: Path) -> None:
+    """Every extra that a page installs is declared."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for extras in re.findall(r"pip install .*?\[([\w,-]+)\]", path.read_text()):
+        assert set(extras.split(",")) <= project["optional-dependencies"].keys()
+
+
+def test_the_readme_is_short() -> None:
+    """It has at most 150 lines, and the first command is within the first screen."""
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    assert "pip install . && scm-world discover pushing" in lines[:24]
 
 
 def test_the_tables_of_variables_are_up_to_date() -> None:
@@ -94,8 +156,8 @@ def test_examples_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("name", SHORT)
 def test_examples_of_training_are_short(name: str) -> None:
-    """Each has fewer than 60 lines, so that it is read in one go."""
-    assert len((ROOT / "examples" / f"{name}.py").read_text().splitlines()) < 60
+    """Each has at most 60 lines, so that it is read in one go."""
+    assert len((ROOT / "examples" / f"{name}.py").read_text().splitlines()) <= 60
 
 
 def test_import_is_silent_and_light() -> None:

@@ -7,7 +7,7 @@
     python -m benchmarks.speed --quick --out DIR  # everything in a minute; the figures are rough
 
 It stays on one core (but where threads and workers are compared), writes ``results.json`` and
-``speed.png``, and its tables into ``benchmarks/README.md``. Sides that are compared take turns;
+``speed.png``, and its tables into ``docs/benchmarks/index.md``. Sides that are compared take turns;
 ratios are medians over rounds. The predecessor, CausalWorld 1.2, gets an environment of its own in
 the cache, unless ``--predecessor`` names an interpreter that has it.
 """
@@ -42,6 +42,7 @@ from scm_world.output.durable import write_durably
 from scm_world.queries.experiments.versions import versions
 
 HERE = Path(__file__).parent
+DOCS = HERE.parents[1] / "docs"
 SECTIONS: dict[str, Callable[[Settings], dict[str, Any]]] = {
     "step": stepping,
     "predecessor": comparing,
@@ -80,7 +81,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     if unknown:
         parser.error(f"there is no {min(unknown)!r}; there are {', '.join(SECTIONS)}")
     if found.page is None and found.out == HERE:
-        found.page = HERE.parent / "README.md"
+        found.page = DOCS / "benchmarks" / "index.md"
     return found
 
 
@@ -142,7 +143,7 @@ def main(given: list[str] | None = None) -> None:
         if not measured(name, settings, core, document):
             broken.append(name)
         write_durably(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode())
-    draw(document["results"], asked.out / "speed.png")
+    draw(document["results"], (DOCS / "images" if asked.out == HERE else asked.out) / "speed.png")
     if asked.page is not None:
         put(page(document), asked.page)
     print("\n".join(goals(document["results"])))

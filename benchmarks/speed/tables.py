@@ -1,4 +1,4 @@
-"""The page: markdown tables of all figures, between two marks in ``benchmarks/README.md``."""
+"""The page: markdown tables of all figures, between two marks in ``docs/benchmarks/index.md``."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def page(document: dict[str, Any]) -> str:
     packages = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     machine = f"{about['processor']}, {about['cores']} cores, {about['system']}"
     lines = [f"Measured on {machine}; {packages}.", ""]
-    lines += ["![what a step costs](speed/speed.png)", ""]
+    lines += ["![what a step costs](../images/speed.png)", ""]
     for title, (write, words) in SECTIONS.items():
         written = write(results)
         if written:
