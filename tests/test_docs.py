@@ -11,9 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import typer.main
 
-from scm_world.cli import app
 from scm_world.errors import MissingExtra
 
 ROOT = Path(__file__).parent.parent
@@ -73,19 +71,6 @@ def test_every_example_is_shown() -> None:
     """The page of examples shows every file of the folder once."""
     shown = re.findall(r'^--8<-- "examples/(\w+)\.py"$', EXAMPLES_PAGE.read_text(), re.MULTILINE)
     assert sorted(shown) == sorted(path.stem for path in (ROOT / "examples").glob("*.py"))
-
-
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_commands_in_documents_exist(path: Path) -> None:
-    """Every ``scm-world`` command of a page has that name and those options."""
-    commands = typer.main.get_command(app).commands
-    text = path.read_text().replace("\\\n", " ")
-    for name, rest in re.findall(
-        r"(?:^|`|\$ |&& )scm-world ([a-z]+)([^\n`&#|]*)", text, re.MULTILINE
-    ):
-        known = {option for parameter in commands[name].params for option in parameter.opts}
-        given = {word.partition("=")[0] for word in rest.split() if word.startswith("--")}
-        assert given <= known | {"--help"}, f"scm-world {name}"
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
