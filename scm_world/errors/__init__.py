@@ -14,6 +14,7 @@ allowed and what to do::
     │   ├── OutOfBounds          physically impossible
     │   ├── OutOfSpace           possible, but outside the space that was asked for
     │   ├── ConflictingTargets   two names of one quantity in the same do()
+    │   ├── ClosesCycle          a mechanism that makes variables cause one another at once
     │   ├── Infeasible           two bodies in one place, or a body outside the arena
     │   └── SeveralProblems      more than one of the above
     ├── ActionError              an action the robot cannot take
@@ -42,7 +43,9 @@ from scm_world.errors.engines import (
     SnapshotMismatch,
 )
 from scm_world.errors.interventions import (
+    ClosesCycle,
     ConflictingTargets,
+    CyclicModel,
     Infeasible,
     InterventionError,
     ModelError,
@@ -74,7 +77,9 @@ __all__ = [
     "DAMAGED",
     "ActionError",
     "BudgetExhausted",
+    "ClosesCycle",
     "ConflictingTargets",
+    "CyclicModel",
     "Diverged",
     "EngineError",
     "EngineFailure",

@@ -21,6 +21,19 @@ class ModelError(ScmWorldError, ValueError):
         super().__init__(f"the model has {len(self.problems)} problem(s):\n{lines}")
 
 
+class CyclicModel(ModelError):
+    """A causal model whose contemporaneous edges form cycles.
+
+    Attributes:
+        cycles: The variables of one cycle for each knot.
+    """
+
+    def __init__(self, cycles: Iterable[Sequence[str]]) -> None:
+        self.cycles = tuple(tuple(cycle) for cycle in cycles)
+        paths = (" → ".join([*cycle, cycle[0]]) for cycle in self.cycles)
+        super().__init__([f"contemporaneous edges form a cycle: {path}" for path in paths])
+
+
 class InterventionError(ScmWorldError, ValueError):
     """An intervention that was refused. Nothing has changed.
 
@@ -156,6 +169,23 @@ class ConflictingTargets(InterventionError):
             f"{' and '.join(map(repr, self.names))} both set {quantity!r}; give one of them",
             variable=self.names[0],
         )
+
+
+class ClosesCycle(InterventionError, ModelError):
+    """A mechanism, or a draw from a space that follows others, closes a cycle.
+
+    Attributes:
+        cycle: The variables that would drive one another within an instant.
+        problems: It as one sentence.
+    """
+
+    def __init__(self, name: str, value: Any, cycle: Sequence[str]) -> None:
+        self.cycle = tuple(cycle)
+        path = " → ".join([*self.cycle, self.cycle[0]])
+        self.variable, self.value = name, value
+        message = f"do({name}): contemporaneous edges would form a cycle: {path}"
+        self.problems = (message,)
+        Exception.__init__(self, message)  # that of a model counts its problems
 
 
 class Infeasible(InterventionError):

@@ -11,7 +11,9 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.errors import (
+    ClosesCycle,
     ConflictingTargets,
+    CyclicModel,
     InterventionError,
     ModelError,
     NotIntervenable,
@@ -25,6 +27,7 @@ from scm_world.graph.structure import Edge, Structure, checked
 from scm_world.variables import (
     SOFT,
     Derived,
+    Draw,
     Exogenous,
     Fixed,
     Hard,
@@ -42,11 +45,18 @@ BEFORE = 2**32
 """The step whose noise is that of the instant before the first step."""
 
 
-def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
+def flatten(
+    request: Mapping[str, Any], twice: list[InterventionError] | None = None
+) -> dict[str, Any]:
     """Turn a nested request into dotted names.
 
+    Args:
+        request: Dotted or nested.
+        twice: Where to put the errors about names that are given twice, nested and dotted; the
+            first value of such a name is kept. They are raised if None.
+
     Raises:
-        ConflictingTargets: A name is given twice, nested and dotted.
+        ConflictingTargets: A name is given twice.
         UnknownOption: It is no mapping.
 
     Example:
@@ -56,14 +66,20 @@ def flatten(request: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(request, Mapping):
         raise UnknownOption("request", request, ("a dictionary of variables and values",))
     flat: dict[str, Any] = {}
+    problems: list[InterventionError] = []
     for name, value in request.items():
         if isinstance(value, Mapping):
-            parts = {f"{name}.{key}": part for key, part in flatten(value).items()}
+            inner = flatten(value, problems)
+            parts = {f"{name}.{key}": part for key, part in inner.items()}
         else:
             parts = {name: value}
-        for twice in flat.keys() & parts.keys():
-            raise ConflictingTargets((twice, twice), twice)
-        flat.update(parts)
+        again = [key for key in parts if key in flat]
+        problems += [ConflictingTargets((key, key), key) for key in again]
+        flat = {**parts, **flat} if again else {**flat, **parts}
+    if twice is None:
+        raise_all(problems)
+    else:
+        twice += problems
     return flat
 
 
@@ -252,7 +268,7 @@ class SCM:
 
         Raises:
             InterventionError: With every problem of the request.
-            ModelError: A mechanism, or a draw from a space that follows others, closes a cycle.
+            ClosesCycle: A mechanism, or a draw from a space that follows others, closes a cycle.
         """
         return self._do(request, any_variable=False)
 
@@ -267,7 +283,7 @@ class SCM:
         wanted: dict[str, Intervention] = {}
         problems: list[InterventionError] = []
         targets: dict[str, str] = {}
-        for name, value in flatten(request).items():
+        for name, value in flatten(request, problems).items():
             try:
                 act = self.accept(name, value, any_variable=any_variable)
                 for target in self.targets(name):
@@ -277,14 +293,16 @@ class SCM:
                 wanted[name] = act
             except InterventionError as problem:
                 problems.append(problem)
-        raise_all(problems)
-        return self.with_interventions(wanted)
+        model, cycles = self.without_cycles(wanted)
+        raise_all([*problems, *cycles])
+        return model
 
     def with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
         """Apply interventions that have been checked already; on a bundle, to its parts.
 
         Raises:
-            ModelError: Draws from spaces that follow other variables, or mechanisms, close a cycle.
+            CyclicModel: Draws from spaces that follow other variables, or mechanisms, close a
+                cycle.
         """
         model = object.__new__(type(self))
         model._copy(self)
@@ -305,6 +323,23 @@ class SCM:
         adds = any(adds_edges(act) for act in model._acts.values())
         model._order = model.structure.order if adds else self._order
         return model
+
+    def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
+        """Apply interventions that have been checked already, but for those that close a cycle.
+
+        Returns:
+            The model, and an error for each cycle.
+        """
+        kept, problems = dict(acts), list[ClosesCycle]()
+        while True:
+            try:
+                return self.with_interventions(kept), problems
+            except CyclicModel as error:
+                for cycle in error.cycles:
+                    there = [n for n in kept if not {*self.targets(n)}.isdisjoint(cycle)]
+                    new = [n for n in there if isinstance(kept[n], Draw | Mechanism)]
+                    closing = {name: kept.pop(name) for name in new or there}
+                    problems += [ClosesCycle(*next(iter(closing.items())), cycle)]
 
     def _copy(self, other: SCM) -> None:
         """Be what another model is."""

@@ -11,7 +11,7 @@ from typing import Any, final
 
 import networkx as nx
 
-from scm_world.errors import ModelError, nearest
+from scm_world.errors import CyclicModel, ModelError, nearest
 from scm_world.variables import Derived, Parent, Space, Variable
 
 
@@ -146,17 +146,15 @@ def _topological(names: Iterable[str], edges: Sequence[Edge]) -> tuple[str, ...]
         return tuple(sorter.static_order())
     except CycleError:
         graph = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
-        problems = [f"contemporaneous edges form a cycle: {cycle}" for cycle in _cycles(graph)]
-        raise ModelError(problems) from None
+        raise CyclicModel(_cycles(graph)) from None
 
 
-def _cycles(graph: nx.DiGraph) -> Iterable[str]:
-    """Write down one cycle of every knot of variables that drive one another."""
+def _cycles(graph: nx.DiGraph) -> Iterable[list[str]]:
+    """List one cycle of every knot of variables that drive one another."""
     for knot in nx.strongly_connected_components(graph):
         part = graph.subgraph(knot)
         if part.number_of_edges():
-            edges = nx.find_cycle(part)
-            yield " → ".join([edges[0][0], *(effect for _, effect in edges)])
+            yield [cause for cause, _ in nx.find_cycle(part)]
 
 
 def _space_parents(variable: Variable) -> Iterable[tuple[str, str]]:

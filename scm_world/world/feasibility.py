@@ -107,6 +107,7 @@ def feasible_plan(
     request: Mapping[str, Any],
     space: AnyRegion | None,
     key: Moment,
+    found: Iterable[InterventionError] = (),
 ) -> tuple[InterventionPlan, Difference]:
     """Plan an intervention that puts no two bodies in one place.
 
@@ -121,6 +122,7 @@ def feasible_plan(
         request: The intervention, with dotted names.
         space: Every target has to lie in, if any.
         key: Where to draw.
+        found: Problems of the request that are known already.
 
     Raises:
         InterventionError: See ``plan_intervention``.
@@ -131,7 +133,7 @@ def feasible_plan(
     last: InterventionPlan | None = None
     for attempt in range(ATTEMPTS if draws else 1):
         key = replace(key, attempt=attempt)
-        last = plan = plan_intervention(structures, base, request, space, key, last)
+        last = plan = plan_intervention(structures, base, request, space, key, last, found)
         change = present.difference(plan)
         problems = present.overlaps(base, plan, change)
         if draws and not problems:

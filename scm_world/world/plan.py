@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -23,7 +23,7 @@ from scm_world.variables import Draw, Hard, Intervention, Natural, Null, divided
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
 from scm_world.world.solver import Solver
-from scm_world.world.structures import StructureCache, restructured
+from scm_world.world.structures import StructureCache, restructured, wrong_structure
 
 
 @final
@@ -59,6 +59,7 @@ def plan_intervention(
     space: AnyRegion | None,
     key: Moment,
     last: InterventionPlan | None = None,
+    found: Iterable[InterventionError] = (),
 ) -> InterventionPlan:
     """Compute what the world would be after an intervention.
 
@@ -70,23 +71,28 @@ def plan_intervention(
         key: Where to draw.
         last: An earlier attempt at the same. What is the same again is taken from there; nothing
             comes out differently for that.
+        found: Problems of the request that are known already.
 
     Raises:
-        InterventionError: With every problem of the request.
+        InterventionError: With every problem of the request. Whether bodies overlap is asked only
+            where there is no other problem.
         UnknownOption: There is no such space.
     """
     space = as_region("space", space)
     draws = (name for name, act in request.items() if isinstance(act, Draw))
     earlier = None if last is None else last.solver
     if earlier is None or any(name in structures.head for name in draws):
+        wrong = wrong_structure(structures, base, request)
+        request = {n: act for n, act in request.items() if n not in wrong}
         base = restructured(structures, base, request, key)
         accepted, asked, problems = _accepted(base, request)
+        problems = [*found, *wrong.values(), *problems]
         solver = Solver(base, asked, {**base.pending, **accepted}, key)
     else:  # another draw from the same spaces
         solver, problems = earlier.again(key), []
     base, model = solver.base, solver.base.compiled.model
     with np.errstate(all="ignore"):  # what is not finite is refused by name
-        problems += solver.solve(space, stops=len(structures.head) > 0)
+        problems += solver.solve(space, frozenset(structures.head))
     raise_all(solver.as_asked(problems) if problems else problems)
     nulls = {name: (name, act) for name, act in request.items() if isinstance(act, Null)}
     kept = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from typing import Any, final
 
 import numpy as np
@@ -76,6 +77,7 @@ class Solver:
         self.index = base.index
         self.problems: list[InterventionError] = []
         self._whole: dict[str, Value] = {}  # what bundles are to be
+        self._impossible: set[str] = set()  # their values are not known
 
     def _is_state(self, target: str) -> bool:
         return self._task.model.declared(target).role == "state"
@@ -84,16 +86,19 @@ class Solver:
         """Return a solver of the same request at another draw."""
         return Solver(self.base, self.asked, self.pending, key, self)
 
-    def solve(self, space: AnyRegion | None, *, stops: bool) -> list[InterventionError]:
+    def solve(self, space: AnyRegion | None, head: frozenset[str]) -> list[InterventionError]:
         """Solve for the parameters, then for the states; return what is wrong.
 
         Args:
             space: Every target has to lie in, if any.
-            stops: Whether impossible parameters end it, since bodies may not go with them.
+            head: What decides which bodies there are. Where that is impossible, nothing is known
+                of the bodies, and states are not looked at.
         """
         self._solve_parameters()
-        problems = [] if self.problems and stops else self._set_states()
-        return problems + self._check(space)
+        if head.isdisjoint(self._impossible):
+            self._set_states()
+        self._check(space)
+        return self.problems
 
     def _solve_parameters(self) -> None:
         """Mutilate the model and recompute the descendants of the targets."""
@@ -103,8 +108,13 @@ class Solver:
         targets = tuple(target for target in acts if target in self.static)
         draws = [t for t in targets if isinstance(acts[t][1], Draw)]
         if self._earlier is None:
-            _refuse_moving(acts, self.static, self._task.actions)
-            self.model = self.base.model.with_interventions(dict(acts.values()))
+            moving = _moving(acts, self.static, self._task.actions)
+            kept = {target: named for target, named in acts.items() if target not in moving}
+            self.model, cycles = self.base.model.without_cycles(dict(kept.values()))
+            self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
+            self._impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
+            targets = tuple(target for target in targets if target not in self._impossible)
+            draws = [target for target in draws if target in targets]
             self._order = tuple(self._following(targets))
             if any(self._follows_others(*acts[target]) for target in draws):
                 follow = frozenset(self._order)
@@ -179,16 +189,17 @@ class Solver:
                 impossible.add(name)
                 continue
             known[name] = value = self.model.evaluate(name, known, self._key)
-            if np.shape(value) != variable.shape:  # of a mechanism that a user gave
-                raise WrongShape(name, value, variable.shape, np.shape(value))
             follows = variable.bounds is not None and variable.bounds.parents()
             try:
+                if np.shape(value) != variable.shape:  # of a mechanism that a user gave
+                    raise WrongShape(name, value, variable.shape, np.shape(value))
                 check_bounds(variable, value, self._context() if follows else {})
             except InterventionError as problem:
                 self.problems.append(problem)
                 impossible.add(name)
             else:
                 self.static[name] = value
+        self._impossible |= impossible
 
     def _coordinates(self, name: str) -> Value:
         """Give the value that something has which was asked for, such as other coordinates."""
@@ -205,42 +216,42 @@ class Solver:
             return self._task.view(target, self.state)
         return self.static[target]
 
-    def _set_states(self) -> list[InterventionError]:
+    def _set_states(self) -> None:
         """Set states, and carry along those whose parents were set.
 
         States that others follow come first; a shift or scale starts from where its state was
         carried to.
         """
         self.state = self.base.state.copy()
-        problems: list[InterventionError] = []
         followed = {variable.name for variable in self._task.carried}
         acts = [t for t in self._pending if self._is_state(t)]
         for target in sorted(acts, key=lambda name: name in followed):
             if target not in followed:
-                problems += self._set(target)
+                self._set(target)
         for variable in self._task.carried:
             name, act = self._pending.get(variable.name, (None, None))
             if name is None or isinstance(act, SOFT):
                 self._carry(variable)
             if name is not None:
-                problems += self._set(variable.name)
-        return problems
+                self._set(variable.name)
 
-    def _set(self, target: str) -> list[InterventionError]:
-        value = self._wish(target, *self._pending[target])
-        where = self._task.slices.get(target)
-        if where is not None and same(value, self._task.view(target, self.base.state)):
-            self.state.vector[where] = np.ravel(value)
-            return []
+    def _set(self, target: str) -> None:
+        variable, where = self._task.model.declared(target), self._task.slices.get(target)
         try:
-            check_bounds(self._task.model.declared(target), value, self.static)
+            value = self._wish(target, *self._pending[target])
+            if where is not None and same(value, self._task.view(target, self.base.state)):
+                self.state.vector[where] = np.ravel(value)
+                return
+            if variable.bounds is None or self._impossible.isdisjoint(variable.bounds.parents()):
+                check_bounds(variable, value, self.static)
         except InterventionError as problem:
-            return [problem]
+            if problem.variable not in {p.variable for p in self.problems}:  # of a bundle's parts
+                self.problems.append(problem)
+            return
         if where is None:
             self.index = int(value)
         else:
             self.state.vector[where] = np.ravel(self._exact(target, value))
-        return []
 
     def _exact(self, target: str, value: Value) -> Value:
         """Make a quaternion one of norm 1; other values are as exact as they were given."""
@@ -310,21 +321,23 @@ class Solver:
             return self._task.view(name, self.base.state)
         return self.base.static[name]
 
-    def _check(self, space: AnyRegion | None) -> list[InterventionError]:
-        """Check bounds and the asked space, now that all other values are known."""
-        problems = self.problems
-        if space is None or problems:
-            return problems
+    def _check(self, space: AnyRegion | None) -> None:
+        """Check the asked space, where the value and what the space follows are known."""
+        if space is None:
+            return
         context = self._context()
+        unknown = self._impossible | {problem.variable for problem in self.problems}
         for name in self.asked:
             requested = self._task.model.declared(name)
+            spaces = (s.parents() for s in (requested.bounds, requested.a, requested.b) if s)
+            if not unknown.isdisjoint({name, *self._task.model.targets(name), *chain(*spaces)}):
+                continue
             try:
                 value = self._held(name) if self._is_action(name) else self._coordinates(name)
                 check_space(requested, value, space, context)
             except InterventionError as problem:
                 if not self._asked_within(requested, space, context):
-                    problems.append(problem)
-        return problems
+                    self.problems.append(problem)
 
     def _asked_within(self, requested: Variable, space: AnyRegion, context: Values) -> bool:
         """Tell whether what was asked of other coordinates lies in a space, whatever they keep."""
@@ -385,16 +398,16 @@ class Solver:
         return target, Hard(self._value(target).tolist())
 
 
-def _refuse_moving(
+def _moving(
     acts: Mapping[str, tuple[str, Intervention]],
     static: Mapping[str, Value],
     actions: Iterable[str],
-) -> None:
-    """Refuse parameters that should follow what moves: they change at interventions only.
+) -> dict[str, InterventionError]:
+    """Return an error for each parameter that should follow what moves.
 
-    Raises:
-        InterventionError: With the parents that move, or, of an action, those of earlier.
+    Parameters change at interventions only; actions follow the present, not what was earlier.
     """
+    found: dict[str, InterventionError] = {}
     for target, (name, act) in acts.items():
         if not isinstance(act, Mechanism):
             continue
@@ -404,12 +417,13 @@ def _refuse_moving(
             moving, who, what = [p.name for p in act.parents if p.lag], "an action", "the present"
         if moving:
             asked = whole_of(act, name)
-            raise InterventionError(
+            found[target] = InterventionError(
                 f"do({asked}): {who} can follow {what} only, not {', '.join(moving)}; let a plan "
                 "set it step by step instead",
                 variable=asked,
                 value=act,
             )
+    return found
 
 
 def _followed(requested: Variable, act: Mechanism, values: Values) -> Value:

@@ -19,7 +19,7 @@ from scm_world.graph import SCM, Moment
 from scm_world.models import Model, State
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.tasks.composition import Entity
-from scm_world.variables import Exogenous, Intervention, Measured, Null, Variable
+from scm_world.variables import Exogenous, Intervention, Measured, Mechanism, Null, Variable
 from scm_world.world.compiled_task import (
     CompiledTask,
     Options,
@@ -93,7 +93,9 @@ class StructureCache:
         if not mine:
             return None
         kept = {name: act for name, act in held.interventions.items() if name in self.head}
-        model = self.head.with_interventions(kept).with_interventions(mine)
+        model, cycles = self.head.with_interventions(kept).without_cycles(mine)
+        if cycles:
+            return None  # the intervention will be refused, with the reason
         targets = {target for name in (*kept, *mine) for target in self.head.targets(name)}
         known = {
             v.name: static[v.name]
@@ -150,7 +152,9 @@ def _refused(task: Task) -> Iterator[None]:
 def _possible(variable: Variable, values: Values) -> bool:
     value = values[variable.name]
     bounds = variable.bounds
-    return bool(np.isfinite(value).all()) and (bounds is None or bounds.contains(value, values))
+    if np.shape(value) != variable.shape or not np.isfinite(value).all():
+        return False
+    return bounds is None or bool(bounds.contains(value, values))
 
 
 def _head(task: Task) -> SCM:
@@ -192,11 +196,12 @@ def restructured(
     Args:
         structures: Of the task.
         base: As physics left it.
-        request: With dotted names.
+        request: With dotted names; what it takes away has been checked.
         key: Where to draw.
     """
     present = base.compiled
-    gone = _taken_away(request, base.pending.values(), present.composition.entities)
+    before = {name for name, act in base.pending.values() if isinstance(act, Null)}
+    gone = before | {name for name, act in request.items() if isinstance(act, Null)}
     compiled: CompiledTask | None = None
     if len(structures.head):
         acts = dict(base.pending.values())
@@ -241,37 +246,53 @@ def _state(base: StepBase, compiled: CompiledTask) -> State:
     return state
 
 
-def _taken_away(
-    request: Mapping[str, Any], requests: Iterable[Any], entities: Iterable[Entity]
-) -> frozenset[str]:
-    """Name what a request, and those of the same instant, take away.
+def wrong_structure(
+    structures: StructureCache, base: StepBase, request: Mapping[str, Any]
+) -> dict[str, InterventionError]:
+    """Return an error for each part of a request that cannot decide which bodies there are.
 
-    Args:
-        request: What is asked for now, flat.
-        requests: What was asked for at this instant so far.
-        entities: That there are.
-
-    Raises:
-        InterventionError: It is no block, obstacle or goal.
-        UnknownVariable: There is nothing of this name.
+    Such are removals of what is no block, obstacle or goal, and mechanisms that follow variables
+    which depend on the bodies.
     """
-    asked = {name for name, act in request.items() if isinstance(act, Null)}
-    before = {name for name, act in requests if isinstance(act, Null)}
-    there = {entity.name: entity for entity in entities}
-    for name in sorted(asked - before):
-        entity = there.get(name)
-        if entity is None:
-            raise UnknownVariable(name, there)
-        if not (entity.is_block or entity.is_obstacle or _is_goal(entity)):
-            raise InterventionError(
-                f"do({name}): it cannot be taken away; blocks, obstacles and goals can: "
-                + ", ".join(
-                    n for n, e in there.items() if e.is_block or e.is_obstacle or _is_goal(e)
-                ),
-                variable=name,
-                value=Null(),
-            )
-    return frozenset(asked | before)
+    wrong: dict[str, InterventionError] = {}
+    for name, act in request.items():
+        try:
+            if isinstance(act, Null):
+                _check_removal(base, name)
+            elif isinstance(act, Mechanism) and name in structures.head:
+                _check_parents(structures.head, name, act)
+        except InterventionError as problem:
+            wrong[name] = problem
+    return wrong
+
+
+def _check_parents(head: SCM, name: str, act: Mechanism) -> None:
+    others = [parent.name for parent in act.parents if parent.name not in head or parent.lag]
+    if others:
+        raise InterventionError(
+            f"do({name}): it decides which bodies there are, so it can follow only "
+            f"{', '.join(n for n in head if n != name) or 'nothing'}, not {', '.join(others)}",
+            variable=name,
+            value=act,
+        )
+
+
+def _check_removal(base: StepBase, name: str) -> None:
+    if any(asked == name and isinstance(act, Null) for asked, act in base.pending.values()):
+        return  # it was taken away at this instant
+    there = {entity.name: entity for entity in base.compiled.composition.entities}
+    if name not in there and name in base.compiled.model:
+        base.compiled.model.accept(name, Null())  # which says that it is a variable
+    if name not in there:
+        raise UnknownVariable(name, there)
+    removable = [n for n, e in there.items() if e.is_block or e.is_obstacle or _is_goal(e)]
+    if name not in removable:
+        raise InterventionError(
+            f"do({name}): it cannot be taken away; blocks, obstacles and goals can: "
+            + ", ".join(removable),
+            variable=name,
+            value=Null(),
+        )
 
 
 def _is_goal(entity: Entity) -> bool:

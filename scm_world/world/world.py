@@ -13,7 +13,13 @@ from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.backends.base import EngineSnapshot
-from scm_world.errors import EngineFailure, NotReset, SnapshotMismatch, UnknownOption
+from scm_world.errors import (
+    EngineFailure,
+    InterventionError,
+    NotReset,
+    SnapshotMismatch,
+    UnknownOption,
+)
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.models import ControlMode, Difference, Scene, State
 from scm_world.models.camera import Camera
@@ -368,11 +374,14 @@ class World(WorldAttributes):
             NotReset: There is no episode yet.
         """
         self._require_state()
-        flat = flatten(request)
+        twice: list[InterventionError] = []
+        flat = flatten(request, twice)
         base = self._base or self._step_base()
         region = self.variables_space if space is None else space
         key = self.moment(base.index)
-        plan, change = feasible_plan(self.structures, base, self._present(), flat, region, key)
+        plan, change = feasible_plan(
+            self.structures, base, self._present(), flat, region, key, twice
+        )
         audit = self._commit(plan, change, flat)
         self._base = replace(base, pending=plan.pending)
         if base.at_start:
