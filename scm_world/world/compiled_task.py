@@ -342,6 +342,17 @@ class StepBase:
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
 
+    def value(self, name: str) -> Value | None:
+        """Return a parameter or a state, also in other coordinates; None for anything else."""
+        if name in self.compiled.slices:
+            return self.compiled.view(name, self.state)
+        targets = self.compiled.model.targets(name)
+        if targets == (name,):
+            return self.static.get(name)
+        parts = [self.value(target) for target in targets]
+        known = [part for part in parts if part is not None]
+        return self.compiled.in_coordinates(name, *known) if len(known) == len(parts) else None
+
 
 def beginning(compiled: CompiledTask, key: Moment | None) -> tuple[dict[str, Value], State]:
     """Compute where an episode begins when nobody intervenes.

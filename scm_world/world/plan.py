@@ -129,13 +129,13 @@ def _accepted(
         if isinstance(value, Natural) and name in compiled.entity_names:
             continue  # it is there
         try:
-            act = _checked(base, name, value)
+            kept, act = _checked(base, name, value)
             targets = model.targets(name)
             twice = next((target for target in targets if target in asked), None)
             if twice is not None:
                 raise ConflictingTargets((asked[twice], name), twice)
             asked |= dict.fromkeys(targets, name)
-            for part, own in divided(model.declared(name), act).items():
+            for part, own in divided(model.declared(kept), act).items():
                 accepted[model.target(part)] = (part, own)
         except InterventionError as problem:
             reason = compiled.task.refusal(name)
@@ -145,16 +145,27 @@ def _accepted(
     return accepted, tuple(dict.fromkeys(asked.values())), problems
 
 
-def _checked(base: StepBase, name: str, value: Any) -> Intervention:
-    compiled = base.compiled
+def _checked(base: StepBase, name: str, value: Any) -> tuple[str, Intervention]:
+    """Check an intervention; return it with the name of what it sets.
+
+    Coordinates that are those of the instant set the quantity to what it was at the instant: their
+    inverse is rounded, and taking something back leaves no trace.
+    """
+    model = base.compiled.model
     try:
-        return compiled.model.accept(name, value)
+        act = model.accept(name, value)
     except OutOfBounds as problem:
         # What physics did is possible: a state can always be put back to where it is.
-        present = compiled.view(name, base.state) if name in compiled.slices else None
-        if present is not None and np.array_equal(problem.value, present):
-            return Hard(problem.value)
-        raise
+        present = base.value(name)
+        if present is None or not np.array_equal(problem.value, present):
+            raise
+        act = Hard(problem.value)
+    target = model.target(name)
+    if isinstance(act, Hard) and name != target and name not in base.compiled.bundles:
+        quantity, present = base.value(target), base.value(name)
+        if present is not None and np.array_equal(act.value, np.ravel(present)):
+            return target, Hard(quantity)
+    return name, act
 
 
 def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:

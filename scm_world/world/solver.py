@@ -240,7 +240,7 @@ class Solver:
         try:
             value = self._wish(target, *self._pending[target])
             if where is not None and same(value, self._task.view(target, self.base.state)):
-                self.state.vector[where] = np.ravel(value)
+                self.state.vector[where] = self.base.state.vector[where]
                 return
             if variable.bounds is None or self._impossible.isdisjoint(variable.bounds.parents()):
                 check_bounds(variable, value, self.static)
@@ -264,7 +264,11 @@ class Solver:
         requested: Any = self._task.model.declared(whole)
         if whole == name:
             value = self._wanted(name, act)
-            return np.asarray(value if name == target else requested.inverse.bind()(value))
+            if name == target:
+                return value
+            if np.array_equal(value, self._coordinates(name)):
+                return self._value(target)
+            return np.asarray(requested.inverse.bind()(value))
         if whole not in self._whole:
             self._whole[whole] = self._wanted(whole, act)
         return np.asarray(

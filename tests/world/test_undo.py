@@ -22,7 +22,7 @@ from worlds import (
     shared,
 )
 
-from scm_world.variables import Draw, Scale, Shift
+from scm_world.variables import Draw, Natural, Scale, Shift
 
 
 @pytest.mark.parametrize("horizon", [1, 250])
@@ -129,3 +129,52 @@ def test_what_physics_did_can_always_be_restored(backend: str, task: str) -> Non
         world.do({"joint_positions": REST})
         world.do({"joint_positions": values["joint_positions"]})
         assert same(world.values(), values)
+
+
+def _undo_at_random(backend: str, task: str, cases: int, seed: int) -> None:
+    """Compare futures without an intervention and with one that is undone, at random instants.
+
+    What is undone is drawn among all that can be set; half of the cases write back the present
+    value only.
+    """
+    rng = np.random.default_rng(seed)
+    world = shared(backend, task)
+    names = settable(world)
+    if cases < len(names):
+        names = [name for name in names if world.model.targets(name) != (name,)]
+    for case in range(cases):
+        world.reset(seed=int(rng.integers(1000)))
+        play(world, actions(int(rng.integers(1, 5)), seed=case))
+        horizon = 50 if case % 10 == 0 else 1
+        start, commands = world.snapshot(), actions(horizon, seed=case)
+        values, future = world.values(), play(world, commands)
+        world.restore(start)
+        name = names[case % len(names)]
+        if case // len(names) % 2 == 0:
+            world.do({name: other(world, name)})
+        world.do({name: values[name]})
+        assert same(world.values(), values), name
+        np.testing.assert_array_equal(play(world, commands), future, err_msg=name)
+
+
+@pytest.mark.parametrize(("backend", "task"), PARAMS)
+def test_what_is_undone_in_its_own_coordinates_leaves_no_trace(backend: str, task: str) -> None:
+    """A quantity whose coordinates are set back, or to what they are, keeps its last digit."""
+    _undo_at_random(backend, task, 10, seed=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("backend", "task"), [p for p in PARAMS if "fake" not in str(p.id)])
+def test_what_is_undone_leaves_no_trace_a_thousand_times(backend: str, task: str) -> None:
+    """Any variable, written back or set and set back, at random states."""
+    _undo_at_random(backend, task, 1000, seed=1)
+
+
+@pytest.mark.parametrize(("backend", "task"), PUSHING)
+def test_a_quantity_stays_when_a_change_of_its_coordinates_is_none(backend: str, task: str) -> None:
+    """Shifts by zero and releases in other coordinates keep the quantity."""
+    world = begin(backend, task)
+    values = world.values()
+    for act in (Shift([0.0, 0.0, 0.0]), Scale([1.0, 1.0, 1.0]), Natural()):
+        world.do({"tool_block.cylindrical_position": act, "tool_block.euler_orientation": act})
+        assert same(world.values(), values), act
