@@ -64,7 +64,7 @@ def test_modules_of_the_reference_exist() -> None:
     modules = re.findall(r"^::: (\S+)$", pages, re.MULTILINE)
     assert len(modules) > 10
     for module in modules:
-        importlib.import_module(module)
+        assert importlib.import_module(module).__file__, module  # a folder alone is no module
 
 
 def test_every_example_is_shown() -> None:
