@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
 from scm_world._types import Floats, Integers
+from scm_world.errors import EngineFailure
 from scm_world.models.scene import (
     ControlMode,
     Difference,
@@ -194,6 +195,9 @@ class EngineBatch(ABC):
             substeps: How many steps of ``structure.timestep``.
             into: Where their states are written afterwards: the vector of scene i into the first
                 columns of row i, shape (n, at least layout.size).
+
+        Raises:
+            EngineFailure: A scene lost its state; all others were stepped.
         """
 
 
@@ -211,10 +215,21 @@ class OneByOne(EngineBatch):
     def step(
         self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
     ) -> None:
-        """Step the scenes one after another."""
+        """Step the scenes one after another.
+
+        Raises:
+            EngineFailure: The first one of a scene; all were stepped.
+        """
+        failed: EngineFailure | None = None
         for index in which.tolist():
             backend = self._backends[index]
             structure = backend.structure
-            backend.step(mode, commands[index, : structure.n_commands], substeps)
+            try:
+                backend.step(mode, commands[index, : structure.n_commands], substeps)
+            except EngineFailure as error:
+                said = f"scene {index} of the batch: {error}"
+                failed = failed or EngineFailure(said, error.engine)
             layout = structure.layout
             backend.read(State(layout, into[index, : layout.size]))
+        if failed is not None:
+            raise failed

@@ -366,6 +366,7 @@ class StepBatch(EngineBatch):
                 on how many there are, which is asked once for every number of rows.
         """
         _require_controls(mode)
+        failed: EngineFailure | None = None
         together: dict[StepModel, list[int]] = {}
         for index in which.tolist():
             together.setdefault(self._backends[index].structure, []).append(index)
@@ -375,8 +376,14 @@ class StepBatch(EngineBatch):
                 self._together(model, members, commands[rows, : model.n_commands], substeps)
             else:
                 for row, member in zip(rows, members, strict=True):
-                    member.step(mode, commands[row, : model.n_commands], substeps)
+                    try:
+                        member.step(mode, commands[row, : model.n_commands], substeps)
+                    except EngineFailure as error:
+                        said = f"scene {row} of the batch: {error}"
+                        failed = failed or EngineFailure(said, error.engine)
             into[rows, :size] = [member.vector for member in members]
+        if failed is not None:
+            raise failed
 
     def _together(
         self, model: StepModel, members: list[StepFunction], commands: Floats, substeps: int

@@ -169,7 +169,10 @@ def _space_parents(variable: Variable) -> Iterable[tuple[str, str]]:
 
 
 def _parent_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    named = Counter((parent.name, parent.lag) for parent in variable.all_parents)
+    keys = [(parent.name, parent.lag) for parent in variable.all_parents]
+    if len(set(keys)) == len(keys) and all(name in known for name, _ in keys):
+        return
+    named = Counter(keys)
     for (name, lag), times in named.items():
         if name not in known:
             hint = nearest(name, known)

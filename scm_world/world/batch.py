@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
-from scm_world.errors import UnknownOption
+from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.work.threads import cores
 from scm_world.world.compiled_task import CompiledTask
@@ -153,7 +153,7 @@ class Batch:
 
         Raises:
             NotReset: A world has no episode yet.
-            EngineFailure: The engine lost a state.
+            EngineFailure: The engine lost a state. All other worlds are one step further.
         """
         rows = self._all if which is None else np.flatnonzero(which)
         self.fill(rows)
@@ -163,8 +163,14 @@ class Batch:
             for row in held:
                 commands[row] = self.world(row).decided(commands[row])
         groups = self._grouped(rows)
+        failed: EngineFailure | None = None
         for (table, mode, substeps), members in groups:
-            self._step(table, mode, substeps, members, commands)
+            try:
+                self._step(table, mode, substeps, members, commands)
+            except EngineFailure as error:
+                failed = failed or error
+        if failed is not None:
+            raise failed
         for (table, *_), members in groups if evaluate else ():
             table.compiled.mechanisms.evaluate(table.names, table.matrix, members)
             self._fresh[members] = True

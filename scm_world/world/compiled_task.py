@@ -128,6 +128,7 @@ class CompiledTask:
         commanded: Where each action stands, with the bundles of actions.
         parameter_keys: Which physical parameter each variable sets.
         carried: States that follow others when these are set.
+        set_parents: These others, of each.
         computed: Variables that are computed from what moves, causes before effects.
         static_names: Everything that interventions alone decide, causes before effects.
         random: Variables that are drawn when an episode begins.
@@ -156,7 +157,9 @@ class CompiledTask:
             name for name in self.slices if self.model.declared(name).dtype != "real"
         )
         ordered = map(self.model.declared, self.model.structure.order)
-        self.carried = tuple(v for v in ordered if isinstance(v, Measured) and v.set_parents())
+        measured = [v for v in ordered if isinstance(v, Measured)]
+        self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
+        self.carried = tuple(v for v in measured if v.name in self.set_parents)
         self.computed = _computed(self.model)
         self.static_names = _static(self.model, self.computed)
         self.random = tuple(

@@ -141,8 +141,13 @@ def feasible_plan(
         if not problems:
             return plan, change
         if draws and not attempt:
-            key = replace(key, kept=_immaterial(structures, plan.compiled, request))
-    tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
+            kept = _immaterial(structures, plan.compiled, request)
+            if _stay(structures, plan.compiled, request, kept, problems):
+                tried = "whatever is drawn, "
+                break
+            key = replace(key, kept=kept)
+    else:
+        tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
     raise refusal(structures, base, present, plan, request, problems, key, tried)
 
 
@@ -166,6 +171,31 @@ def _immaterial(
             if not (is_state or moves or hides):
                 found.add(name)
     return frozenset(found)
+
+
+def _stay(
+    structures: StructureCache,
+    compiled: CompiledTask,
+    request: Mapping[str, Any],
+    kept: frozenset[str],
+    problems: Iterable[Overlap],
+) -> bool:
+    """Tell whether an overlap is there whatever is drawn.
+
+    It is where no draw moves anything, or where both bodies are blocks or obstacles that do not
+    follow a draw. Where a draw decides which bodies there are, nothing is known.
+    """
+    draws = {name for name, act in request.items() if isinstance(act, Draw)} - kept
+    if any(name in structures.head for name in draws):
+        return False
+    targets = {target for name in draws for target in compiled.model.targets(name)}
+    moved = targets.union(compiled.static_order(sorted(targets)))
+    for state in compiled.carried:
+        if not moved.isdisjoint(compiled.set_parents[state.name]):
+            moved.add(state.name)
+    anyhow = {*compiled.composition.blocks, *compiled.composition.obstacles}
+    anyhow -= {name.partition(".")[0] for name in moved}
+    return not draws or any(anyhow.issuperset(overlap.bodies) for overlap in problems)
 
 
 def _buried(plan: InterventionPlan, request: Mapping[str, Any]) -> list[Overlap]:

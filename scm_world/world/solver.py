@@ -297,7 +297,7 @@ class Solver:
 
     def _carry(self, variable: Measured) -> None:
         """Let a state follow the parents that act on it when set (a block that grows)."""
-        parents = variable.set_parents()
+        parents = self._task.set_parents[variable.name]
         new = [self._value(parent) for parent in parents]
         where = self._task.slices[variable.name]
         if variable.name in self.base.fresh:

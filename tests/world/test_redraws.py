@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scm_world import Draw, Mechanism, Shift, World
+from scm_world.errors import Infeasible
 from scm_world.variables import Box, Function
 from scm_world.world import feasibility
 from scm_world.world.plan import InterventionPlan, plan_intervention
@@ -90,3 +91,35 @@ def test_a_crowded_draw_is_made_with_few_computations(monkeypatch: pytest.Monkey
     world.do({"joint_positions": Draw("A"), **{name: Draw("A") for name in masses}})
     assert len(attempts) > 5
     assert [computed.count(name) for name in masses] == [1] * len(masses)
+
+
+@pytest.mark.parametrize(
+    ("task", "request_"),
+    [
+        ("pushing", {"tool_block.cartesian_position": [0, 0, 0.01], "floor_color": Draw("A")}),
+        (
+            "stacking2",
+            {
+                "tool_block_1.cartesian_position": [0.0, 0.0, 0.1],
+                "tool_block_2.cartesian_position": [0.0, 0.0, 0.1],
+                "joint_positions": Draw("A"),
+            },
+        ),
+    ],
+)
+def test_what_no_draw_changes_is_refused_without_drawing_again(
+    task: str, request_: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two bodies in one place that follow no draw are refused after the first one."""
+    attempts: list[int] = []
+
+    def counted(*args: Any) -> InterventionPlan:
+        attempts.append(args[4].attempt)
+        return plan_intervention(*args)
+
+    world = World(task, backend="fake")
+    world.reset(seed=1)
+    monkeypatch.setattr(feasibility, "plan_intervention", counted)
+    with pytest.raises(Infeasible, match="whatever is drawn, '"):
+        world.do(request_)
+    assert max(attempts) == 0

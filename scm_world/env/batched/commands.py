@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
-from scm_world.env.batched.crew import located
+from scm_world.env.batched.crew import check_actions
 from scm_world.env.batched.inside import Inside
 from scm_world.env.delta import JOINTS
 from scm_world.env.environment import ScmWorldEnv
-from scm_world.errors import ActionError
 from scm_world.world.batch import Batch, Table
 
 
@@ -54,12 +53,8 @@ class Commands:
         Raises:
             ActionError: A number is not finite.
         """
+        check_actions(rows, actions)
         given = actions[rows].astype(np.float64)
-        bad = rows[~np.isfinite(given).all(axis=1)]
-        if len(bad):
-            row = int(bad[0])
-            said = f"an action is finite numbers, got {actions[row]!r}"
-            raise located(ActionError(said, actions[row]), row)
         if self._delta is not None:
             batch.fill(rows)
             actions = np.array(actions, dtype=np.float64)

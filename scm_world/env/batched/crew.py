@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._types import Integers
 from scm_world.env.batched.sheet import Form, Sheet
 from scm_world.env.copies import EnvSnapshot
-from scm_world.errors import ScmWorldError
+from scm_world.errors import ActionError, ScmWorldError
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 
@@ -49,6 +51,9 @@ class Crew(Protocol):
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step.
 
+        If an action is not finite, none moves. If one fails as it is stepped, all others are one
+        step further, and the first error is raised.
+
         Args:
             which: Which ones, shape (n,), bool.
             actions: Shape (n, n_actions), 64-bit floats; those of the others are not looked at.
@@ -76,6 +81,24 @@ class Crew(Protocol):
 
     def close(self) -> None:
         """Free everything they hold. The sheet can still be read."""
+
+
+def check_actions(rows: Integers, actions: NDArray[Any], first: int = 0) -> None:
+    """Refuse actions that are not finite, before anything moves.
+
+    Args:
+        rows: Who is stepped, shape (m,).
+        actions: Shape (n, n_actions).
+        first: The number of the first one in messages.
+
+    Raises:
+        ActionError: With the number of the environment.
+    """
+    bad = rows[~np.isfinite(actions[rows]).all(axis=1)]
+    if len(bad):
+        row = int(bad[0])
+        said = f"an action is finite numbers, got {actions[row]!r}"
+        raise located(ActionError(said, actions[row]), first + row)
 
 
 def located(error: ScmWorldError, index: int) -> ScmWorldError:

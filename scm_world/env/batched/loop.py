@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.env.batched.crew import located
+from scm_world.env.batched.crew import check_actions, located
 from scm_world.env.batched.sheet import Form, Sheet
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
@@ -66,19 +66,23 @@ class LoopCrew:
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step."""
-        sheet, index = self.sheet, 0
-        try:
-            for index in np.flatnonzero(which).tolist():
+        sheet, rows = self.sheet, np.flatnonzero(which)
+        check_actions(rows, actions, self._first)
+        failed: ScmWorldError | None = None
+        for index in rows.tolist():
+            try:
                 observation, reward, terminated, truncated, info = self.envs[index].step(
                     actions[index]
                 )
-                sheet.rewards[index] = reward
-                sheet.terminations[index] = terminated
-                sheet.truncations[index] = truncated
-                sheet.write(index, observation, info)
-        except ScmWorldError as error:
-            located(error, self._first + index)
-            raise
+            except ScmWorldError as error:
+                failed = failed or located(error, self._first + index)
+                continue
+            sheet.rewards[index] = reward
+            sheet.terminations[index] = terminated
+            sheet.truncations[index] = truncated
+            sheet.write(index, observation, info)
+        if failed is not None:
+            raise failed
 
     def do(
         self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None

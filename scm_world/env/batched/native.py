@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
@@ -18,7 +18,7 @@ from scm_world.env.batched.lens import Lens
 from scm_world.env.batched.loop import LoopCrew
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import REWARD, ScmWorldEnv
-from scm_world.errors import ScmWorldError
+from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.tasks.rewards import one_number
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
@@ -69,8 +69,15 @@ class NativeCrew:
         commands = self._commands.read(rows, actions, self._batch)
         try:
             self._batch.advance(commands, which)
-        except FunctionFailure as error:
-            raise located(error, error.row) from error.__cause__
+        except (FunctionFailure, EngineFailure) as error:  # the others are a step further
+            self._commands.passed(rows)
+            self._bring(rows.tolist())
+            for row in rows.tolist():
+                with suppress(ScmWorldError):
+                    self.sheet.write(row, *self._envs[row].present())
+            if isinstance(error, FunctionFailure):
+                raise located(error, error.row) from error.__cause__
+            raise
         self._commands.passed(rows)
         for table, members in self._batch.tables(rows):
             lens = self._lens(table, int(members[0]))

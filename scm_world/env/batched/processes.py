@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
+from scm_world.env.batched.crew import check_actions
 from scm_world.env.batched.memory import Bell, Carver, meeting_place, share
 from scm_world.env.batched.sheet import Form
 from scm_world.env.batched.station import DONE, RESET, STEP, Desk, Station
@@ -103,6 +104,7 @@ class ProcessCrew:
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step."""
+        check_actions(np.flatnonzero(which), actions)
         self._desk.which[:] = which
         self._desk.actions[:] = actions
         self._ring(STEP, self._busy(which))

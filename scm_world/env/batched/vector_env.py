@@ -145,6 +145,9 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
     def step(self, actions: Any) -> Stepped:
         """Advance all environments one control step.
 
+        If an action is refused, none moves. If one environment fails as it is stepped, all others
+        are one step further; ``present`` shows them. All executors do so.
+
         Args:
             actions: Shape (n, n_actions).
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from crews import check_same
 from scm_world.env import ScmWorldEnv
 from scm_world.env.batched.loop import LoopCrew
 from scm_world.env.batched.native import NativeCrew
-from scm_world.errors import ActionError, InterventionError, ModelError
+from scm_world.errors import ActionError, EngineFailure, InterventionError, ModelError
 from scm_world.tasks import Pushing
 from scm_world.tasks.rewards import term
 
@@ -149,6 +150,52 @@ def test_errors_name_the_environment() -> None:
     with pytest.raises(ActionError, match="environment 2"):
         native.step(EVERYONE, asked)
     compare(loop, native, "after the refusal")
+
+
+@pytest.mark.parametrize("kind", [LoopCrew, NativeCrew])
+def test_where_an_action_is_refused_none_moves(kind: Any) -> None:
+    """Nobody is a step further, not even those before the one with the wrong action."""
+    crew = kind(partial(ScmWorldEnv), COUNT)
+    crew.reset(EVERYONE, range(COUNT), [None] * COUNT)
+    asked = actions(crew, 1)[0]
+    asked[2, 3] = np.nan
+    with pytest.raises(ActionError, match="environment 2"):
+        crew.step(EVERYONE, asked)
+    assert [env.world.index for env in crew.attribute(range(COUNT), "unwrapped")] == [0] * COUNT
+
+
+@pytest.mark.parametrize("kind", [LoopCrew, NativeCrew])
+def test_where_one_fails_all_others_are_a_step_further(
+    kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A state that is lost, and a function that fails, stop no other environment."""
+    monkeypatch.chdir(tmp_path)  # engines may write a log
+    own = term("reward.own", _heavy, ("floor_friction", "control_index"), "Of mine.")
+    task = Pushing(terms=[own], weights={"reward.own": 1.0})
+    crew = kind(partial(ScmWorldEnv, task=task), COUNT)
+    given: list[Any] = [None, {"do": {"floor_friction": 0.7}}, None, None]
+    crew.reset(EVERYONE, range(COUNT), given)
+    alone = ScmWorldEnv(task)
+    asked = actions(crew, 2)
+    with pytest.raises(ModelError, match=r"reward\.own"):
+        crew.step(EVERYONE, asked[0])
+    indices = [env.world.index for env in crew.attribute(range(COUNT), "unwrapped")]
+    assert indices == [1] * COUNT
+    crew.reset(EVERYONE, range(COUNT), [None] * COUNT)
+    envs = crew.attribute(range(COUNT), "unwrapped")
+    envs[1].world.backend.realization.data.qvel[:] = 1e200
+    with pytest.raises(EngineFailure):
+        crew.step(EVERYONE, asked[0])
+    envs = crew.attribute(range(COUNT), "unwrapped")
+    for index in (0, 2, 3):
+        alone.reset(seed=index)
+        shown = alone.step(asked[0][index])[0]
+        assert envs[index].world.index == 1
+        np.testing.assert_array_equal(crew.sheet.observation(index), shown)
+
+
+def _heavy(friction: Any, index: Any) -> float:
+    return float("nan") if float(friction) == 0.7 and int(index) else 0.0
 
 
 def test_a_reward_that_is_no_number() -> None:
