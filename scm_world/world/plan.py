@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -33,23 +34,43 @@ class InterventionPlan:
 
     Attributes:
         compiled: The task in the structure that there would be.
-        model: With the interventions that would hold.
         static: Values of everything that physics does not move.
         state: Where everything would be.
         index: The control step.
-        pending: The interventions at this control step, draws as values.
         asked: The names that were asked for now.
         solver: How it was computed, for another attempt.
+        removals: What was asked to be taken away.
     """
 
     compiled: CompiledTask
-    model: SCM
     static: Mapping[str, Value]
     state: State
     index: int
-    pending: PendingInterventions
     asked: tuple[str, ...] = ()
     solver: Solver | None = None
+    removals: Mapping[str, Null] = field(default_factory=dict)
+
+    # Of hundreds of attempts one is carried out: these are computed for it alone.
+
+    @cached_property
+    def model(self) -> SCM:
+        """With the interventions that would hold."""
+        if self.solver is None:
+            return self.compiled.model
+        fixed = self.solver.fixed
+        return self.solver.model.with_interventions(fixed) if fixed else self.solver.model
+
+    @cached_property
+    def pending(self) -> PendingInterventions:
+        """The interventions at this control step, draws as values."""
+        solver, model = self.solver, self.compiled.model
+        if solver is None:
+            return {}
+        removals = {name: (name, act) for name, act in self.removals.items()}
+        return {
+            target: solver.frozen(target, *named) if target in model else named
+            for target, named in {**solver.pending, **removals}.items()
+        }
 
 
 def plan_intervention(
@@ -90,24 +111,17 @@ def plan_intervention(
         solver = Solver(base, asked, {**base.pending, **accepted}, key)
     else:  # another draw from the same spaces
         solver, problems = earlier.again(key), []
-    base, model = solver.base, solver.base.compiled.model
     with np.errstate(all="ignore"):  # what is not finite is refused by name
         problems += solver.solve(space, frozenset(structures.head))
     raise_all(solver.as_asked(problems) if problems else problems)
-    nulls = {name: (name, act) for name, act in request.items() if isinstance(act, Null)}
-    kept = {
-        target: solver.frozen(target, *named) if target in model else named
-        for target, named in {**solver.pending, **nulls}.items()
-    }
     return InterventionPlan(
-        base.compiled,
-        solver.model,
+        solver.base.compiled,
         solver.static,
         solver.state,
         solver.index,
-        kept,
         solver.asked,
         solver,
+        {name: act for name, act in request.items() if isinstance(act, Null)},
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from itertools import chain
 from typing import Any, final
 
@@ -52,7 +53,7 @@ class Solver:
         static: Values of everything that physics does not move.
         state: Where everything would be.
         index: The control step.
-        model: With the interventions that would hold.
+        model: With the interventions that would hold, draws among them.
         problems: What is wrong with the request.
     """
 
@@ -68,11 +69,11 @@ class Solver:
         self._task, self._key = base.compiled, key
         self._pending = {t: named for t, named in pending.items() if t in base.compiled.model}
         self._earlier = earlier
-        self._fixed: dict[str, Hard] = {}
+        self._draws: list[str] = []
         self._order: tuple[str, ...] = ()
         self._unchanged: frozenset[str] | None = None
         self.static: dict[str, Value] = dict(base.static)
-        self.model = self.drawn = base.model
+        self.model = base.model
         self.state = base.state
         self.index = base.index
         self.problems: list[InterventionError] = []
@@ -120,18 +121,15 @@ class Solver:
                 follow = frozenset(self._order)
                 self._order = tuple(n for n in self.model.structure.order if n in follow)
         else:
-            self.model, self._order = self._earlier.drawn, self._earlier._order
+            self.model, self._order = self._earlier.model, self._earlier._order
             self._unchanged = self._same_again(self._earlier)
-        self.drawn = self.model
         known = dict(self.static)
         for target in targets:
             del known[target]
         if draws:  # and states among them
             known |= self._task.states(self.base.state)
         self._solve(self._order, known)
-        if draws:
-            self._fixed = {target: self._as_drawn(target) for target in draws}
-            self.model = self.model.with_interventions(self._fixed)
+        self._draws = draws
         self._earlier = None  # attempts are no chain
 
     def _following(self, targets: tuple[str, ...]) -> tuple[str, ...]:
@@ -163,15 +161,14 @@ class Solver:
         for name in self._order:
             bounds = self._task.model.declared(name).bounds
             is_bound = bounds is not None and bounds.parents()
-            if is_bound or not anew.isdisjoint(earlier.drawn.structure.parents(name)):
+            if is_bound or not anew.isdisjoint(earlier.model.structure.parents(name)):
                 anew.add(name)
         return frozenset(self._order) - anew
 
-    def _as_drawn(self, target: str) -> Hard:
-        """Hold what came out of a draw."""
-        if self._earlier is not None and target in (self._unchanged or ()):
-            return self._earlier._fixed[target]
-        return Hard(self.static[target].tolist())
+    @cached_property
+    def fixed(self) -> dict[str, Hard]:
+        """What holds the values that came out of draws, by target."""
+        return {target: Hard(self.static[target].tolist()) for target in self._draws}
 
     def _solve(self, order: Iterable[str], known: dict[str, Value]) -> None:
         """Compute variables one after another, and stop where one is impossible.
@@ -397,8 +394,8 @@ class Solver:
         keeps = isinstance(act, (*SOFT, Mechanism, Natural)) and not self._is_state(target)
         if isinstance(act, Hard) or target in self._task.actions or keeps:
             return name, act
-        if target in self._fixed:
-            return target, self._fixed[target]
+        if target in self.fixed:
+            return target, self.fixed[target]
         return target, Hard(self._value(target).tolist())
 
 

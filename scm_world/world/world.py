@@ -256,7 +256,7 @@ class World(WorldAttributes):
         if not compiled.random:
             return
         static, state = beginning(compiled, key)
-        plan = InterventionPlan(compiled, compiled.model, static, state, 0, {})
+        plan = InterventionPlan(compiled, static, state, 0)
         base, present = self._step_base(), self._present()
         change = present.difference(plan)
         problems = present.overlaps(base, plan, change) if compiled.composition.solid else []
