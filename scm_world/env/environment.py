@@ -25,6 +25,7 @@ from scm_world.env.vector import box
 from scm_world.env.window import Window
 from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import scaled_clip_kernel
+from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
@@ -385,8 +386,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
     @property
     def interventions(self) -> tuple[tuple[int, dict[str, Any]], ...]:
-        """What was done in this episode: the control step, and the intervention."""
-        return tuple(self._done)
+        """What was done in this episode: the control step, and the intervention, as copies."""
+        return tuple((index, flatten(acts)) for index, acts in self._done)
 
     def observe(self) -> Observation:
         """Give the observation of the present."""

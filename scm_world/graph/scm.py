@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import replace
 from itertools import chain
 from typing import Any, Self
@@ -48,7 +49,7 @@ BEFORE = 2**32
 def flatten(
     request: Mapping[str, Any], twice: list[InterventionError] | None = None
 ) -> dict[str, Any]:
-    """Turn a nested request into dotted names.
+    """Return a request under dotted names; arrays and lists are copied.
 
     Args:
         request: Dotted or nested.
@@ -72,7 +73,8 @@ def flatten(
             inner = flatten(value, problems)
             parts = {f"{name}.{key}": part for key, part in inner.items()}
         else:
-            parts = {name: value}
+            held = isinstance(value, list | tuple) or hasattr(value, "__array__")
+            parts = {name: deepcopy(value) if held else value}
         again = [key for key in parts if key in flat]
         problems += [ConflictingTargets((key, key), key) for key in again]
         flat = {**parts, **flat} if again else {**flat, **parts}

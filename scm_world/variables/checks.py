@@ -44,6 +44,8 @@ def coerce(variable: Variable, value: Any) -> Value:
         WrongShape: It has another shape.
         NotFinite: It has a NaN or an infinity.
     """
+    if np.ma.isMaskedArray(value):  # there is something under the mask
+        raise WrongType(variable.name, value, _expected(variable))
     try:
         given = np.asarray(value)
     except (ValueError, TypeError):  # a ragged list, or an object that refuses

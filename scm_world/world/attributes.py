@@ -150,7 +150,7 @@ class WorldAttributes:
         numbers = (self.frame_skip, self.max_episode_length)
         options = (self.options.preset, self.action_mode, self.conventions.name)
         finer = () if self.resolution == self.task.resolutions[0] else (self.resolution,)
-        return (self.task.name, *options, *numbers, *finer)
+        return (self.task.name, *options, *numbers, *finer, self.structures.digest)
 
     def describe(self, values: Values, state: State) -> Scene:
         """Describe the scene that some values stand for."""

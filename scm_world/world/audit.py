@@ -106,7 +106,7 @@ def report(
     bundles = plan.compiled.bundles
     known = {*targets, *(part for name in targets for part in bundles.get(name, ()))}
     followed = {
-        name: (before.values[name], value)
+        name: (np.array(before.values[name]), np.array(value))
         for name, value in plan.static.items()
         if value is not before.values.get(name, value)
         and name not in known
@@ -167,4 +167,4 @@ def _outcome(
     if target in compiled.slices:
         return applied, np.array(compiled.view(target, now.state))
     key = compiled.parameter_keys.get(target)
-    return applied, None if key is None else backend.parameters([key])[key]
+    return applied, None if key is None else np.array(backend.parameters([key])[key])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from io import BytesIO
 from typing import Any, final
 
@@ -13,7 +14,7 @@ import numpy as np
 from scm_world._types import Floats, Value
 from scm_world.backends.base import EngineSnapshot
 from scm_world.backends.step import StepModel
-from scm_world.errors import SnapshotMismatch
+from scm_world.errors import ScmWorldError, SnapshotMismatch, in_one_line
 from scm_world.models import Model
 from scm_world.variables import Intervention
 from scm_world.world.compiled_task import PendingInterventions, Plan
@@ -28,7 +29,7 @@ class WorldSnapshot:
 
     Attributes:
         engine: The engine's part; bytes that ``unpacked`` reads once it was pickled.
-        static: Values of everything that physics does not move.
+        kept: Values of everything that physics does not move; ``static`` gives copies.
         interventions: What ``do`` holds.
         previous: Values of one control step ago.
         action: The last action.
@@ -39,14 +40,14 @@ class WorldSnapshot:
         plan: The structure.
         memory: What a world of another kind remembers besides.
         base: The world at this control step before anyone intervened; None after a step. Of it,
-            only ``static``, ``interventions``, ``index``, ``plan`` and what follows here count.
+            only ``kept``, ``interventions``, ``index``, ``plan`` and what follows here count.
         vector: Of a base: where everything is.
         pending: Of a base: what was asked for since.
         at_start: Of a base: whether an episode was just beginning.
     """
 
     engine: EngineSnapshot | bytes | None
-    static: Mapping[str, Value]
+    kept: Mapping[str, Value]
     interventions: Mapping[str, Intervention] = field(default_factory=dict)
     previous: Mapping[str, Value] = field(default_factory=dict)
     action: Floats = field(default_factory=lambda: np.zeros(0))
@@ -61,12 +62,20 @@ class WorldSnapshot:
     pending: PendingInterventions = field(default_factory=dict)
     at_start: bool = False
 
-    def __getstate__(self) -> dict[str, Any]:
-        if self.engine is None or isinstance(self.engine, bytes):
-            return vars(self)
-        file = BytesIO()
-        _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(self.engine)
-        return {**vars(self), "engine": file.getvalue()}
+    @property
+    def static(self) -> dict[str, Value]:
+        """Values of everything that physics does not move, as copies."""
+        return {name: np.array(value) for name, value in self.kept.items()}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle with a checksum."""
+        engine = self.engine
+        if engine is not None and not isinstance(engine, bytes):
+            file = BytesIO()
+            _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(engine)
+            engine = file.getvalue()
+        content = pickle.dumps({**vars(self), "engine": engine}, pickle.HIGHEST_PROTOCOL)
+        return _unpickled, (content, blake2b(content, digest_size=16).digest())
 
     def __deepcopy__(self, memo: dict[int, Any]) -> WorldSnapshot:
         return self  # nothing writes into it
@@ -78,17 +87,37 @@ class WorldSnapshot:
             structure: What the world compiles.
 
         Raises:
-            SnapshotMismatch: It was taken of another model, or is the base of another snapshot.
+            SnapshotMismatch: It was taken of another model, is the base of another snapshot, or is
+                damaged.
         """
         if self.engine is None:
             raise SnapshotMismatch("the snapshot has no engine's part: it is the base of another")
-        if not isinstance(self.engine, bytes):
-            return self.engine
-        found: EngineSnapshot = _Unpickler(BytesIO(self.engine), structure).load()
+        found: Any = self.engine
+        if isinstance(found, bytes):
+            try:
+                found = _Unpickler(BytesIO(found), structure).load()
+            except ScmWorldError:
+                raise
+            except Exception as error:
+                told = f"the snapshot is damaged: {in_one_line(error)}"
+                raise SnapshotMismatch(told) from error
+        if not isinstance(found, EngineSnapshot):
+            raise SnapshotMismatch(f"the snapshot is damaged: {found!r} is no engine's part")
         return found
 
 
-def _reference(structure: Any) -> str | None:
+def _unpickled(content: bytes, checksum: bytes) -> WorldSnapshot:
+    """Read what was pickled.
+
+    Raises:
+        SnapshotMismatch: It is damaged.
+    """
+    if blake2b(content, digest_size=16).digest() != checksum:
+        raise SnapshotMismatch("the snapshot is damaged: its checksum is another one")
+    return WorldSnapshot(**pickle.loads(content))  # noqa: S301 # pickled by whom it is read
+
+
+def reference(structure: Any) -> str | None:
     """Say which model something is, if it is one."""
     if isinstance(structure, StepModel):
         return f"step function {structure.name}"
@@ -100,7 +129,7 @@ class _Pickler(pickle.Pickler):
 
     def persistent_id(self, obj: Any) -> str | None:
         """Give the reference that is written."""
-        return _reference(obj)
+        return reference(obj)
 
 
 class _Unpickler(pickle.Unpickler):
@@ -112,6 +141,6 @@ class _Unpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> Any:
         """Give the model."""
-        if pid != _reference(self._structure):
+        if pid != reference(self._structure):
             raise SnapshotMismatch("the snapshot is one of another model")
         return self._structure

@@ -7,6 +7,8 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import cached_property
+from hashlib import blake2b
 from os import PathLike
 from typing import Any, final
 
@@ -27,6 +29,7 @@ from scm_world.world.compiled_task import (
     StepBase,
     refuse_impossible,
 )
+from scm_world.world.snapshot import reference
 
 KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
@@ -57,6 +60,16 @@ class StructureCache:
         whole = math.floor(seconds / options.control_period + 1e-9)
         self.steps = options.given_length or max(whole, 1)
         refuse_impossible(self.natural(None))
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the variables, whatever arguments declared them, and of the model."""
+        natural = self.natural(None)
+        structure = natural.structure(natural.model.solve(only=natural.static_names))
+        found = blake2b(str(reference(structure)).encode(), digest_size=16)
+        for variable in natural.model.variables:
+            found.update(variable.model_dump_json().encode())
+        return found.hexdigest()
 
     def plan(self, values: Values) -> Plan:
         """Give the structure that values of the head decide."""

@@ -17,8 +17,10 @@ from scm_world.errors import (
     EngineFailure,
     InterventionError,
     NotReset,
+    ScmWorldError,
     SnapshotMismatch,
     UnknownOption,
+    in_one_line,
 )
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.models import ControlMode, Difference, Scene, State
@@ -190,12 +192,14 @@ class World(WorldAttributes):
     def scene(self) -> Scene:
         """Describe the present for a picture, or for another engine."""
         self._require_episode()
-        return self.describe(self._values.now, self._values.state.copy())
+        scene = self.describe(_copies(self._values.now), self._values.state.copy())
+        parameters = {key: np.array(value) for key, value in scene.parameters.items()}
+        return replace(scene, parameters=parameters)
 
     def cameras(self) -> tuple[Camera, ...]:
         """Describe the cameras whose places are variables: the three of the robot."""
         self._require_episode()
-        return self.composition.cameras(self._values.now)
+        return self.composition.cameras(_copies(self._values.now))
 
     def reset(
         self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
@@ -524,7 +528,7 @@ class World(WorldAttributes):
         base = self._base
         saved = base and WorldSnapshot(
             engine=None,
-            static=dict(base.static),
+            kept=base.static,
             interventions=base.model.interventions,
             index=base.index,
             plan=base.compiled.plan,
@@ -534,7 +538,7 @@ class World(WorldAttributes):
         )
         return WorldSnapshot(
             engine=self.backend.snapshot(),
-            static=self._values.static,
+            kept=self._values.static,
             interventions=self._held.interventions,
             previous=self.previous(),
             action=np.array(self._values.action),
@@ -555,31 +559,69 @@ class World(WorldAttributes):
         if not isinstance(snapshot, WorldSnapshot):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
         if snapshot.world != self.identity:
-            raise SnapshotMismatch("the snapshot is one of another task, or of other options")
+            raise SnapshotMismatch(
+                "the snapshot is one of another task, of other arguments of it or of other options"
+            )
+        engine = snapshot.unpacked(self.structure)
+        present, saved = self._checked_base(snapshot), snapshot.base
+        base = None if saved is None else self._checked_base(saved)
+        noise = Noise(snapshot.seed)
         if not self._started:
             self._begin()
-        self.backend.restore(snapshot.unpacked(self.structure))
+        before = self.backend.snapshot()
+        try:
+            self.backend.restore(engine)
+            self._check_restored(present)
+        except BaseException as error:
+            self.backend.restore(before)
+            if isinstance(error, ScmWorldError) or not isinstance(error, Exception):
+                raise
+            raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
         self._lost = ""
-        self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
-        compiled = self.structures.compiled(snapshot.plan)
-        held = compiled.model.with_interventions(snapshot.interventions)
-        self._adopt(compiled, held, snapshot.static, snapshot.index)
+        self.noise, self.episode = noise, snapshot.episode
+        self._adopt(present.compiled, present.model, present.static, snapshot.index)
         self._values.action[:] = snapshot.action
         for name, value in snapshot.previous.items():
             self._values.before[name][...] = value
-        self._base = None
-        if snapshot.base is not None:
-            base = snapshot.base
-            compiled = self.structures.compiled(base.plan)
-            self._base = StepBase(
+        self._base = base
+
+    def _checked_base(self, saved: WorldSnapshot) -> StepBase:
+        """Return what a snapshot holds of a control step; the world stays as it is.
+
+        Raises:
+            SnapshotMismatch: It is damaged.
+        """
+        try:
+            compiled = self.structures.compiled(saved.plan)
+            declared = compiled.model.declared
+            vector = saved.vector if saved.engine is None else compiled.empty_state().vector
+            parts = {**saved.kept, **saved.previous}
+            wrong = [name for name, value in parts.items() if value.shape != declared(name).shape]
+            missing = {*saved.kept} ^ {*compiled.static_names}
+            if saved.engine is not None:
+                missing |= {*saved.previous} ^ {*compiled.mechanisms.earlier}
+            if saved.engine is not None and saved.action.shape != (compiled.n_actions,):
+                wrong.append("the action")
+            if vector.shape != compiled.empty_state().vector.shape:
+                wrong.append("the state")
+            if wrong or missing:
+                raise ValueError(f"no values of {', '.join(sorted([*wrong, *missing]))}")
+            return StepBase(
                 compiled,
-                compiled.model.with_interventions(base.interventions),
-                base.static,
-                compiled.empty_state(base.vector.copy()),
-                base.index,
-                dict(base.pending),
-                base.at_start,
+                compiled.model.with_interventions(saved.interventions),
+                saved.kept,
+                compiled.empty_state(vector.copy()),
+                whole_number("index", saved.index, least=0),
+                dict(saved.pending),
+                saved.at_start,
             )
+        except Exception as error:
+            raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
+
+    def _check_restored(self, present: StepBase) -> None:
+        """Refuse an engine's part that does not belong to the rest of a snapshot."""
+        if self.backend.structure != present.compiled.structure(present.static):
+            raise SnapshotMismatch("the snapshot is damaged: the engine has another structure")
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
@@ -601,6 +643,10 @@ class World(WorldAttributes):
         if self._lost:
             advice = "reset the world, or restore a snapshot"
             raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
+
+
+def _copies(values: Values) -> dict[str, Value]:
+    return {name: np.array(value) for name, value in values.items()}
 
 
 def _close(given: Floats, reported: Floats) -> bool:
