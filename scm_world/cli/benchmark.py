@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,12 +15,14 @@ from scm_world.cli.questions import POLICIES
 from scm_world.cli.tasks import build, suffix
 from scm_world.cli.working import Work
 from scm_world.discovery.benchmark_report import COLUMNS, HEADS, STANDARDISED, Row, summary
-from scm_world.discovery.benchmarks import benchmark, slug
+from scm_world.discovery.benchmarks import BenchmarkResult, benchmark, slug
 from scm_world.discovery.problems import FAMILIES, GroundTruth, TaskView
 from scm_world.errors import UnknownOption
 from scm_world.output.locations import Location
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from scm_world.queries.progress import Progress
 
 INTERRUPTED = 130
@@ -92,11 +95,20 @@ def run(
         said = f"interrupted: {done} runs are safe in {folder}; the same command resumes"
         terminal.print(said, soft_wrap=True)
         return INTERRUPTED
-    for name, rows in summary(result).items():
-        terminal.print(_table(result.problems[name], rows))
+    _print(terminal, result)
     files = ("report.html", "results.md", "results.csv", "budget.png")
     written(terminal, *(folder / name for name in files))
     return 0
+
+
+def _print(terminal: Console, result: BenchmarkResult) -> None:
+    """Print a table for each problem, then why runs were not done."""
+    for name, rows in summary(result).items():
+        terminal.print(_table(result.problems[name], rows))
+    ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
+    for (learner, problem, reason), runs in ended.items():
+        said = f"{learner} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}"
+        terminal.print(said, soft_wrap=True, markup=False)
 
 
 def _split(text: str) -> list[str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world.cli.assignments import parse_assignments
-from scm_world.cli.console import console, table, written
+from scm_world.cli.console import check_writable, console, table, written
 from scm_world.cli.questions import Circumstances, read_outcome, shown_episodes
 from scm_world.cli.tasks import tag
 from scm_world.cli.working import Work
@@ -72,6 +72,7 @@ def run(options: Options, *, out: Location | None) -> int:
     check_files(options.files)
     where = options.where
     folder = out or where.folder(f"collect-{options.design}")
+    check_writable(folder, folder=True)
     world = where.world()
     terminal = console()
     try:

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
+import typer
 from rich.text import Text
 
 from scm_world.cli.console import console, keep_whole, show, table
 from scm_world.cli.evaluation import policies_of
 from scm_world.cli.questions import shown_episodes
+from scm_world.errors import UnknownOption
 from scm_world.evaluation import Causes, Evaluation, check, why
 from scm_world.evaluation.files import false_scores
 from scm_world.output.locations import Location
@@ -70,10 +72,30 @@ class Where:
     trusted: tuple[str, ...] = ()
 
 
+def _chosen(results: Evaluation, where: Where) -> tuple[str, str]:
+    """Choose agent and engine.
+
+    Raises:
+        BadParameter: There are several, or none of the name; with the option that chooses.
+    """
+    found = []
+    for name, option, given in (
+        ("agent", "'--agent'", where.agent),
+        ("engine", "'--backend'", where.engine),
+    ):
+        try:
+            found.append(results.the(name, given))
+        except UnknownOption as error:
+            said = "choose one" if given is None else f"{given!r} is none"
+            message = f"{said} of {', '.join(error.choices)}"
+            raise typer.BadParameter(message, param_hint=option) from None
+    return found[0], found[1]
+
+
 def show_causes(where: Where, protocol: str | None) -> int:
     """Print for each protocol what its variables did to the score; return the exit code."""
     results = Evaluation.load(where.path)
-    agent, engine = results.the("agent", where.agent), results.the("engine", where.engine)
+    agent, engine = _chosen(results, where)
     terminal = console()
     for name in results.protocols if protocol is None else (protocol,):
         found = results.causes(name, where.metric, agent=agent, engine=engine)
@@ -102,13 +124,14 @@ def show_otherwise(where: Where, protocol: str, episode: int, versus: str | None
     """Print what an episode would have been; return the exit code."""
     _look_here(where.trusted, None)
     results = Evaluation.load(where.path)
+    agent, engine = _chosen(results, where)
     with shown_episodes() as progress:
         found = why(
             results,
             protocol,
             episode,
-            agent=where.agent,
-            engine=where.engine,
+            agent=agent,
+            engine=engine,
             metric=where.metric,
             versus=versus,
             trusted=where.trusted,

@@ -11,7 +11,7 @@ import typer
 
 from scm_world.cli.assignments import parse_assignments, parse_value
 from scm_world.cli.collection import check_files, kept, read_measure
-from scm_world.cli.console import console, show, table, written
+from scm_world.cli.console import check_writable, console, show, table, written
 from scm_world.cli.questions import Circumstances, shown_episodes
 from scm_world.cli.tasks import tag
 from scm_world.cli.working import Work
@@ -62,6 +62,7 @@ def run(options: Options, *, out: Location | None) -> int:
     check_files(options.files)
     over, where = read_over(options.over), options.where
     folder = out or where.folder("sweep-" + "-".join(over).replace(".", "_"))
+    check_writable(folder, folder=True)
     plain = where.world()
     world = plain.given(parse_assignments(options.do, "'--do'")) if options.do else plain
     terminal = console()

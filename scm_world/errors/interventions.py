@@ -7,6 +7,9 @@ from typing import Any
 
 from scm_world.errors.base import ScmWorldError, nearest, suggested
 
+SHOWN = 8
+"""Near names that a message lists."""
+
 
 class ModelError(ScmWorldError, ValueError):
     """A causal model that cannot be built.
@@ -52,14 +55,20 @@ class UnknownVariable(InterventionError):
     """No variable has this name.
 
     Attributes:
+        near: Names of which this is the first or the last part, the shortest first.
         suggestion: The nearest name there is, or None.
     """
 
     def __init__(self, name: str, known: Iterable[str]) -> None:
-        self.suggestion = nearest(name, known)
-        super().__init__(
-            f"no variable is named {name!r}{suggested(self.suggestion)}", variable=name
-        )
+        known = list(known)
+        parts = (n for n in known if n.startswith(f"{name}.") or n.endswith(f".{name}"))
+        self.near = tuple(sorted(parts, key=len))
+        self.suggestion = self.near[0] if self.near else nearest(name, known)
+        hint = suggested(self.suggestion)
+        if self.near:
+            more = f" and {len(self.near) - SHOWN} more" if len(self.near) > SHOWN else ""
+            hint = f"; near it are: {', '.join(self.near[:SHOWN])}{more}"
+        super().__init__(f"no variable is named {name!r}{hint}", variable=name)
 
 
 class NotIntervenable(InterventionError):

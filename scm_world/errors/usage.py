@@ -135,10 +135,12 @@ class MissingExtra(ScmWorldError, ImportError):
 
     Attributes:
         package: Its name.
-        extra: The extra of this package that brings it.
+        extra: The extra of this package that brings it; None if none does.
     """
 
-    def __init__(self, package: str, extra: str) -> None:
+    def __init__(self, package: str, extra: str | None = None) -> None:
         self.package, self.extra = package, extra
-        install = f"pip install 'scm-world[{extra}]'"
-        super().__init__(f"this needs the package {package!r}; install it with: {install}")
+        install = package if extra is None else f"'scm-world[{extra}]'"
+        super().__init__(
+            f"this needs the package {package!r}; install it with: pip install {install}"
+        )

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import gymnasium
+
 from scm_world.errors import UnknownOption
 from scm_world.policies import PolicyAbout
 from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
@@ -26,10 +28,18 @@ TASK = "pushing"
 def task_for(task: Task | str | None, agents: Trained) -> Task | str:
     """Choose the task: the one that is given, else the one that the agents were trained for.
 
+    Warn of an agent that was trained for another task than the one that is given.
+
     Raises:
         UnknownOption: They were trained for several.
     """
     if task is not None:
+        given = task if isinstance(task, str) else task.name
+        for name, about in agents:
+            if about is not None and about.task != given:
+                gymnasium.logger.warn(
+                    f"{name!r} was trained for the task {about.task!r}, and acts in {given!r}"
+                )
         return task
     tasks = _distinct(about.task for _, about in agents if about is not None)
     if len(tasks) > 1:

@@ -54,8 +54,7 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
             return value
         case Null():
             raise InterventionError(
-                f"do({variable.name}): a variable cannot be taken away, an entity can: "
-                f"do({variable.name.partition('.')[0]})",
+                f"do({variable.name}): a variable cannot be taken away; a body of a world can be",
                 variable=variable.name,
                 value=value,
             )

@@ -58,6 +58,7 @@ def flatten(
 
     Raises:
         ConflictingTargets: A name is given twice.
+        InterventionError: A nested dictionary is empty.
         UnknownOption: It is no mapping.
 
     Example:
@@ -70,6 +71,9 @@ def flatten(
     problems: list[InterventionError] = []
     for name, value in request.items():
         if isinstance(value, Mapping):
+            if not value:
+                said = f"do({name}): an empty dictionary sets nothing; leave {name!r} out"
+                problems.append(InterventionError(said, variable=name, value=value))
             inner = flatten(value, problems)
             parts = {f"{name}.{key}": part for key, part in inner.items()}
         else:
@@ -356,6 +360,9 @@ class SCM:
         Raises:
             InterventionError: What is wrong with it.
         """
+        if name not in self:
+            settable = (n for n, v in self._declared.items() if v.settable or any_variable)
+            raise UnknownVariable(name, settable)
         target = self.declared(self.target(name))
         whole = whole_of(value, name)
         if whole != name and name not in self.declared(whole).parts:

@@ -23,9 +23,10 @@ def located(given: Location | str) -> Location:
             ``file://`` stands in front, the rest is a path of this machine.
 
     Raises:
-        MissingExtra: fsspec is not installed, and it is a URL of another place.
-        UnknownOption: There is no such protocol, its package is not installed, a password stands
-            in the URL, or a URL was made a ``Path``.
+        MissingExtra: It is a URL of another place, and fsspec or the package of the protocol is not
+            installed.
+        UnknownOption: There is no such protocol, a password stands in the URL, or a URL was made
+            a ``Path``.
 
     Example:
         >>> located("runs/one").name, located("file:///runs/one%202").name

@@ -18,6 +18,9 @@ OBJECT_STORES = ("abfs", "abfss", "az", "gcs", "gs", "memory", "s3", "s3a")
 PARTIAL = ".part"
 """How the names of files end that are not whole yet."""
 
+_PACKAGE = re.compile(r"nstall ['\"`]?([\w.-]+)")
+"""What fsspec says of a protocol whose package is missing."""
+
 _PASSWORD = re.compile(r"://[^/@]*:[^/]*@")
 
 
@@ -33,9 +36,8 @@ class Remote:
         url: Such as ``"s3://bucket/run"``.
 
     Raises:
-        MissingExtra: fsspec is not installed.
-        UnknownOption: There is no such protocol, its package is not installed, or a password
-            stands in the URL.
+        MissingExtra: fsspec, or the package of the protocol, is not installed.
+        UnknownOption: There is no such protocol, or a password stands in the URL.
     """
 
     __slots__ = ("_path", "_protocol")
@@ -246,5 +248,5 @@ def _check(url: str, protocol: str) -> None:
         known = [*OBJECT_STORES, "file", "any other that fsspec knows"]
         raise UnknownOption("protocol of a URL", protocol, known) from None
     except ImportError as error:
-        needed = [f"{protocol}, once its package is there ({error})", "file"]
-        raise UnknownOption("protocol of a URL", protocol, needed) from None
+        named = _PACKAGE.search(str(error))
+        raise MissingExtra(named[1] if named else protocol) from None

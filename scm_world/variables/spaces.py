@@ -8,12 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property, lru_cache
-from typing import Annotated, Any, Literal, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from scm_world._types import Floats, Value, Values
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
 
 TOLERANCE = 1e-9
 """How far outside a closed interval a number still counts as inside, as a share of the end, so that
@@ -21,7 +27,46 @@ a value computed from a parent, or read from a file, is not refused for its last
 beyond which many quantities mean nothing, is exact."""
 
 
-class Frozen(BaseModel):
+class _Named(ModelMetaclass):
+    """Turn what pydantic says of a wrong field into an error of this package."""
+
+    def __call__(self, *given: Any, **fields: Any) -> Any:
+        """Make a declaration.
+
+        Raises:
+            UnknownOption: There is no such field; the nearest one is suggested.
+            ModelError: Fields are wrong or missing; all of them are named.
+        """
+        try:
+            return super().__call__(*given, **fields)
+        except ValidationError as error:
+            raise refused_fields(self, error) from None
+
+
+def refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
+    """Return what is wrong with the fields of a declaration, as an error of this package."""
+    said: dict[str, list[str]] = {}
+    for one in error.errors():
+        cause = one.get("ctx", {}).get("error")
+        if isinstance(cause, ScmWorldError):
+            return cause
+        name = str(one["loc"][0]) if one["loc"] else ""
+        if one["type"] == "extra_forbidden" and len(one["loc"]) == 1:
+            return UnknownOption(f"field of {kind.__name__}", name, kind.model_fields)
+        field = f"{kind.__name__}.{name}" if name else ""
+        if name and one["type"] != "missing" and len(one["loc"]) < 3:
+            field += f" = {one['input']!r}"
+        said.setdefault(field, []).append(one["msg"].removeprefix("Value error, "))
+    return ModelError(
+        [
+            f"{field}: {alternatives}" if field else alternatives
+            for field, words in said.items()
+            for alternatives in [", or ".join(dict.fromkeys(words))]
+        ]
+    )
+
+
+class Frozen(BaseModel, metaclass=_Named):
     """A declaration: immutable, strict about its fields, and the same after a JSON round trip."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -135,6 +180,19 @@ class Box(_Space):
     def __init__(self, low: Any, high: Any, **fields: Any) -> None:
         super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
 
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> Self:
+        ends = (bound if isinstance(bound, tuple) else (bound,) for bound in (self.low, self.high))
+        low, high = (
+            np.array([np.nan if isinstance(part, Affine | Switch) else part for part in end])
+            for end in ends
+        )
+        if low.shape != high.shape and min(low.size, high.size) != 1:
+            raise ValueError(f"a box has corners of one shape; these have {low.size}, {high.size}")
+        if (low > high).any():
+            raise ValueError(f"a box is empty where low > high: {self.low} and {self.high}")
+        return self
+
     @cached_property
     def _followed(self) -> frozenset[str]:
         return frozenset(_parents(self.low, self.high))
@@ -215,6 +273,12 @@ class Integers(_Space):
 
     def __init__(self, low: int, high: int, **fields: Any) -> None:
         super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
+
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> Self:
+        if self.low > self.high:
+            raise ValueError(f"there are no whole numbers from {self.low} to {self.high}")
+        return self
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Tell whether a value is whole and lies between the ends."""

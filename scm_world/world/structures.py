@@ -13,7 +13,6 @@ from os import PathLike
 from typing import Any, final
 
 import numpy as np
-from pydantic import ValidationError
 
 from scm_world._types import Values
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
@@ -153,13 +152,12 @@ def as_structures(task: Task | StructureCache | str, options: Options) -> Struct
 
 @contextmanager
 def _refused(task: Task) -> Iterator[None]:
-    """Say of which task a variable cannot be declared."""
+    """Note of which task a variable cannot be declared."""
     try:
         yield
-    except ValidationError as error:
-        problems = [problem["msg"].removeprefix("Value error, ") for problem in error.errors()]
-        named = [f"a variable of the task {task.name!r}: {problem}" for problem in problems]
-        raise ModelError(named) from error
+    except (ModelError, UnknownOption) as error:
+        error.add_note(f"in the task {task.name!r}")
+        raise
 
 
 def _possible(variable: Variable, values: Values) -> bool:

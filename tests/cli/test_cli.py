@@ -397,3 +397,41 @@ def test_assignments_are_read() -> None:
         parse_assignments(["a"])
     with pytest.raises(ConflictingTargets):
         parse_assignments(["a=1", "a=2"])
+
+
+@pytest.mark.parametrize(
+    "command", [("collect", "pushing"), ("sweep", "pushing", "--over", "tool_block.mass=0.02,0.03")]
+)
+def test_a_file_is_no_folder_for_results(command: tuple[str, ...]) -> None:
+    """What is given as the folder and is a file is refused before anything is run."""
+    Path("there").write_text("mine")
+    refused = call(*command, "--backend=fake", "-n2", "--steps=2", "--out=there")
+    assert refused.exit_code == 2
+    assert "'--out': 'there' is a file" in " ".join(refused.output.split())
+    assert Path("there").read_text() == "mine"
+
+
+def test_a_sweep_counts_episodes_at_a_point() -> None:
+    """Where a folder has more episodes already, the number is that of ``-n``."""
+    command = ("sweep", "pushing", "--over=tool_block.mass=0.02,0.03,0.04", "--backend=fake")
+    options = ("--steps=2", "--outcome=reward", "--out=swept", "--format=csv")
+    assert call(*command, *options, "-n17").exit_code == 0
+    refused = call(*command, *options, "-n5")
+    assert refused.exit_code == 2
+    said = " ".join(refused.output.split())
+    assert "number of episodes at a point cannot be 5; it can be: 17 or more" in said
+
+
+def test_the_reason_of_a_failed_learner_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Below the tables, with the learner, the problem and how many runs it is."""
+    monkeypatch.setattr("sys.path", [*sys.path])
+    lines = ("def broken(data, *, seed=0):", "    raise ValueError('no idea at all')", "")
+    Path("learner_of_a_test.py").write_text("\n".join(lines))
+    done = call(
+        *("discover", "er2:4", "--learner=learner_of_a_test:broken", "--seeds=2", "--budget=10,11"),
+        *("--workers=1", "--out=failed"),
+    )
+    assert done.exit_code == 0, done.output
+    said = " ".join(done.output.split())
+    assert "not done in 6 run(s): " in said
+    assert "no idea at all" in said

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 from scm_world.cli import app
 from scm_world.cli.evaluation import policies_of
 from scm_world.errors import UnknownOption
-from scm_world.evaluation import METRICS, Evaluation, protocols_of
+from scm_world.evaluation import METRICS, Evaluation, evaluate, protocols_of
 from scm_world.policies import save_policy
 
 QUICK = ("--backend", "fake", "--env", "max_episode_length=3", "--workers", "1")
@@ -128,6 +128,30 @@ def test_explain_ranks_causes_and_asks_what_would_have_been() -> None:
     assert one.exit_code == 0, one.output
     assert "tool_block.mass = 0.02" in one.stdout
     assert "goal_block.cylindrical_position" in one.stdout
+
+
+def test_explain_names_the_options_that_choose() -> None:
+    """Of several agents, and of several engines, it says with which option one is chosen."""
+    found = results()
+    for missing, said in (((), "--agent"), (("--agent=nobody",), "'nobody' is none of")):
+        refused = call("explain", "out", *missing)
+        assert refused.exit_code == 2
+        assert said in " ".join(refused.output.split())
+    columns = {**found.columns, "engine": found.columns["engine"].copy()}
+    columns["engine"][::2] = "mujoco"
+    about = {**found.about, "engines": [*found.about["engines"], {"name": "mujoco"}]}
+    Evaluation(about, columns).save("two")
+    refused = call("explain", "two", "--agent", "still")
+    assert refused.exit_code == 2
+    assert "--backend" in refused.output
+    assert "choose one of" in refused.output
+    assert "agent" not in refused.output.partition("Error")[2]
+
+
+def test_an_agent_of_another_task_is_told() -> None:
+    """A policy that was trained for another task acts, with a warning."""
+    with pytest.warns(UserWarning, match="'picking' was trained for the task 'picking'"):
+        evaluate("zoo:picking", "P0", task="pushing", n=1, backend="fake")
 
 
 @pytest.mark.parametrize(

@@ -44,9 +44,9 @@ def test_what_is_done_at_a_reset_counts_more_than_the_start() -> None:
 
 def test_names_of_one_quantity_replace_each_other() -> None:
     """Of two coordinates of one pose the later one counts."""
-    declaration = World("pushing", backend="fake").compiled
+    model = World("pushing", backend="fake").model
     polar, cartesian = "tool_block.cylindrical_position", "tool_block.cartesian_position"
-    found = merged(declaration, {polar: "A", "gravity": 1.0}, {cartesian: 2.0}, {"unheard_of": 3})
+    found = merged(model, {polar: "A", "gravity": 1.0}, {cartesian: 2.0}, {"unheard_of": 3})
     assert found == {"gravity": 1.0, cartesian: 2.0, "unheard_of": 3}
     assert asked({"tool_block": {"mass": "A|B"}}) == {"tool_block.mass": Draw("A|B")}
 

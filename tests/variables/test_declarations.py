@@ -15,6 +15,7 @@ from scm_world.errors import (
     NotFinite,
     OutOfBounds,
     OutOfSpace,
+    UnknownOption,
     WrongShape,
     WrongType,
 )
@@ -123,11 +124,29 @@ def test_every_intervention_survives_json(act: Any) -> None:
 
 
 def test_declarations_are_frozen() -> None:
-    """Nothing can be changed, and no field can be misspelled."""
+    """Nothing can be changed."""
     with pytest.raises(ValidationError):
         VARIABLES[0].name = "other"
-    with pytest.raises(ValidationError):
-        Exogenous(name="x", defualt=1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "said"),
+    [
+        (lambda: Exogenous(name="x", defualt=1.0), UnknownOption, "'defualt'; did you mean 'defa"),
+        (lambda: Box(0.0, 1.0, hihg=2.0), UnknownOption, "field of Box is named 'hihg'"),
+        (lambda: Draw("A", strem="x"), UnknownOption, "did you mean 'stream'"),
+        (lambda: Exogenous(default=1.0), ModelError, r"Exogenous\.name: Field required"),
+        (lambda: Exogenous(name="x", default="much"), ModelError, r"Exogenous\.default = 'much'"),
+        (lambda: Box(1.0, 0.0), ModelError, "a box is empty where low > high"),
+        (lambda: Box((0.0, 1.0), (1.0, 0.0)), ModelError, "a box is empty"),
+        (lambda: Box((0.0, 0.0), (1.0, 1.0, 1.0)), ModelError, "corners of one shape"),
+        (lambda: Integers(3, 1), ModelError, "no whole numbers from 3 to 1"),
+    ],
+)
+def test_wrong_fields_are_errors_of_this_package(make: Any, kind: type, said: str) -> None:
+    """They name the field, what is wrong with it, and the nearest one that there is."""
+    with pytest.raises(kind, match=said):
+        make()
 
 
 @pytest.mark.parametrize(

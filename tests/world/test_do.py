@@ -31,7 +31,7 @@ from scm_world.errors import (
     WrongType,
 )
 from scm_world.models import diff
-from scm_world.variables import Draw, Normal, Scale, Shift
+from scm_world.variables import Draw, Normal, Null, Scale, Shift
 from scm_world.world.plan import plan_intervention
 
 NAN = float("nan")
@@ -232,3 +232,28 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
         assert told.parameters.keys() == expected.parameters.keys()
         assert all(np.array_equal(told.parameters[k], v) for k, v in expected.parameters.items())
         assert told.state == expected.state
+
+
+def test_names_near_an_unknown_one_are_told() -> None:
+    """Of an entity or a quantity alone: what can be set that has it as a part."""
+    world = begin("fake", "pushing")
+    with pytest.raises(UnknownVariable, match=r"near it are: .*tool_block\.mass") as caught:
+        world.do({"tool_block": 0.03})
+    assert "tool_block.type" not in caught.value.near  # a constant
+    with pytest.raises(UnknownVariable, match=r"near it are: tool_block\.mass, .* more"):
+        world.do({"mass": 0.03})
+
+
+@pytest.mark.parametrize("name", ["floor_friction", "tool_block.mass"])
+def test_a_variable_cannot_be_removed(name: str) -> None:
+    """The error says that it is one, and that bodies can be."""
+    said = "a variable cannot be taken away; a body of a world can"
+    with pytest.raises(InterventionError, match=said):
+        begin("fake", "pushing").do({name: Null()})
+
+
+@pytest.mark.parametrize("request_", [{"no_such": {}}, {"tool_block": {}}])
+def test_empty_requests_within_requests_are_refused(request_: dict[str, Any]) -> None:
+    """An empty dictionary under a name sets nothing, whatever the name."""
+    with pytest.raises(InterventionError, match="an empty dictionary sets nothing"):
+        begin("fake", "pushing").do(request_)

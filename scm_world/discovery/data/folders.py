@@ -24,6 +24,21 @@ SHARD = 100
 """Episodes in a file by default."""
 
 
+class FewerEpisodes(UnknownOption):
+    """A folder has more episodes already than are asked for.
+
+    Attributes:
+        there: How many it has.
+        folder: Which one.
+    """
+
+    def __init__(
+        self, asked: int, there: int, folder: str, option: str = "number of episodes"
+    ) -> None:
+        self.there, self.folder = there, folder
+        super().__init__(option, asked, (f"{there} or more: {folder} has so many already",))
+
+
 @final
 @dataclass(frozen=True)
 class Head:
@@ -181,8 +196,7 @@ class Folder:
             reason = f"it holds another dataset: {', '.join(other)} differ"
             raise UnreadableFile(str(self.path), reason, "give another folder")
         if there["n"] > self.head.n:
-            allowed = (f"{there['n']} or more: {self.path} has so many already",)
-            raise UnknownOption("number of episodes", self.head.n, allowed)
+            raise FewerEpisodes(self.head.n, there["n"], str(self.path))
         if there["n"] < self.head.n:
             self.note({})
 

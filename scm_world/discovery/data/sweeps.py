@@ -12,7 +12,7 @@ from scm_world._arguments import whole_number
 from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset
 from scm_world.discovery.data.designs import Design
-from scm_world.discovery.data.folders import SHARD
+from scm_world.discovery.data.folders import SHARD, FewerEpisodes
 from scm_world.discovery.data.levels import Point, points_of
 from scm_world.discovery.data.sources import Part, Tell
 from scm_world.discovery.data.swept import Swept
@@ -90,19 +90,23 @@ def sweep(
     points = points_of(over, world.model)
     setting = Setting(policy, nature, whole_number("steps", steps, least=1), seed)
     source = Grid(world, points, outcomes, setting)
-    data = collect(
-        source,
-        Design(),
-        count * len(points),
-        seed=seed,
-        out=out,
-        shard=shard,
-        format=format,
-        progress=progress,
-        workers=workers,
-        engine=engine,
-        address=address,
-    )
+    try:
+        data = collect(
+            source,
+            Design(),
+            count * len(points),
+            seed=seed,
+            out=out,
+            shard=shard,
+            format=format,
+            progress=progress,
+            workers=workers,
+            engine=engine,
+            address=address,
+        )
+    except FewerEpisodes as error:
+        there = error.there // len(points)
+        raise FewerEpisodes(count, there, error.folder, "number of episodes at a point") from None
     found = Swept(points, data)
     if out is not None:
         found.save(located(out))
