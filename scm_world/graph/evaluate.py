@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.errors import ModelError, ScmWorldError, WrongShape, in_one_line
+from scm_world.errors import ModelError, ScmWorldError, WrongShape, WrongType, in_one_line
 from scm_world.variables import (
     SOFT,
     Derived,
@@ -181,7 +181,10 @@ class Evaluator:
         """Compute what another mechanism makes of a variable."""
         requested = act.requested
         arguments = map(np.array, self._arguments(given.parents, values, previous))  # copies
-        value = np.asarray(given.function.bind()(*arguments))
+        found = given.function.bind()(*arguments)
+        value = np.asarray(found)
+        if value.dtype.kind not in ("iuf" if requested.dtype == "real" else "biuf"):
+            raise WrongType(name, found, f"numbers of shape {requested.shape}")
         if value.shape[value.ndim - len(requested.shape) :] != requested.shape:
             try:
                 value = requested.array(value)

@@ -13,7 +13,7 @@ from worlds import PUSHING, REST, begin, play, same
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import SnapshotMismatch, WrongType
 from scm_world.tasks import ModelTask, StepTask
-from scm_world.variables import Exogenous, Measured
+from scm_world.variables import Exogenous, Measured, Mechanism
 from scm_world.world import World
 
 
@@ -133,3 +133,13 @@ def test_masked_arrays_are_refused() -> None:
     world = begin("fake", "pushing")
     with pytest.raises(WrongType):
         world.do({"gravity": np.ma.masked_array([0.0, 0.0, -5.0], mask=[0, 0, 1])})
+
+
+@pytest.mark.parametrize("given", [np.array([1j, 0.5, 0.5]), np.array([True] * 3), "red", None])
+def test_mechanisms_give_numbers(given: Any) -> None:
+    """What a mechanism of a user gives is checked like a value, and named."""
+    world = begin("fake", "pushing")
+    values = world.values()
+    with pytest.raises(WrongType, match="floor_color"):
+        world.do({"floor_color": Mechanism(lambda friction: given, ["floor_friction"])})
+    assert same(world.values(), values)
