@@ -105,7 +105,7 @@ def reached(tip: Any, target: Any, a: float, b: float) -> float:
 
 def reacher() -> ModelTask:
     """Reach."""
-    tip, target = "fingertip.position", "target.position"
+    tip, target = "body:fingertip.position", "body:target.position"
     return ModelTask(
         str(ASSETS / "reacher.xml"),
         frame_skip=2,

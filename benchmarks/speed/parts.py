@@ -92,7 +92,7 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
     tables, lenses = crew._batch._tables.values(), crew._lenses.values()
     places: list[tuple[str, Any, str]] = [
         (PHYSICS, crew._batch._engine, "step"),
-        *(("mechanisms", table, "evaluate") for table in tables),
+        *(("mechanisms", one, "evaluate") for one in {t.compiled.mechanisms for t in tables}),
         *(("observation", lens, "write") for lens in lenses),
         ("observation", inner, "_observations"),
         ("info", inner, "_infos"),

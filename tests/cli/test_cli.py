@@ -77,7 +77,7 @@ def test_discover_writes_a_report_and_a_picture(task: str) -> None:
     assert (report["task"], report["backend"]) == (task, "mujoco")
     assert (report["seed"], report["probes"]) == (3, 2)
     assert report["versions"]["mujoco"] in result.stdout
-    assert imread("here/graphs.png").shape[:2] == (900, 1600)
+    assert imread("here/graphs.png").shape[1] == 1600
 
 
 def test_discover_says_where_the_default_folder_is() -> None:
@@ -171,11 +171,11 @@ def test_graph_goes_to_a_file(form: str) -> None:
 
 
 def test_graph_as_picture_has_a_default_name() -> None:
-    """The picture of the declared graph is a PNG of 1600 x 900."""
+    """The picture of the declared graph is a PNG 1600 pixels wide."""
     result = call("graph", "reaching", "--format", "png")
 
     assert result.exit_code == 0, result.output
-    assert imread("reaching-graph.png").shape[:2] == (900, 1600)
+    assert imread("reaching-graph.png").shape[1] == 1600
 
 
 # --- do ------------------------------------------------------------------------------------------

@@ -55,7 +55,7 @@ LEAVES: list[Any] = [
     goals("B", besides="goal_block.euler_orientation"),
     interpolate({"block.size": [0.09] * 3, "gravity": [0, 0, 1]}, episodes=9, first=3),
     interpolate({"floor_friction": 0.9}, start={"floor_friction": 0.1}, episodes=2),
-    follow("scm_world.curricula.phrases:poses"),
+    follow("scm_world.tasks.rewards:above"),
     published_curriculum(["goal_actor", "random_actor"], [(0, 1e9, 1, 0), (3, 9, 2, 5)]),
 ]
 
