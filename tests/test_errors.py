@@ -13,7 +13,9 @@ from scm_world import errors
 from scm_world.errors import (
     ActionError,
     BudgetExhausted,
+    ClosesCycle,
     ConflictingTargets,
+    CyclicModel,
     Diverged,
     EngineError,
     EngineFailure,
@@ -116,6 +118,16 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         ModelError(["one", "two"]),
         "the model has 2 problem(s):\n  - one\n  - two",
         {"problems": ("one", "two")},
+    ),
+    (
+        ClosesCycle("x", 1, ("x", "y")),
+        "do(x): contemporaneous edges would form a cycle: x → y → x",
+        {"variable": "x", "cycle": ("x", "y")},
+    ),
+    (
+        CyclicModel([("x", "y")]),
+        "the model has 1 problem(s):\n  - contemporaneous edges form a cycle: x → y → x",
+        {"cycles": (("x", "y"),)},
     ),
     (ActionError("an action is 9 numbers", 3), "an action is 9 numbers", {"action": 3}),
     (NotReset(), "the world has no episode yet; call reset() first", {}),

@@ -17,6 +17,7 @@ allowed and what to do::
     │   ├── ClosesCycle          a mechanism that makes variables cause one another at once
     │   ├── Infeasible           two bodies in one place, or a body outside the arena
     │   └── SeveralProblems      more than one of the above
+    ├── CyclicModel              a causal model with contemporaneous cycles (a ModelError)
     ├── ActionError              an action the robot cannot take
     ├── NotReset                 a world that was never reset
     ├── UnknownOption            a task, backend, preset or mode that does not exist

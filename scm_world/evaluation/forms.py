@@ -34,7 +34,7 @@ def task_for(task: Task | str | None, agents: Trained) -> Task | str:
         UnknownOption: They were trained for several.
     """
     if task is not None:
-        given = task if isinstance(task, str) else task.name
+        given = getattr(task, "name", task)
         for name, about in agents:
             if about is not None and about.task != given:
                 gymnasium.logger.warn(

@@ -212,5 +212,5 @@ def test_a_pickled_snapshot_leaves_the_model_out() -> None:
     other.restore(again)
     other.step([1.0])
     assert all(np.array_equal(other[name], value) for name, value in world.values().items())
-    with pytest.raises(SnapshotMismatch, match="another model"):
+    with pytest.raises(SnapshotMismatch, match="another task, of other arguments"):
         World.from_mjcf(PENDULUM.format(actuator=MOTOR).replace("0.5", "0.6")).restore(again)
