@@ -14,10 +14,10 @@ import numpy as np
 from scm_world.errors import DAMAGED, ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_durably
 from scm_world.policies.scripted import Sequence as Given
-from scm_world.queries.episodes import Episode
+from scm_world.queries.episodes import Episode, episode_of
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
-from scm_world.queries.rollouts import Schedule, Trace, begin, run
+from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
@@ -156,24 +156,16 @@ def load_episode(
     model = twins.task.system.digest if isinstance(twins.task, ModelTask) else None
     if about.get("model") != model:
         raise SnapshotMismatch(f"{file} happened in another model, or one that was changed since")
-    layers = [
+    layers = tuple(
         (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
-    ]
-    trace, schedule = Trace(), Schedule(layers)
+    )
+    unit = Unit(about["seed"], about["number"], layers, Given(actions), about["steps"])
     with twins.twin() as twin:
-        begin(twin, about["seed"], about["number"], schedule, trace)
-        run(twin, trace, schedule, Given(actions), first=0, steps=about["steps"])
+        trace = unit.run(twin)
     if _digest(trace) != about["parameters"]:
         raise SnapshotMismatch(f"{file} happens with other parameters than it did")
     _compare(trace, np.split(states, np.cumsum(lengths)[:-1]), file, about["versions"])
-    return Episode(
-        twins,
-        seed=about["seed"],
-        number=about["number"],
-        layers=layers,
-        steps=about["steps"],
-        trace=trace,
-    )
+    return episode_of(twins, unit, trace)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:

@@ -13,17 +13,15 @@ from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
-from scm_world.queries.parallel import Ending, lived
-from scm_world.queries.plans import Plan
+from scm_world.queries.parallel import Result, run_units
+from scm_world.queries.plans import Layer, Plan
 from scm_world.queries.rollouts import (
     ALL,
     EVERY,
-    Layer,
-    Schedule,
+    Running,
     Trace,
     Unit,
     as_names,
-    begin,
     length,
     run,
 )
@@ -127,20 +125,8 @@ class Episode:
     def replay(self) -> Trace:
         """Go through the episode again, with every variable and every contact written down."""
         if self._all is None:
-            trace = Trace()
             with self.twins.twin() as world:
-                begin(world, self.seed, self.number, Schedule(self.layers), trace)
-                run(
-                    world,
-                    trace,
-                    Schedule(self.layers),
-                    Given(self.trace.actions),
-                    first=0,
-                    steps=self.steps,
-                    names=(ALL,),
-                    contacts=True,
-                )
-            self._all = trace
+                self._all = replace(self._again(), names=(ALL,), contacts=True).run(world)
         return self._all
 
     def __eq__(self, other: object) -> bool:
@@ -180,7 +166,7 @@ class Episode:
         """
         unit = self._unit(do, self._instant(at), actions, as_names(record))
         with self.twins.twin() as world:
-            trace = unit.lived(world, lambda twin: self._arrive(twin, unit.first))
+            trace = unit.run(world, lambda twin: self._arrive(twin, unit.first))
         return episode_of(self.twins, unit, trace)
 
     def _instant(self, at: Any) -> int:
@@ -196,16 +182,20 @@ class Episode:
         whole = tuple(name for name in names if self._is_whole(name, at))
         past = self.trace.until(at)
         past.values = {name: list(self[name][:at]) for name in whole}
-        return Unit(
-            seed=self.seed,
-            number=self.number,
+        again = self._again()
+        return replace(
+            again,
             layers=(*self.layers, (at, Plan(do))),
-            policy=Given(self.trace.actions) if _is_replay(actions) else actions,
-            steps=self.steps,
+            policy=again.policy if _is_replay(actions) else actions,
             names=whole,
             first=at,
             past=past,
         )
+
+    def _again(self) -> Unit:
+        """Return the unit that repeats this episode."""
+        past = Given(self.trace.actions)
+        return Unit(self.seed, self.number, self.layers, past, self.steps)
 
     def _arrive(self, world: System, at: int) -> None:
         """Bring a twin to an instant, before anything is done then that the past does not know."""
@@ -222,7 +212,7 @@ class Episode:
         if near < (at - 1) // EVERY * EVERY:
             if near < 0:
                 near = 0
-                begin(world, self.seed, self.number, Schedule(self.layers), Trace())
+                Running(self._again(), world).begin()
             else:
                 world.restore(self.trace.snapshots[near])
             found = self._go_through(world, near, at).snapshots
@@ -232,10 +222,10 @@ class Episode:
 
     def _go_through(self, world: System, first: int, last: int) -> Trace:
         """Let the same happen again, from after what was done at an instant."""
-        again = Trace(fired=dict(self.trace.fired))
-        past = Given(self.trace.actions)
-        run(world, again, Schedule(self.layers), past, first=first, steps=last)
-        return again
+        running = Running(replace(self._again(), steps=last), world)
+        running.trace.fired = dict(self.trace.fired)
+        run(running, first, last)
+        return running.trace
 
     def _is_whole(self, name: str, at: int) -> bool:
         """Tell whether a variable is there at every instant before one."""
@@ -268,12 +258,12 @@ class Episode:
                 self._arrive(world, at)
                 start = world.snapshot()
         units = [replace(self._unit(do, at, actions, names), start=start) for do in given]
-        return tuple(lived(self.twins, units, partial(self._ended, units), workers))
+        return tuple(run_units(self.twins, units, partial(self._result, units), workers))
 
-    def _ended(self, units: Sequence[Unit], place: int, ending: Ending) -> Episode:
-        if isinstance(ending, Exception):
-            raise ending
-        return episode_of(self.twins, units[place], ending)
+    def _result(self, units: Sequence[Unit], place: int, result: Result) -> Episode:
+        if isinstance(result, Exception):
+            raise result
+        return episode_of(self.twins, units[place], result)
 
 
 def rollout(
@@ -311,7 +301,7 @@ def rollout(
             steps=length(world, steps),
             names=as_names(record),
         )
-        return episode_of(twins, unit, unit.lived(world))
+        return episode_of(twins, unit, unit.run(world))
 
 
 def episode_of(twins: AnyTwins, unit: Unit, trace: Trace) -> Episode:

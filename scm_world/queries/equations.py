@@ -14,16 +14,16 @@ from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, Moment, flatten
-from scm_world.variables import Action, Noise
+from scm_world.variables import Noise
 from scm_world.world import Audit, World
 from scm_world.world.audit import Applied
-from scm_world.world.compiled_task import clipped
+from scm_world.world.compiled_task import ActionVector, slices_of
 from scm_world.world.solver import same
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Layout:
+class Layout(ActionVector):
     """Where the variables of a model stand in one row of numbers.
 
     Attributes:
@@ -36,34 +36,12 @@ class Layout:
     @cached_property
     def slices(self) -> Mapping[str, slice]:
         """Place of each variable."""
-        return _places(self.model, self.model)
+        return slices_of(self.model, self.model)
 
     @cached_property
     def size(self) -> int:
         """How many numbers there are."""
         return max((where.stop for where in self.slices.values()), default=0)
-
-    @cached_property
-    def actions(self) -> Mapping[str, slice]:
-        """Place of each action in the vector of all actions."""
-        declared = self.model.variables
-        return _places(self.model, [v.name for v in declared if isinstance(v, Action)])
-
-    @property
-    def n_actions(self) -> int:
-        """How many numbers all actions have together."""
-        return max((where.stop for where in self.actions.values()), default=0)
-
-    @cached_property
-    def action_bounds(self) -> tuple[Floats, Floats]:
-        """Lower and upper end of all actions, shape (n_actions,) each."""
-        low, high = np.full(self.n_actions, -np.inf), np.full(self.n_actions, np.inf)
-        for name, where in self.actions.items():
-            variable: Any = self.model.declared(name)
-            if variable.bounds is not None:
-                ends = variable.bounds.bounds(variable.shape, {})
-                low[where], high[where] = (np.ravel(end) for end in ends)
-        return low, high
 
     def idle(self) -> dict[str, Value]:
         """Give the value of each action that is nearest to zero."""
@@ -96,14 +74,6 @@ class Layout:
 
     def __getstate__(self) -> dict[str, Any]:
         return {"model": self.model}
-
-
-def _places(model: SCM, names: Any) -> dict[str, slice]:
-    found, end = dict[str, slice](), 0
-    for name in names:
-        start, end = end, end + int(np.prod(model.declared(name).shape, dtype=int))
-        found[name] = slice(start, end)
-    return found
 
 
 @final
@@ -280,7 +250,7 @@ class Equations:
         if rows is not None and rows.ndim == 2:
             given = np.clip(rows, low, high)
         else:
-            given = clipped(action, low, high, "1")
+            given = self.compiled.clipped(action)
         now = {**self._now(), **self._split(given)}
         for name, where in self.compiled.actions.items():
             shape = self.model.declared(name).shape

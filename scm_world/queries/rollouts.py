@@ -1,199 +1,22 @@
-"""How an episode is run: what is done when, the loop, and what it leaves behind."""
+"""How episodes run: the rollout loop, and the trace that it leaves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, final
+from functools import cached_property
+from typing import Any, Protocol, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world._types import Floats, Value
-from scm_world.errors import ActionError, InterventionError
+from scm_world._types import Floats, Integers, Value
+from scm_world.errors import ActionError
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
-from scm_world.queries.plans import Plan
-from scm_world.queries.timed import ACTS, At, Clamp, On
-from scm_world.variables import Hard, Intervention, Mechanism, Natural
+from scm_world.queries.plans import GroupedSchedules, Key, Layer, Schedule
 from scm_world.world import Audit, World
-
-Layer = tuple[int, Plan]
-"""The control step from which a plan counts, and the plan."""
-Key = tuple[int, str, int]
-"""Layer, variable and number of an intervention that waits for an event."""
-
-
-@final
-class Schedule:
-    """Plans over one another: from its first step on, a later one counts for what it names.
-
-    Args:
-        layers: In the order of their making.
-
-    Raises:
-        InterventionError: Something should happen before its plan begins, or a state is to be
-            held at what is no value.
-    """
-
-    def __init__(self, layers: Iterable[Layer]) -> None:
-        self.layers = tuple((start, plan) for start, plan in layers if len(plan))
-        for start, plan in self.layers:
-            for name, part in plan.timed():
-                step = part.step if isinstance(part, At) else start
-                step = part.start if isinstance(part, Clamp) else step
-                if step < start:
-                    raise InterventionError(
-                        f"do({name}): control step {step} is over; the plan begins at {start}",
-                        variable=name,
-                        value=part,
-                    )
-        self._is_simple = not any(True for _, plan in self.layers for _ in plan.timed())
-        self._starts = frozenset(start for start, _ in self.layers)
-
-    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
-        """Give what is to be done at the beginning of a control step.
-
-        Args:
-            world: As it is then; events are looked for in it.
-            step: Number of the control step.
-            fired: When events happened; those that happen now are added.
-        """
-        if self._is_simple and step not in self._starts:
-            return {}
-        found: dict[str, Intervention] = {}
-        for number, name, start, parts in self._owners(step, world):
-            released = False
-            for index, part in enumerate(parts):
-                act = _due(part, step, start, name, world, fired, (number, name, index))
-                if isinstance(part, Clamp) and isinstance(act, Natural) and step == part.stop:
-                    released = True
-                elif act is not None:
-                    found[name] = act
-            if released and name not in found:
-                found[name] = _still_held(parts, step)
-        return found
-
-    def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
-        """Tell whether anything may be due at a control step, without a look at the present.
-
-        Args:
-            world: In the structure that there is then.
-            step: Number of the control step.
-            fired: When events happened.
-        """
-        if self._is_simple or step in self._starts:
-            return step in self._starts
-        return any(
-            _concerns(part, step, start, world, name, fired, (number, name, index))
-            for number, (start, plan) in enumerate(self.layers)
-            if start <= step
-            for name, parts in plan.items()
-            for index, part in enumerate(parts)
-        )
-
-    def _owners(self, step: int, world: System) -> Iterator[tuple[int, str, int, tuple[Any, ...]]]:
-        """List what counts at a step: of each quantity the last plan that names it."""
-        last: dict[str, tuple[int, dict[str, None]]] = {}
-        for number, (start, plan) in enumerate(self.layers):
-            for name in plan if start <= step else ():
-                for target in world.model.targets(name) if name in world.model else (name,):
-                    if last.get(target, (-1, {}))[0] != number:
-                        last[target] = (number, {})
-                    last[target][1][name] = None
-        owners = dict.fromkeys((number, name) for number, names in last.values() for name in names)
-        for number, name in owners:
-            start, plan = self.layers[number]
-            yield number, name, start, plan[name]
-
-
-@final
-class Schedules:
-    """Schedules of groups of episodes that are run together.
-
-    Args:
-        schedules: Of each group.
-    """
-
-    def __init__(self, schedules: Iterable[Schedule]) -> None:
-        self._courses = tuple(schedules)
-
-    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[int, Any]:
-        """Give what is to be done in each group where something is."""
-        found = ((g, schedule.due(world, step, fired)) for g, schedule in enumerate(self._courses))
-        return {group: due for group, due in found if due}
-
-
-def _still_held(parts: tuple[Any, ...], step: int) -> Intervention:
-    """Say what holds where a window ends: a window around it, or the variable's own mechanism."""
-    for part in parts:
-        is_open = isinstance(part, Clamp) and part.start <= step
-        if is_open and (part.stop is None or step < part.stop):
-            held: Intervention = part.act
-            return held
-    return Natural()
-
-
-def _concerns(
-    part: Any,
-    step: int,
-    start: int,
-    world: System,
-    name: str,
-    fired: Mapping[Key, int],
-    key: Key,
-) -> bool:
-    """Tell whether a part may be due at a control step."""
-    match part:
-        case At():
-            return part.step == step
-        case Clamp():
-            if step < part.start or (part.stop is not None and step > part.stop):
-                return False
-            is_held = name not in world.model or _is_state(name, world)
-            return is_held or step in (part.start, part.stop)
-        case On():
-            return step > start and fired.get(key, step) == step
-    return False
-
-
-def _due(
-    part: Any, step: int, start: int, name: str, world: System, fired: dict[Key, int], key: Key
-) -> Intervention | None:
-    act: Intervention | None = None
-    match part:
-        case At():
-            act = part.act if part.step == step else None
-        case Clamp():
-            act = _held(part, step, name, world)
-        case On():
-            if step > start and key not in fired and part.event.happens(world):
-                fired[key] = step
-            act = part.act if fired.get(key) == step else None
-        case _ if isinstance(part, ACTS):
-            act = part if step == start else None
-    return act
-
-
-def _held(part: Clamp, step: int, name: str, world: System) -> Intervention | None:
-    """Say what a clamp does: a state is put back at every step, a parameter is set and released."""
-    if step < part.start or (part.stop is not None and step > part.stop):
-        return None
-    if not _is_state(name, world):
-        return {part.start: part.act, part.stop: Natural()}.get(step)
-    if not isinstance(part.act, Hard | Mechanism):
-        raise InterventionError(
-            f"do({name}): a state is held at a value or by a Mechanism, not by {part.act!r}",
-            variable=name,
-            value=part.act,
-        )
-    return part.act if step != part.stop else None
-
-
-def _is_state(name: str, world: System) -> bool:
-    role: str = world.model.declared(world.model.target(name)).role
-    return role == "state"
-
+from scm_world.world.batch import Batch, Table
 
 EVERY = 10
 """Control steps from one snapshot to the next."""
@@ -242,46 +65,6 @@ class Trace:
         )
 
 
-def run(
-    world: System,
-    trace: Trace,
-    schedule: Schedule | Schedules,
-    policy: Policy,
-    *,
-    first: int,
-    steps: int,
-    names: Iterable[str] = (),
-    contacts: bool = False,
-) -> None:
-    """Go on with a world, and write down what happens.
-
-    Args:
-        world: At the instant ``first``, after what was done then.
-        trace: To go on with; it ends before that instant.
-        schedule: What is done.
-        policy: Who acts.
-        first: Number of the first instant.
-        steps: Number of the last one.
-        names: Variables to write down at every instant; ``ALL`` for all.
-        contacts: Whether to write down which bodies touch, where there are bodies.
-    """
-    wanted = tuple(names)
-    version = -1
-    for step in range(first, steps + 1):
-        if first < step < steps:
-            intervene(world, schedule, step, trace)
-        if world.version != version:
-            version = world.version
-            note_parameters(world, trace, step)
-        write(world, trace, wanted, contacts)
-        if step % EVERY == 0 and step < steps:
-            trace.snapshots[step] = world.snapshot()
-        if step < steps:
-            action = _chosen(policy, world)
-            world.step(action)
-            trace.actions.append(action)
-
-
 def as_names(record: Iterable[str]) -> tuple[str, ...]:
     """Read the names of variables; a text is one name."""
     return (record,) if isinstance(record, str) else tuple(record)
@@ -303,51 +86,6 @@ def _chosen(policy: Policy, world: System) -> Floats:
         raise ActionError("an action is finite numbers", given) from None
 
 
-def begin(
-    world: System, seed: int, number: int, schedule: Schedule | Schedules, trace: Trace
-) -> None:
-    """Begin an episode, with what is due at its first instant.
-
-    Args:
-        world: Any; it is reset.
-        seed: Of the noise.
-        number: Of the episode within that noise.
-        schedule: What is done.
-        trace: Still empty.
-    """
-    world.reset(seed=seed, episode=number)
-    intervene(world, schedule, 0, trace)
-
-
-def intervene(world: System, schedule: Schedule | Schedules, step: int, trace: Trace) -> None:
-    """Do what is due at an instant."""
-    due: Any = schedule.due(world, step, trace.fired)
-    if due:
-        trace.audits[step] = world.do(due)
-
-
-def note_parameters(world: System, trace: Trace, step: int) -> None:
-    """Write down the values of parameters, and the structure if it is another one."""
-    now = world.current()[0] if isinstance(world, World) else {}
-    values = {name: np.array(now[name]) for name in world.static_names}
-    trace.statics.append((step, values))
-    if not trace.declarations or trace.declarations[-1][1].plan != world.compiled.plan:
-        trace.declarations.append((step, world.compiled))
-
-
-def write(world: System, trace: Trace, names: tuple[str, ...], contacts: bool = False) -> None:
-    """Write down an instant, with what else was asked for."""
-    trace.vectors.append(world.vector.copy())
-    if names:
-        there = names if names == (ALL,) else tuple(name for name in names if name in world.model)
-        found = world.values() if names == (ALL,) else world.evaluate(there)
-        for name in found if names == (ALL,) else there:
-            trace.values.setdefault(name, []).append(np.array(found[name]))
-    if contacts and isinstance(world, World):
-        pairs = (tuple(sorted(c.bodies)) for c in world.backend.contacts() if c.force > 0.0)
-        trace.touching.append(frozenset((one, other) for one, other in pairs))
-
-
 def length(system: System, steps: int | None) -> int:
     """Give the number of control steps of an episode; that of the task if None.
 
@@ -363,7 +101,7 @@ def length(system: System, steps: int | None) -> int:
 @final
 @dataclass(frozen=True)
 class Unit:
-    """All that decides what will have happened.
+    """An episode to run: everything that decides its outcome.
 
     Attributes:
         seed: Of the noise.
@@ -371,10 +109,11 @@ class Unit:
         layers: Plans, each with the control step from which it counts.
         policy: Who acts; see ``rollout``.
         steps: How many control steps the episode has.
-        names: Variables to write down at every instant.
+        names: Variables to record at every instant; ``ALL`` for all.
         first: The control step at which it goes on; 0 for a new episode.
         past: What was before that.
         start: The world at that instant, before anything is done then; None for a new episode.
+        contacts: Whether to record which bodies touch, where there are bodies.
     """
 
     seed: int
@@ -386,52 +125,262 @@ class Unit:
     first: int = 0
     past: Trace = field(default_factory=Trace)
     start: Any = None
+    contacts: bool = False
 
-    def goes_on(self) -> Trace:
-        """Give the past, to be gone on with."""
-        trace = self.past.until(self.first)
-        trace.values = {name: list(values) for name, values in self.past.values.items()}
-        return trace
-
-    def arrive(self, world: System) -> None:
-        """Bring a world to the instant at which it goes on."""
-        if self.start is None:
-            world.reset(seed=self.seed, episode=self.number)
-        else:
-            world.restore(self.start)
-
-    def lived(self, world: System, arrive: Callable[[System], None] | None = None) -> Trace:
-        """Let it happen in a world by itself.
+    def run(self, world: System, arrive: Callable[[System], None] | None = None) -> Trace:
+        """Run it in one world.
 
         Args:
             world: Any twin.
-            arrive: Brings it to the first instant; ``Unit.arrive`` if None.
+            arrive: Brings the world to the first instant; a reset or ``start`` if None.
 
         Raises:
             InterventionError: An intervention was refused.
             ActionError: The policy gave no action.
         """
-        schedule, trace = Schedule(self.layers), self.goes_on()
-        (arrive or self.arrive)(world)
-        intervene(world, schedule, self.first, trace)
-        run(
-            world,
-            trace,
-            schedule,
-            self.acts(world),
-            first=self.first,
-            steps=self.steps,
-            names=self.names,
-        )
-        return trace
+        running = Running(self, world)
+        running.begin(arrive)
+        run(running, self.first, self.steps)
+        return running.trace
 
-    def ended(self, world: System) -> Trace | Exception:
-        """Let it happen in a world by itself; give what stopped it, if something did."""
+    def result(self, world: System) -> Trace | Exception:
+        """Run it in one world; return its trace, or the exception that stopped it."""
         try:
-            return self.lived(world)
+            return self.run(world)
         except Exception as error:
             return error
 
-    def acts(self, world: System | None = None) -> Policy:
-        """Make the policy, for one life, in a world if it is known."""
-        return as_policy(self.policy, world)
+
+class Runs(Protocol):
+    """Episodes under way: one in a world or in equations, or those in the rows of a batch."""
+
+    def intervene(self, step: int) -> None:
+        """Do what is due at an instant."""
+
+    def record(self, step: int) -> None:
+        """Record an instant, after its interventions."""
+
+    def act(self, step: int) -> None:
+        """Take a control step."""
+
+
+def run(running: Runs, first: int, steps: int) -> None:
+    """Run episodes from one instant to another: the only rollout loop of queries.
+
+    Args:
+        running: At the instant ``first``, after its interventions; recorded up to that instant.
+        first: Number of the first instant.
+        steps: Number of the last one.
+    """
+    for step in range(first, steps + 1):
+        if first < step < steps:
+            running.intervene(step)
+        running.record(step)
+        if step < steps:
+            running.act(step)
+
+
+@final
+class Running:
+    """A unit under way in one world, or in equations that solve several episodes together.
+
+    Args:
+        unit: To run.
+        world: To run it in.
+
+    Attributes:
+        trace: What it has left behind so far.
+    """
+
+    def __init__(self, unit: Unit, world: System) -> None:
+        self.unit, self.world = unit, world
+        self.policy: Any = as_policy(unit.policy, world)
+        self.trace = unit.past.until(unit.first)
+        self.trace.values = {name: list(values) for name, values in unit.past.values.items()}
+        self._version = -1
+
+    @cached_property
+    def schedule(self) -> Schedule | GroupedSchedules:
+        """The interventions of the unit."""
+        return Schedule(self.unit.layers)
+
+    def begin(self, arrive: Callable[[System], None] | None = None) -> None:
+        """Go to the first instant and do what is due then; see ``Unit.run``."""
+        if arrive is not None:
+            arrive(self.world)
+        elif self.unit.start is None:
+            self.world.reset(seed=self.unit.seed, episode=self.unit.number)
+        else:
+            self.world.restore(self.unit.start)
+        self.intervene(self.unit.first)
+
+    def intervene(self, step: int) -> None:
+        """Do what is due at an instant."""
+        due: Any = self.schedule.due(self.world, step, self.trace.fired)
+        if due:
+            self.trace.audits[step] = self.world.do(due)
+
+    def record(self, step: int) -> None:
+        """Record an instant, and of some a snapshot."""
+        self.note(step)
+        if step % EVERY == 0 and step < self.unit.steps:
+            self.trace.snapshots[step] = self.world.snapshot()
+
+    def note(self, step: int) -> None:
+        """Record the state, what else was asked for, and parameters that have changed."""
+        world, trace = self.world, self.trace
+        if world.version != self._version:
+            self._version = world.version
+            now = world.current()[0] if isinstance(world, World) else {}
+            values = {name: np.array(now[name]) for name in world.static_names}
+            trace.statics.append((step, values))
+            if not trace.declarations or trace.declarations[-1][1].plan != world.compiled.plan:
+                trace.declarations.append((step, world.compiled))
+        trace.vectors.append(world.vector.copy())
+        names = self.unit.names
+        if names:
+            there = tuple(name for name in names if name in world.model)
+            found = world.values() if names == (ALL,) else world.evaluate(there)
+            for name in found if names == (ALL,) else there:
+                trace.values.setdefault(name, []).append(np.array(found[name]))
+        if self.unit.contacts and isinstance(world, World):
+            pairs = (tuple(sorted(c.bodies)) for c in world.backend.contacts() if c.force > 0.0)
+            trace.touching.append(frozenset((one, other) for one, other in pairs))
+
+    def act(self, step: int) -> None:
+        """Let the policy act, and take a control step."""
+        action = _chosen(self.policy, self.world)
+        self.world.step(action)
+        self.trace.actions.append(action)
+
+
+@final
+class RunningTogether:
+    """Units under way in the rows of a batch; an error stops one of them, and no other one.
+
+    Args:
+        batch: Of as many worlds or more, whose tables have the names of the units.
+        units: All with the same first control step, as many steps, the same names, and policies
+            whose actions are known beforehand.
+    """
+
+    def __init__(self, batch: Batch, units: Sequence[Unit]) -> None:
+        self._batch = batch
+        self._rows = [Running(unit, batch.world(row)) for row, unit in enumerate(units)]
+        self._errors: dict[int, Exception] = {}
+        self._first, self._steps, self._names = units[0].first, units[0].steps, units[0].names
+        self._goes_on = np.arange(len(batch)) < len(units)
+        self._pending = np.zeros(len(batch), dtype=np.bool_)  # stepped, and not recorded
+        self._shifts = [0] * len(units)  # of the clock: an intervention can set it
+        n_actions = self._rows[0].world.compiled.n_actions
+        self._commands = np.zeros((self._steps, len(batch), n_actions))
+        self._columns: dict[int, tuple[Table, _Columns]] = {}
+        self._numbers: list[list[Floats]] = [[] for _ in units]  # of rows, not in the trace yet
+        self._read_by: list[_Columns | None] = [None] * len(units)
+
+    def begin(self) -> None:
+        """Bring every world to the first instant."""
+        for row in range(len(self._rows)):
+            self._alone(row, self._first)
+
+    def intervene(self, step: int) -> None:
+        """Do what is due at an instant."""
+        for row in np.flatnonzero(self._goes_on).tolist():
+            one = self._rows[row]
+            schedule: Any = one.schedule
+            if schedule.concerns(one.world, step, one.trace.fired):
+                self._alone(row, step)
+
+    def record(self, step: int) -> None:
+        """Record an instant of those rows that have not been recorded by themselves."""
+        rows = np.flatnonzero(self._pending)
+        for table, members in self._batch.tables(rows) if len(rows) else ():
+            if id(table) not in self._columns:
+                self._columns[id(table)] = table, _Columns.of(table, self._names)
+            columns = self._columns[id(table)][1]
+            numbers = table.matrix[members[:, None], columns.read]
+            for row, mine in zip(members.tolist(), numbers, strict=True):
+                self._read_by[row] = columns
+                self._numbers[row].append(mine)
+
+    def act(self, step: int) -> None:
+        """Take a control step in all rows."""
+        if self._goes_on.any():
+            self._batch.advance(self._commands[step], self._goes_on)
+        self._pending[:] = self._goes_on
+
+    def results(self) -> list[Trace | Exception]:
+        """Return what each unit leaves behind, or the exception that stopped it."""
+        for row in range(len(self._rows)):
+            self._flush(row)
+        return [self._errors.get(row, one.trace) for row, one in enumerate(self._rows)]
+
+    def _alone(self, row: int, step: int) -> None:
+        """Let one world begin or intervene by itself, and record the instant."""
+        one = self._rows[row]
+        self._flush(row)
+        self._pending[row] = False
+        self._batch.world(row)
+        try:
+            if step == self._first:
+                one.begin()
+            else:
+                one.intervene(step)
+            one.note(step)
+            shift = one.world.index - step
+            if step == self._first or shift != self._shifts[row]:
+                self._shifts[row] = shift
+                self._look_ahead(row, step)
+        except Exception as error:  # it ends this unit, and no other one
+            self._errors[row] = error
+            self._goes_on[row] = False
+
+    def _look_ahead(self, row: int, step: int) -> None:
+        """Ask a policy for all actions that are left."""
+        one = self._rows[row]
+        given = one.policy.ahead(one.world, one.world.index, self._steps - step)
+        for command, action in zip(self._commands[step:, row], given, strict=True):
+            command[:] = one.world.compiled.clipped(action)
+        one.trace.actions[step:] = np.array(given)
+
+    def _flush(self, row: int) -> None:
+        """Move the numbers of a row into its trace."""
+        columns, trace = self._read_by[row], self._rows[row].trace
+        if not self._numbers[row] or columns is None:
+            return
+        numbers, self._numbers[row] = np.array(self._numbers[row]), []
+        trace.vectors.extend(numbers[:, : columns.size].copy())
+        for name, (place, shape) in columns.names.items():
+            values = trace.values[name]
+            found = numbers[:, place].reshape(-1, *shape)
+            cast = found.astype(values[-1].dtype)  # the last one was recorded by the world itself
+            values.extend(cast if np.array_equal(cast, found, equal_nan=True) else found)
+
+
+@final
+@dataclass
+class _Columns:
+    """Which columns of a table are recorded.
+
+    Attributes:
+        read: The columns, those of the state first.
+        size: How many are those of the state.
+        names: For each variable its place among these columns, and its shape.
+    """
+
+    read: Integers
+    size: int
+    names: dict[str, tuple[slice, tuple[int, ...]]]
+
+    @classmethod
+    def of(cls, table: Table, names: Sequence[str]) -> _Columns:
+        """Find them."""
+        model, width = table.compiled.model, table.state_size
+        parts, places = [np.arange(width)], {}
+        for name in names:
+            if name in model:
+                where = table.where[name]
+                parts.append(np.arange(where.start, where.stop))
+                places[name] = slice(width, width + len(parts[-1])), model.declared(name).shape
+                width += len(parts[-1])
+        return cls(np.concatenate(parts), table.state_size, places)

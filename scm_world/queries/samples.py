@@ -17,7 +17,7 @@ from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode, episode_of
 from scm_world.queries.equations import System
 from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read, watched
-from scm_world.queries.parallel import Ending, lived, paths
+from scm_world.queries.parallel import Result, paths, run_units
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
 from scm_world.queries.rollouts import Unit, as_names, length
@@ -101,7 +101,7 @@ class Setting:
         """
         unit = self.unit(world, self.plan(world, do), number, names)
         with twins.twin() as twin:
-            return episode_of(twins, unit, unit.lived(twin))
+            return episode_of(twins, unit, unit.run(twin))
 
 
 @final
@@ -196,11 +196,11 @@ def sample(
     names = tuple(dict.fromkeys(name for outcome in wanted for name in watched(outcome)))
     done = 0
 
-    def finish(place: int, ending: Ending) -> list[Floats]:
+    def finish(place: int, result: Result) -> list[Floats]:
         nonlocal done
-        if isinstance(ending, Exception):
-            raise ending
-        episode = episode_of(twins, units[place], ending)
+        if isinstance(result, Exception):
+            raise result
+        episode = episode_of(twins, units[place], result)
         found = [read(outcome, episode) for outcome in wanted]
         done += 1
         if progress is not None:
@@ -217,7 +217,7 @@ def sample(
         if progress is not None:
             progress(count, count)
     else:
-        rows = lived(twins, units, finish, setting.workers)
+        rows = run_units(twins, units, finish, setting.workers)
         try:
             found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
         except ValueError:

@@ -43,13 +43,13 @@ class Twins:
     def _clear(self) -> None:
         self._free: list[World] = []
         self._lock = threading.Lock()
-        self._choir: list[World] = []
-        self._crew: Executor | None = None
-        self._singing = threading.RLock()
+        self._members: list[World] = []  # of batches
+        self._batching = threading.RLock()
+        self._executor: Executor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the twins."""
-        private = ("_free", "_lock", "_choir", "_singing", "_crew")
+        private = ("_free", "_lock", "_members", "_batching", "_executor")
         return {name: value for name, value in self.__dict__.items() if name not in private}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -79,8 +79,8 @@ class Twins:
             names: What has to be computed in every step.
             threads: Of the engine.
         """
-        with self._singing:
-            worlds, self._choir = self._choir[:n], self._choir[n:]
+        with self._batching:
+            worlds, self._members = self._members[:n], self._members[n:]
             while len(worlds) < n:
                 worlds.append(self._make(worlds[0].structures if worlds else None))
             try:
@@ -89,26 +89,26 @@ class Twins:
                 for world in worlds:
                     if world.has_begun:
                         world.backend.state()  # it comes back, and the batch can be forgotten
-                self._choir = worlds + self._choir
+                self._members = worlds + self._members
 
     @property
-    def at_hand(self) -> int:
+    def batched(self) -> int:
         """How many twins there are that can be stepped together."""
-        return len(self._choir)
+        return len(self._members)
 
-    def has_crew(self, workers: int) -> bool:
+    def has_executor(self, workers: int) -> bool:
         """Tell whether there are processes already."""
-        return self._crew is not None and self._crew.workers == workers
+        return self._executor is not None and self._executor.workers == workers
 
-    def crew(self, workers: int) -> Executor:
-        """Give processes, which end with the stage."""
+    def executor(self, workers: int) -> Executor:
+        """Return processes, which end with the twins."""
         with self._lock:
-            if self._crew is None or self._crew.workers != workers:
-                if self._crew is not None:
-                    self._crew.close()
-                self._crew = Processes(workers)
-                weakref.finalize(self, self._crew.close)
-            return self._crew
+            if self._executor is None or self._executor.workers != workers:
+                if self._executor is not None:
+                    self._executor.close()
+                self._executor = Processes(workers)
+                weakref.finalize(self, self._executor.close)
+            return self._executor
 
     def _make(self, family: StructureCache | None = None) -> World:
         task = copy.copy(self.task) if family is None else family
@@ -148,12 +148,12 @@ class EquationTwins:
 
 AnyTwins = Twins | EquationTwins
 
-_STAGES: WeakKeyDictionary[World, Twins] = WeakKeyDictionary()
+_TWINS: WeakKeyDictionary[World, Twins] = WeakKeyDictionary()
 
 
 def twins_of(world: World) -> Twins:
     """Give the twins of a world; it lives as long as the world."""
-    found = _STAGES.get(world)
+    found = _TWINS.get(world)
     if found is None:
-        found = _STAGES[world] = Twins(world)
+        found = _TWINS[world] = Twins(world)
     return found

@@ -11,9 +11,8 @@ from typing import Any, Self, final
 from scm_world._types import Floats
 from scm_world.backends import Backend
 from scm_world.queries.equations import System
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Key, Plan, Schedule
 from scm_world.queries.questions import Questions
-from scm_world.queries.rollouts import Key, Schedule
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask

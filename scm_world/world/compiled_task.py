@@ -28,21 +28,69 @@ PendingInterventions = dict[str, tuple[str, Intervention]]
 """By target: the name that was asked for (the target, or coordinates of it), and what for."""
 
 
-def clipped(action: ArrayLike, low: Floats, high: Floats, unit: str) -> Floats:
-    """Return an action clipped to its range, shape (n,).
+def slices_of(model: SCM, names: Iterable[str]) -> dict[str, slice]:
+    """Return the place of each variable in one vector of all."""
+    found, end = dict[str, slice](), 0
+    for name in names:
+        start, end = end, end + int(np.prod(model.declared(name).shape, dtype=int))
+        found[name] = slice(start, end)
+    return found
 
-    Raises:
-        ActionError: It is not n finite numbers.
+
+class ActionVector:
+    """The actions of a causal model, as one vector.
+
+    Attributes:
+        model: The causal model.
     """
-    try:
-        given = np.ascontiguousarray(action, dtype=np.float64)
-    except (TypeError, ValueError):  # text, or a ragged list
-        given = np.full(low.size + 1, np.nan)
-    command = np.empty(low.shape)
-    if given.shape != low.shape or not clip_kernel(given, low, high, command):
-        numbers = "a finite number" if low.size == 1 else f"{low.size} finite numbers"
-        raise ActionError(f"an action is {numbers} [{unit}], got {action!r}", action)
-    return command
+
+    model: SCM
+
+    @cached_property
+    def actions(self) -> Mapping[str, slice]:
+        """Place of each action in the vector of all actions."""
+        declared = self.model.variables
+        return slices_of(self.model, (v.name for v in declared if isinstance(v, Action)))
+
+    @cached_property
+    def n_actions(self) -> int:
+        """How many numbers all actions have together."""
+        return max((where.stop for where in self.actions.values()), default=0)
+
+    @cached_property
+    def action_bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper end of all actions, shape (n_actions,) each."""
+        low, high = np.full(self.n_actions, -np.inf), np.full(self.n_actions, np.inf)
+        for name, where in self.actions.items():
+            variable: Any = self.model.declared(name)
+            if variable.bounds is not None:
+                ends = variable.bounds.bounds(variable.shape, {})
+                low[where], high[where] = (np.ravel(end) for end in ends)
+        return low, high
+
+    @cached_property
+    def action_unit(self) -> str:
+        """Unit of the actions, if they have one in common."""
+        units = {self.model.declared(name).unit for name in self.actions}
+        return units.pop() if len(units) == 1 else "1"
+
+    def clipped(self, action: ArrayLike) -> Floats:
+        """Return an action clipped to its range, shape (n_actions,).
+
+        Raises:
+            ActionError: It is not as many finite numbers.
+        """
+        low, high = self.action_bounds
+        try:
+            given = np.ascontiguousarray(action, dtype=np.float64)
+        except (TypeError, ValueError):  # text, or a ragged list
+            given = np.full(low.size + 1, np.nan)
+        command = np.empty(low.shape)
+        if given.shape != low.shape or not clip_kernel(given, low, high, command):
+            numbers = "a finite number" if low.size == 1 else f"{low.size} finite numbers"
+            said = f"an action is {numbers} [{self.action_unit}], got {action!r}"
+            raise ActionError(said, action)
+        return command
 
 
 @final
@@ -107,7 +155,7 @@ class Options:
         return self.time_unit * self.frame_skip
 
 
-class CompiledTask:
+class CompiledTask(ActionVector):
     """Everything about a world that stays the same as long as its structure does.
 
     Args:
@@ -122,7 +170,6 @@ class CompiledTask:
         slices: Where each state stands in the state vector, and each bundle of states that stand
             there one after another.
         whole: States that are whole numbers.
-        actions: Where each action stands in the vector of all actions.
         bundles: The parts of each bundle.
         parts: Those of all bundles.
         commanded: Where each action stands, with the bundles of actions.
@@ -141,10 +188,6 @@ class CompiledTask:
         self.composition, variables = task.compose(timing)
         self.model = SCM(options.conventions.adapt(variables))
         self.parameter_keys = self.composition.parameters()
-        self.actions: dict[str, slice] = {}
-        for action in (v for v in self.model.variables if isinstance(v, Action)):
-            first = self.n_actions
-            self.actions[action.name] = slice(first, first + int(np.prod(action.shape)))
         self.bundles = {v.name: v.parts for v in self.model.variables if v.parts}
         self.parts = frozenset(part for parts in self.bundles.values() for part in parts)
         self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
@@ -188,36 +231,6 @@ class CompiledTask:
     def entity_names(self) -> frozenset[str]:
         """Names of what stands in the world."""
         return frozenset(entity.name for entity in self.composition.entities)
-
-    @property
-    def n_actions(self) -> int:
-        """How many numbers all actions have together."""
-        return max((where.stop for where in self.actions.values()), default=0)
-
-    @cached_property
-    def action_bounds(self) -> tuple[Floats, Floats]:
-        """Lower and upper end of all actions, shape (n_actions,) each."""
-        low, high = np.full(self.n_actions, -np.inf), np.full(self.n_actions, np.inf)
-        for name, where in self.actions.items():
-            variable: Any = self.model.declared(name)
-            if variable.bounds is not None:
-                ends = variable.bounds.bounds(variable.shape, {})
-                low[where], high[where] = (np.ravel(end) for end in ends)
-        return low, high
-
-    @cached_property
-    def action_unit(self) -> str:
-        """Unit of the actions, if they have one in common."""
-        units = {self.model.declared(name).unit for name in self.actions}
-        return units.pop() if len(units) == 1 else "1"
-
-    def clipped(self, action: ArrayLike) -> Floats:
-        """Return an action clipped to its range, shape (n_actions,).
-
-        Raises:
-            ActionError: It is not as many finite numbers.
-        """
-        return clipped(action, *self.action_bounds, self.action_unit)
 
     def split(self, action: Floats) -> dict[str, Value]:
         """Give every action variable its part of a vector of all, as views."""

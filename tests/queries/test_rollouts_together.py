@@ -17,7 +17,7 @@ from scm_world.discovery.data.collect import source_of
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
 from scm_world.queries import At, Clamp, Contact, On, Outcome, Reaches, World, parallel
 from scm_world.queries.episodes import episode_of
-from scm_world.queries.parallel import advanced, is_known
+from scm_world.queries.parallel import is_known, run_together
 from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import Twins, twins_of
@@ -65,13 +65,13 @@ def units_of(world: World, plans: Sequence[Mapping[str, Any]], **setting: Any) -
 def alone(twins: Twins, units: Sequence[Unit]) -> list[Trace | Exception]:
     """Let units happen one after another."""
     with twins.twin() as world:
-        return [unit.ended(world) for unit in units]
+        return [unit.result(world) for unit in units]
 
 
 def together(twins: Twins, units: Sequence[Unit], threads: int = 2) -> list[Trace | Exception]:
     """Let units happen at the same time."""
     with twins.together(len(units), units[0].names, threads) as batch:
-        return advanced(batch, units)
+        return run_together(batch, units)
 
 
 def same_values(one: Any, other: Any) -> bool:
@@ -188,11 +188,11 @@ def test_samples_are_the_same_together_and_alone(monkeypatch: pytest.MonkeyPatch
     """Numbers, order and progress; and a batch was used for one of them only."""
     world = World("pushing")
     found = [sampled(world, workers=workers) for workers in (None, 1, 2)]
-    assert twins_of(world).at_hand >= parallel.LEAST
+    assert twins_of(world).batched >= parallel.LEAST
     other = World("pushing")
     monkeypatch.setattr(parallel, "LEAST", 10**9)
     found.append(sampled(other))
-    assert twins_of(other).at_hand == 0
+    assert twins_of(other).batched == 0
     for samples in found[1:]:
         assert all(same_values(samples[name], found[0][name]) for name in found[0])
 
@@ -216,7 +216,7 @@ def test_one_refusal_among_many_is_the_one_that_is_told() -> None:
         episode.worlds(dos)
     with pytest.raises(UnknownVariable, match="nothing"):
         episode.worlds(dos[4:])
-    assert twins_of(world).at_hand >= parallel.LEAST
+    assert twins_of(world).batched >= parallel.LEAST
     assert episode.worlds([{}] * 22)[21] == episode
 
 

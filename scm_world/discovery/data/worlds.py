@@ -27,7 +27,7 @@ from scm_world.graph.structure import Edge
 from scm_world.queries.episodes import episode_of
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.outcomes import Outcome, as_outcome
-from scm_world.queries.parallel import Ending, lived
+from scm_world.queries.parallel import Result, run_units
 from scm_world.queries.plans import Plan
 from scm_world.queries.rollouts import Unit
 from scm_world.queries.samples import Setting
@@ -116,21 +116,21 @@ class Episodes:
         regimes = [self._design.regime_of(kind) for kind in chosen]
         lock = threading.Lock()
 
-        def finish(place: int, ending: Ending) -> Floats | str:
+        def finish(place: int, result: Result) -> Floats | str:
             found: Floats | str
-            if isinstance(ending, InterventionError):
-                found = str(ending)
-            elif isinstance(ending, Exception):
-                raise ending
+            if isinstance(result, InterventionError):
+                found = str(result)
+            elif isinstance(result, Exception):
+                raise result
             else:
-                episode = episode_of(self._twins, units[place], ending)
+                episode = episode_of(self._twins, units[place], result)
                 found = self._rows.rows(episode, self._sensors)
             with lock:
                 tell(1)
             return found
 
         units = [self._unit(n, regime) for n, regime in zip(numbers, regimes, strict=True)]
-        found = lived(self._twins, units, finish, self._setting.workers)
+        found = run_units(self._twins, units, finish, self._setting.workers)
         return self._part(list(zip(numbers, regimes, found, strict=True)))
 
     def _unit(self, number: int, regime: Regime) -> Unit:
@@ -150,17 +150,17 @@ class Episodes:
         kept = {*self._world.compiled.slices, *self._world.static_names}
         return tuple(name for name in self._rows.watched if name not in kept)
 
-    def _table(self, lived: Sequence[tuple[int, Regime, Floats]]) -> Dataset:
+    def _table(self, found: Sequence[tuple[int, Regime, Floats]]) -> Dataset:
         numbered: dict[Regime, int] = {}
         regime, episode, step = [], [], []
-        for number, done, rows in lived:
+        for number, done, rows in found:
             for index in range(len(rows)):
                 targets = self._rows.targets(done.targets, index)
                 at = numbered.setdefault(replace(done, targets=targets), len(numbered))
                 regime.append(at)
                 episode.append(number)
                 step.append(index)
-        parts = [rows for _, _, rows in lived]
+        parts = [rows for _, _, rows in found]
         return Dataset(
             values=np.concatenate([np.empty((0, len(self.columns))), *parts]),
             columns=self.columns,

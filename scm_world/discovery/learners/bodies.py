@@ -19,7 +19,7 @@ from scm_world.errors import ModelError
 from scm_world.queries import Episode, World
 from scm_world.queries.local_graphs import LocalEpisode, LocalGraph, local_graph
 from scm_world.queries.local_truth import Pair, movers, paired_truth
-from scm_world.queries.rollouts import Schedule, Trace, begin
+from scm_world.queries.rollouts import Running, Unit
 from scm_world.world import World as Simulated
 
 STEPS = 60  # control steps of an episode, if nothing else is said
@@ -98,13 +98,13 @@ def local_steps(episode: Episode, *, rule: str = "pressing", truth: bool = False
         UnknownOption: There is no such rule.
     """
     graphs: list[LocalGraph] = []
-    schedule, trace = Schedule(episode.layers), Trace()
+    unit = Unit(episode.seed, episode.number, episode.layers, None, episode.steps)
     with episode.twins.twin() as world:
-        begin(world, episode.seed, episode.number, schedule, trace)
+        running = Running(unit, world)
+        running.begin()
         for step, action in enumerate(episode.actions):
-            due = schedule.due(world, step, trace.fired) if step else {}
-            if due:
-                world.do(due)
+            if step:
+                running.intervene(step)
             graphs.append(
                 _paired(world, action) if truth else local_graph(world, action, rule=rule)
             )
