@@ -143,7 +143,7 @@ def _recipe(task: str, algo: str | None, path: Path | None, fields: dict[str, An
             raise UnknownOption(f"{name} after --set", fields[name], (allowed,))
     if path is None:
         return recipe(task, algo or "ppo", **fields)
-    found = Recipe.load(path)
+    found = Recipe.load(path, trusted=(task,))
     for name, typed, its in (("task", task, found.task), ("algo", algo, found.algo)):
         if typed not in (its, None):
             raise UnknownOption(name, typed, (f"{its}, as in {path}",))

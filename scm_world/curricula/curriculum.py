@@ -13,6 +13,7 @@ from scm_world.curricula.base import AnyPart, as_part, read_from
 from scm_world.curricula.choices import Stages
 from scm_world.curricula.times import AtStep, Every
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
+from scm_world.output.reading import read_text
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Subset
 from scm_world.variables.checks import check_subset
@@ -101,7 +102,7 @@ class Curriculum(Frozen):
         """
         advice = "give a file with the text of Curriculum.to_json()"
         try:
-            return cls.from_json(Path(path).read_text(encoding="utf-8"), trusted=trusted)
+            return cls.from_json(read_text(path), trusted=trusted)
         except DAMAGED as error:
             raise UnreadableFile(str(path), str(error), advice) from None
 

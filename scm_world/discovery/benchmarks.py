@@ -16,7 +16,6 @@ from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import product
-from pathlib import Path
 from threading import Event, Lock
 from typing import Annotated, Any, Literal, final
 
@@ -40,6 +39,7 @@ from scm_world.errors import (
 )
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.locations import Location, located
+from scm_world.output.reading import read_bytes, read_text
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -189,7 +189,7 @@ class BenchmarkResult:
         """
         path = located(folder) / "benchmark.json"
         try:
-            plain = json.loads(path.read_text(encoding="utf-8"))
+            plain = json.loads(read_text(path))
             truths = _TRUTHS.validate_python(plain["problems"])
             runs = tuple(_RUN.validate_python(run) for run in plain["runs"])
             return cls({truth.name: truth for truth in truths}, runs, plain["settings"])
@@ -367,7 +367,7 @@ def _learner_version(chosen: Learner) -> str:
         file = None
     if file is None or function.__module__.startswith("scm_world."):
         return chosen.version or ""
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
+    return hashlib.sha256(read_bytes(file)).hexdigest()[:16]
 
 
 def _claim(folder: Location, settings: dict[str, Any]) -> None:
@@ -375,7 +375,7 @@ def _claim(folder: Location, settings: dict[str, Any]) -> None:
     path = folder / "settings.json"
     if path.exists():
         try:
-            there = json.loads(path.read_text(encoding="utf-8"))
+            there = json.loads(read_text(path))
             different = [key for key in settings if there[key] != settings[key]]
         except DAMAGED as error:
             reason, advice = f"it describes no benchmark: {error}", "give another folder"
@@ -442,7 +442,7 @@ def _kept(folder: Location | None, run: Run) -> Run | None:
         return None
     advice = "delete it, and this run is done again"
     try:
-        there = _RUN.validate_json(path.read_text(encoding="utf-8"))
+        there = _RUN.validate_json(read_text(path))
     except DAMAGED as error:
         raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from error
     if there.key != run.key:

@@ -9,6 +9,7 @@ from typing import Any, final
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.output.durable import made, removed, write_durably
 from scm_world.output.locations import Location, located
+from scm_world.output.reading import read_text
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.paired import Paired
 
@@ -36,7 +37,7 @@ class Checkpoint:
             UnreadableFile: It is damaged, or of another discovery.
         """
         try:
-            data = json.loads(self._path.read_text(encoding="utf-8"))
+            data = json.loads(read_text(self._path))
             if data["format"] != FORMAT:
                 raise ValueError(f"expected the format {FORMAT!r}")
             if data["terms"] != self._terms:

@@ -26,6 +26,7 @@ from scm_world.discovery.learners.simulators import (
 )
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json, to_json
+from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.identification import nature_graph
@@ -578,7 +579,7 @@ def problem_label(name: str, view: TaskView) -> str:
 
 def _read(path: Path) -> SCM:
     try:
-        return from_json(path.read_text(encoding="utf-8"))
+        return from_json(read_text(path))
     except (OSError, ValueError) as error:
         advice = "give a file that scm_world.graph.to_json wrote"
         raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from None
@@ -589,4 +590,4 @@ def _source_version(name: str) -> str:
     if name in TASKS:
         return ""
     file = inspect.getsourcefile(load_factory(name)) if ":" in name else name
-    return "" if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
+    return "" if file is None else hashlib.sha256(read_bytes(file)).hexdigest()[:16]

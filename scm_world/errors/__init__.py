@@ -60,8 +60,8 @@ from scm_world.errors.interventions import (
     WrongType,
     raise_all,
 )
+from scm_world.errors.usage import DAMAGED as DAMAGED  # no error, but a tuple of some
 from scm_world.errors.usage import (
-    DAMAGED,
     ActionError,
     BudgetExhausted,
     Diverged,
@@ -75,7 +75,6 @@ from scm_world.errors.usage import (
 )
 
 __all__ = [
-    "DAMAGED",
     "ActionError",
     "BudgetExhausted",
     "ClosesCycle",
@@ -112,6 +111,5 @@ __all__ = [
 ]
 
 for _name in __all__:  # tracebacks and pickles name them as one imports them
-    if _name != "DAMAGED":
-        globals()[_name].__module__ = __name__
+    globals()[_name].__module__ = __name__
 del _name

@@ -17,16 +17,16 @@ from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.pipeline import Bench
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
-from scm_world.evaluation.recording import refuse_untrusted
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import Seat, listed
 from scm_world.evaluation.setups import Place, Setup
 from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.plans import PACKAGE
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
+from scm_world.tasks.factories import refuse_untrusted
 from scm_world.tasks.model import is_model
+from scm_world.variables.mechanisms import OWN_MECHANISMS
 
 _TASK = ("task", "arguments", "class", "model")
 """What says of an evaluation where it happened."""
@@ -167,7 +167,7 @@ def _acts(options: Any, trusted: Sequence[str]) -> Any:
     if isinstance(options.get("kind"), str):
         part = Do({"option": options})
         for function in part.functions():
-            if not function.is_defined_in((PACKAGE, *trusted)):
+            if not function.is_defined_in((*OWN_MECHANISMS, *trusted)):
                 raise ModelError([f"it calls {function.reference!r}; pass trusted=(…) to read it"])
         return part.request["option"]
     return {name: _acts(value, trusted) for name, value in options.items()}

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import load as load_library
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.seats import what_it_is
 from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
 from scm_world.output.durable import locked, removed, write_durably, write_whole
 from scm_world.output.locations import Location
+from scm_world.output.reading import LARGEST_TABLE, read_bytes, read_table, read_text
 
 FORMAT = "scm_world/evaluation/1"
 RESULTS = "results.json"
@@ -81,7 +82,7 @@ def false_scores(path: Location, evaluation: Evaluation) -> list[str]:
         path: The folder, or its ``results.json``.
         evaluation: That was read from it.
     """
-    data = json.loads((path / RESULTS if path.is_dir() else path).read_text(encoding="utf-8"))
+    data = json.loads(read_text(path / RESULTS if path.is_dir() else path))
     right = json.loads(json.dumps(summarized(evaluation)))
     written = data.get("scores")
     if not isinstance(written, list) or len(written) != len(right):
@@ -99,7 +100,7 @@ def load(path: Location) -> Evaluation:
     """Read an evaluation; see ``Evaluation.load``."""
     file = path / RESULTS if path.is_dir() else path
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(read_text(file))
         if data["format"] != FORMAT:
             raise ValueError("it is no evaluation")
         if data.get("checksum", _checksum(data)) != _checksum(data):  # older files have none
@@ -108,18 +109,10 @@ def load(path: Location) -> Evaluation:
             data["about"][name]
         table = file.parent / PurePosixPath(data["table"]["file"]).name
         decode = CODECS[table.suffix.removeprefix(".")][1]
-        found = Evaluation(data["about"], decode(table.read_bytes()))
+        found = Evaluation(data["about"], decode(read_bytes(table, LARGEST_TABLE)))
         if found.digest != data["table"]["digest"]:
             raise ValueError(f"{table.name} is not the table that was written with it")
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ) as error:
+    except DAMAGED as error:
         raise UnreadableFile(str(file), _said(error), ADVICE) from None
     return found
 
@@ -218,12 +211,7 @@ def _to_parquet(columns: Columns) -> bytes:
 
 
 def _from_parquet(data: bytes) -> Columns:
-    arrow = load_library("pyarrow", "pyarrow", "data")
-    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
-    try:
-        table = parquet.read_table(arrow.BufferReader(data), use_threads=False)
-    except (arrow.ArrowException, OSError) as error:
-        raise ValueError(f"the table is no whole Parquet file ({error})") from None
+    table = read_table(data)
     return _typed({name: table[name].to_numpy() for name in table.column_names})
 
 

@@ -16,6 +16,7 @@ from scm_world.errors import UnknownOption
 from scm_world.policies import PolicyAbout
 from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
 from scm_world.tasks import Task
+from scm_world.tasks.factories import refuse_untrusted
 
 Options = dict[str, Any]
 Trained = Sequence[tuple[str, PolicyAbout | None]]
@@ -25,13 +26,18 @@ TASK = "pushing"
 """Where agents act that say nothing, if nobody says anything."""
 
 
-def task_for(task: Task | str | None, agents: Trained) -> Task | str:
+def task_for(task: Task | str | None, agents: Trained, trusted: Sequence[str] = ()) -> Task | str:
     """Choose the task: the one that is given, else the one that the agents were trained for.
 
     Warn of an agent that was trained for another task than the one that is given.
 
+    Args:
+        task: If it is given.
+        agents: See ``Trained``.
+        trusted: Packages whose functions may be called for a task that only a policy names.
+
     Raises:
-        UnknownOption: They were trained for several.
+        UnknownOption: They were trained for several, or for a function of no trusted package.
     """
     if task is not None:
         given = getattr(task, "name", task)
@@ -44,6 +50,8 @@ def task_for(task: Task | str | None, agents: Trained) -> Task | str:
     tasks = _distinct(about.task for _, about in agents if about is not None)
     if len(tasks) > 1:
         raise UnknownOption("task", None, [f"{one!r}" for one in tasks])
+    for one in tasks:
+        refuse_untrusted(one, trusted)
     return tasks[0] if tasks else TASK
 
 

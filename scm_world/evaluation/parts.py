@@ -12,6 +12,7 @@ from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.evaluation.arena import Row
 from scm_world.output.durable import made, write_whole
 from scm_world.output.locations import Location
+from scm_world.output.reading import read_text
 
 FORMAT = "scm_world/evaluation-part/1"
 FOLDER = "parts"
@@ -54,7 +55,7 @@ def read_part(folder: Location, key: str, count: int) -> list[Row] | None:
     path = part_path(folder, key)
     advice = "delete this file; its episodes are then played again"
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_text(path))
         found = (data["format"], data["key"], data["sum"], len(data["rows"]))
         if found != (FORMAT, key, _sum(data["rows"]), count):
             raise ValueError("its content is not what was written")

@@ -21,6 +21,7 @@ from scm_world.env.delta import PREFIX as RELATIVE_MODE
 from scm_world.env.given import action_scale
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.recording_files import Recorded, from_parquet
+from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.policies import MlpPolicy, OnnxPolicy, PolicyAbout, file_of, load_policy, load_sb2
 from scm_world.policies.scripted import NAMED, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
@@ -54,6 +55,11 @@ def _still() -> Policy:
 
 NAMES: Mapping[str, Callable[[], Policy]] = {"still": _still, **NAMED}
 """Policies that have a name; each entry gives the policy of one episode."""
+
+OWN_POLICIES = frozenset(
+    Function(getattr(made, "func", made)).reference for made in (still, *NAMED.values())
+)
+"""Functions and classes of this package that a file may name as policies."""
 
 FORMS = (
     *NAMES,
@@ -393,7 +399,7 @@ def _archived(path: Path) -> MlpPolicy:
     try:
         return load_sb2(path)
     except UnreadableFile as error:
-        if b"_stable_baselines3_version" not in path.read_bytes():
+        if b"_stable_baselines3_version" not in read_bytes(path):
             raise
         advice = "load it if you trust it, and give the model: as_player(PPO.load(path))"
         reason = "it is one of Stable-Baselines3, whose reading may run any code in it"
@@ -401,7 +407,7 @@ def _archived(path: Path) -> MlpPolicy:
 
 
 def _recorded(path: Path, number: str, trusted: Sequence[str]) -> Recorded:
-    _, found = from_parquet(path.read_bytes(), str(path), trusted)
+    _, found = from_parquet(read_bytes(path, LARGEST_TABLE), str(path), trusted)
     if not number and len(found) != 1:
         advice = f"say which one: {path}#0 to #{len(found) - 1}"
         raise UnreadableFile(str(path), f"it has {len(found)} episodes", advice)
@@ -483,9 +489,9 @@ def _library(name: str) -> dict[str, str]:
 
 def _resolved(name: str, trusted: Sequence[str] | None) -> Any:
     function = Function(name)
-    if trusted is not None and not function.is_defined_in((PACKAGE, *trusted)):
-        allowed = ", ".join((PACKAGE, *trusted))
-        raise ModelError([f"{name!r} is no function of {allowed}; pass trusted=(…) to use it"])
+    if not (trusted is None or name in OWN_POLICIES or function.is_defined_in(trusted)):
+        problem = "is no policy of this package and no function of a trusted one"
+        raise ModelError([f"{name!r} {problem}; pass trusted=(…) to use it"])
     try:
         return function.resolve()
     except (ImportError, AttributeError, ValueError) as error:
@@ -494,7 +500,6 @@ def _resolved(name: str, trusted: Sequence[str] | None) -> Any:
 
 def _sha256(path: Path, advice: str) -> str:
     try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return hashlib.sha256(read_bytes(path, LARGEST_TABLE)).hexdigest()
     except OSError as error:
         raise UnreadableFile(str(path), error.strerror or str(error), advice) from None

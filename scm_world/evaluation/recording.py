@@ -6,7 +6,6 @@ import hashlib
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, final
 
 import gymnasium
@@ -39,10 +38,12 @@ from scm_world.evaluation.recording_files import (
 )
 from scm_world.output.durable import write_durably
 from scm_world.output.locations import Location, located
+from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.output.remote import said
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task
+from scm_world.tasks.factories import refuse_untrusted
 
 __all__ = ["Recorded", "Recorder", "Recording", "record"]
 
@@ -193,7 +194,7 @@ class Recording:
             ModelError: A mechanism is a function of no trusted package.
         """
         try:
-            data = located(path).read_bytes()
+            data = read_bytes(path, LARGEST_TABLE)
         except OSError as error:
             advice = "give one that a Recording was saved to"
             raise UnreadableFile(str(path), said(error), advice) from None
@@ -215,8 +216,10 @@ class Recording:
             MissingExtra: Minari is not installed.
             ModelError: Observations have several shapes, the task has no id with Gymnasium, or
                 something cannot be written.
+            UnknownOption: The task is a function of no trusted package.
             ValueError: There is such a dataset already, says Minari.
         """
+        refuse_untrusted(_name(self.environment), self.trusted)
         usual = {
             "algorithm_name": str((self.policy or {}).get("name", "unknown")),
             "description": f"{self!r}, recorded by scm_world.",
@@ -252,23 +255,6 @@ class Recording:
 def _name(made_with: Mapping[str, Any]) -> str:
     task = made_with["task"]
     return task.name if isinstance(task, Task) else str(task)
-
-
-def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
-    """Refuse to run a function that a file names, as ``"module:function"`` for a task.
-
-    Args:
-        task: The text of the file.
-        trusted: Packages whose functions may be called, without ``.py``; any if None.
-
-    Raises:
-        UnknownOption: With what to do.
-    """
-    home, colon, _ = task.rpartition(":")
-    package = Path(home).stem if home.endswith(".py") else home.partition(".")[0]
-    if colon and trusted is not None and package not in trusted:
-        allowed = (f"task={task!r}, or trusted={(package,)}, to run what is in there",)
-        raise UnknownOption("task that a file names", task, allowed)
 
 
 def _differences(env: ScmWorldEnv, episode: Recorded) -> Iterator[str]:

@@ -26,6 +26,7 @@ from scm_world.env import IDS, MODEL_ID
 from scm_world.env.observer import Observation
 from scm_world.env.start import asked
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.output.reading import read_table
 from scm_world.policies.cards import RELATIVE, USUAL
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task, tasks
@@ -341,11 +342,10 @@ def from_parquet(
         UnreadableFile: It is something else, or damaged.
         ModelError: A mechanism is a function of no trusted package.
     """
-    arrow, parquet = load("pyarrow", "pyarrow", "data"), load("pyarrow.parquet", "pyarrow", "data")
     try:
-        table = parquet.read_table(arrow.BufferReader(data), use_threads=False).combine_chunks()
-    except (arrow.ArrowException, OSError, ValueError) as error:
-        raise UnreadableFile(path, f"it is no whole Parquet file ({error})", _ADVICE) from None
+        table = read_table(data).combine_chunks()
+    except ValueError as error:
+        raise UnreadableFile(path, str(error), _ADVICE) from None
     about = table.schema.metadata or {}
     header = _header(about.get(KEY.encode()), path)
     try:

@@ -256,7 +256,7 @@ def prepare(
         ScmWorldError: What is wrong, by name.
     """
     entries = entries_of(policy, trusted)
-    place = _place(task, env, entries)
+    place = _place(task, env, entries, trusted or ())
     engines = _several("backend", backend)
     for engine in engines:
         if not isinstance(engine, str) or engine not in backends():
@@ -292,7 +292,7 @@ def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
         ScmWorldError: A policy cannot be read, or they were trained for several tasks.
     """
     agents = [(entry.agent, entry.made_for) for entry in entries_of(policy, trusted)]
-    return str(task_for(None, agents))
+    return str(task_for(None, agents, trusted or ()))
 
 
 def _seated(entries: Sequence[Entry], place: Place, shared: ScmWorldEnv) -> Iterator[Seat]:
@@ -308,9 +308,11 @@ def _seated(entries: Sequence[Entry], place: Place, shared: ScmWorldEnv) -> Iter
                 env.close()
 
 
-def _place(task: Task | str | None, env: Any, entries: Sequence[Entry]) -> Place:
+def _place(
+    task: Task | str | None, env: Any, entries: Sequence[Entry], trusted: Sequence[str]
+) -> Place:
     agents = [(entry.agent, entry.made_for) for entry in entries]
-    task = task_for(task, agents)
+    task = task_for(task, agents, trusted)
     if not isinstance(task, Task | str):
         raise UnknownOption("task", task, tasks())
     if not isinstance(env, Mapping | None):

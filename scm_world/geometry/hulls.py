@@ -120,9 +120,11 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     except ImportError as error:
         raise MissingExtra("trimesh", "mesh") from error
     try:
+        if not file.is_file():
+            raise FileNotFoundError("it is no regular file, or not there")
         with file.open("rb") as stream:
             mesh: Any = trimesh.load(stream, file_type=kind, force="mesh", process=False)
-    except (OSError, ValueError, IndexError, KeyError) as error:
+    except (OSError, ValueError, IndexError, KeyError, MemoryError) as error:
         raise ModelError([f"{file} cannot be read as a mesh: {error}"]) from error
     try:
         return hull_of(scale * np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))

@@ -127,6 +127,11 @@ class Remote:
         """Read the file as a text."""
         return self.read_bytes().decode(encoding)
 
+    def size(self) -> int:
+        """Return the number of bytes of the file; 0 where the store does not tell."""
+        with self._store() as (store, path):
+            return int(store.size(path) or 0)
+
     def iterdir(self) -> Iterator[Remote]:
         """List what is in the folder, in order; nothing if it is not there.
 

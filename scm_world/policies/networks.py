@@ -41,12 +41,12 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_durably
 from scm_world.output.locations import Location, located
+from scm_world.output.reading import LARGEST, read_arrays, read_bytes, refuse_large, regular
 from scm_world.policies.cards import KEY, PolicyAbout
 from scm_world.tasks import tasks
 
 Weights = NDArray[np.float32]
 
-LARGEST = 2**28  # [bytes] of a file: more is no policy, and might fill the memory
 _ANY = PolicyAbout(task="any")  # tanh, clip, one array
 _SAVED = "give a file that scm_world.policies.save_policy has written"
 _ARCHIVE = "only multilayer perceptrons of PPO2 (MlpPolicy) can be loaded"
@@ -328,16 +328,11 @@ def load_policy(path: Path | str) -> NetworkPolicy:
     """
     name = str(path)
     try:
-        if Path(name).exists() and not Path(name).is_file():  # a folder, or a pipe without an end
-            raise UnreadableFile(name, "it is no file", _SAVED)
-        _refuse_huge(name, Path(name).stat().st_size, _SAVED)
-        with safetensors.safe_open(name, framework="np") as file:
+        with safetensors.safe_open(regular(Path(name), LARGEST), framework="np") as file:
             text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 # no mapping
     except OSError as error:
         raise UnreadableFile(name, error.strerror or str(error), _SAVED) from None
-    except UnreadableFile:
-        raise
     except (safetensors.SafetensorError, ValueError, TypeError, KeyError, AttributeError) as error:
         reason = f"it is damaged, or of another kind ({error})"
         raise UnreadableFile(name, reason, _SAVED) from None
@@ -359,17 +354,13 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
 
     Raises:
         UnreadableFile: It is no such archive, or the policy in it is no multilayer perceptron.
-        FileNotFoundError: There is no such file.
     """
     name = fspath(path)
     try:
-        with zipfile.ZipFile(name) as archive:
-            _refuse_huge(name, archive.getinfo("parameters").file_size, _ARCHIVE)
-            raw = io.BytesIO(archive.read("parameters"))
-        with zipfile.ZipFile(raw) as inner:
-            _refuse_huge(name, sum(info.file_size for info in inner.infolist()), _ARCHIVE)
-        with np.load(raw, allow_pickle=False) as arrays:
-            found = {key: np.asarray(arrays[key], dtype=np.float32) for key in arrays.files}
+        with zipfile.ZipFile(io.BytesIO(read_bytes(Path(name), LARGEST))) as archive:
+            refuse_large("its weights", archive.getinfo("parameters").file_size, LARGEST)
+            arrays = read_arrays(archive.read("parameters"), LARGEST)
+        found = {key: np.asarray(array, dtype=np.float32) for key, array in arrays.items()}
         hidden = ["shared_fc0"]
         while f"model/shared_fc{len(hidden)}/w:0" in found:
             hidden.append(f"shared_fc{len(hidden)}")
@@ -386,18 +377,13 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:  # or encrypted
         reason = f"it is no zip archive, or damaged ({error})"
         raise UnreadableFile(name, reason, _ARCHIVE) from None
-    except UnreadableFile:
-        raise
+    except OSError as error:
+        raise UnreadableFile(name, error.strerror or str(error), _ARCHIVE) from None
     except ModelError as error:
         raise UnreadableFile(name, "; ".join(error.problems), _ARCHIVE) from None
     except (ValueError, TypeError) as error:  # pickled objects, or no numbers at all
         reason = f"its weights are no plain arrays ({error})"
         raise UnreadableFile(name, reason, _ARCHIVE) from None
-
-
-def _refuse_huge(name: str, size: int, advice: str) -> None:
-    if size > LARGEST:
-        raise UnreadableFile(name, f"it has more than {LARGEST} bytes", advice)
 
 
 def _misfits(

@@ -9,6 +9,7 @@ import numpy as np
 
 from scm_world._arguments import load
 from scm_world.errors import ActionError, ModelError, UnreadableFile
+from scm_world.output.reading import read_bytes
 from scm_world.policies.cards import KEY, PolicyAbout
 
 _TYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(uint8)": "uint8"}
@@ -47,7 +48,7 @@ class OnnxPolicy:
         options.log_severity_level = 4  # it raises what it would print
         self._path, self.library = path, f"onnxruntime {runtime.__version__}"
         try:
-            content = path.read_bytes()
+            content = read_bytes(path)
             if _ELSEWHERE in content:
                 raise ValueError("its weights lie in another file; save it as one file")
             cpu = ["CPUExecutionProvider"]

@@ -13,6 +13,7 @@ import numpy as np
 
 from scm_world.errors import DAMAGED, ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_durably
+from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode, episode_of
 from scm_world.queries.experiments.versions import versions
@@ -171,9 +172,9 @@ def load_episode(
 def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
     advice = "give a file that save_episode wrote"
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-            about = json.loads(str(arrays["about"]))
-            found = arrays["actions"], arrays["states"], arrays["lengths"]
+        arrays = read_arrays(file)
+        about = json.loads(str(arrays["about"]))
+        found = arrays["actions"], arrays["states"], arrays["lengths"]
     except DAMAGED as error:
         raise UnreadableFile(str(file), str(error), advice) from None
     if not isinstance(about, dict) or about.get("format") != FORMAT or not about.keys() >= KEYS:

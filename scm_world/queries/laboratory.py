@@ -22,6 +22,7 @@ from scm_world.errors import (
     UnknownOption,
     UnreadableFile,
 )
+from scm_world.output.reading import read_text
 from scm_world.queries.outcomes import Outcome, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, sample
@@ -139,7 +140,7 @@ class Journal:
         path = self._path
         if path is None:
             return
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
         whole = text[: text.rfind("\n") + 1]
         try:
             first, *lines = (json.loads(line) for line in whole.splitlines())

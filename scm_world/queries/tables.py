@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.graph import SCM
+from scm_world.output.reading import read_text
 
 _COMPONENT = re.compile(r"(.+)\[(\d+)\]")
 
@@ -34,8 +36,8 @@ def read_protocol(protocol: Path | str | Iterable[Mapping[str, Any]], model: SCM
     """
     if isinstance(protocol, str | Path):
         try:
-            with Path(protocol).open(newline="", encoding="utf-8-sig") as stream:
-                rows: list[Mapping[str, Any]] = list(csv.DictReader(stream))
+            text = read_text(protocol, "utf-8-sig")
+            rows: list[Mapping[str, Any]] = list(csv.DictReader(io.StringIO(text, newline="")))
         except (OSError, csv.Error, UnicodeDecodeError) as error:
             advice = "give a CSV file whose first line names variables"
             raise UnreadableFile(str(protocol), str(error), advice) from None

@@ -1,4 +1,4 @@
-"""Functions named on the command line: ``"module:function"`` or ``"file.py:function"``."""
+"""Functions named by a text: ``"module:function"`` or ``"file.py:function"``."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line
+from scm_world.tasks.model import is_model
+
+OWN_TASKS = ("scm_world.tasks.model:ModelTask",)
+"""What a file may name as its task besides those that are registered: it reads a model."""
 
 
 def load_factory(reference: str) -> Callable[..., Any]:
@@ -56,6 +60,27 @@ def load_factory(reference: str) -> Callable[..., Any]:
         offered = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise UnknownOption(f"function in {home}", name, offered)
     return found  # type: ignore[no-any-return]
+
+
+def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
+    """Refuse to run a function that a file, not a user, names as its task.
+
+    Args:
+        task: The text of the file. Registered tasks and models run no code.
+        trusted: Packages whose functions may be called, without ``.py``, or whole references; any
+            if None.
+
+    Raises:
+        UnknownOption: With what to do.
+    """
+    home, colon, _ = task.rpartition(":")
+    package = Path(home).stem if home.endswith(".py") else home.partition(".")[0]
+    if trusted is None or not colon or is_model(task):
+        return
+    if package in trusted or task in (*OWN_TASKS, *trusted):
+        return
+    allowed = (f"task={task!r}, or trusted={(package,)}, to run what is in there",)
+    raise UnknownOption("task that a file names", task, allowed)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
 from scm_world.evaluation.recording import Recording
 from scm_world.output.durable import locked, made, write_durably
+from scm_world.output.reading import read_arrays
 from scm_world.policies import NetworkPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
@@ -219,8 +220,8 @@ def _load(path: Path) -> Demonstrations:
         UnreadableFile: It is something else, or damaged.
     """
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
+        file = read_arrays(path)
+        found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
         if len(found.observations) != len(found.actions):
             raise ValueError("observations and actions are not equally many")
     except DAMAGED as error:

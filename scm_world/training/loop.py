@@ -18,6 +18,7 @@ from scm_world.backends import backends
 from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
 from scm_world.evaluation.setups import Place
 from scm_world.output.durable import is_draft, locked, made, write_whole
+from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -222,7 +223,7 @@ def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, An
     digest = None
     if start is not None:
         try:
-            digest = sha256(start.read_bytes()).hexdigest()
+            digest = sha256(read_bytes(start)).hexdigest()
         except OSError as error:
             advice = "give a policy file to start from"
             raise UnreadableFile(str(start), str(error), advice) from None
@@ -257,7 +258,7 @@ def open_folder(
     folder = path.parent
     if path.exists():
         try:
-            there = json.loads(path.read_text(encoding="utf-8"))
+            there = json.loads(read_text(path))
             if not isinstance(there, dict) or there.get("format") != form:
                 raise ValueError(f"it is not of the format {form!r}")
         except DAMAGED as error:

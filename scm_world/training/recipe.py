@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, final
@@ -23,7 +23,9 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.protocols import chosen
+from scm_world.output.reading import read_text
 from scm_world.tasks import TASKS, make_task, tasks
+from scm_world.tasks.factories import refuse_untrusted
 from scm_world.training.settings import (
     ALGORITHMS,
     Count,
@@ -208,25 +210,31 @@ class Recipe(Frozen):
         return json.dumps(self.as_dict(), indent=2, allow_nan=False)
 
     @classmethod
-    def from_dict(cls, data: Any) -> Recipe:
+    def from_dict(cls, data: Any, *, trusted: Sequence[str] = ()) -> Recipe:
         """Read what ``as_dict`` wrote.
 
+        Args:
+            data: Plain data.
+            trusted: Packages whose functions may be called for the task.
+
         Raises:
-            UnknownOption: It is no recipe; it says where.
+            UnknownOption: It is no recipe, and it says where; or its task is a function of no
+                trusted package.
         """
         if not isinstance(data, Mapping) or data.get("format") != FORMAT:
             raise UnknownOption("format of a recipe", data, (FORMAT,))
+        refuse_untrusted(str(data.get("task")), trusted)
         return _made({name: value for name, value in data.items() if name != "format"})
 
     @classmethod
-    def load(cls, path: Path | str) -> Recipe:
-        """Read a file with the JSON of a recipe.
+    def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Recipe:
+        """Read a file with the JSON of a recipe; see ``from_dict``.
 
         Raises:
             UnreadableFile: There is none, or it is something else.
         """
         try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+            return cls.from_dict(json.loads(read_text(path)), trusted=trusted)
         except DAMAGED as error:
             advice = "give a file with the text of Recipe.to_json()"
             raise UnreadableFile(str(path), str(error), advice) from None

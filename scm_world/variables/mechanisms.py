@@ -103,7 +103,7 @@ class Function(Frozen):
         constants: Passed to it by keyword.
 
     From a file, a name is looked up in modules of this package only, unless the reader names
-    further ones (``SCM.from_json(text, trusted=("my_package",))``): reading never runs code that
+    further ones (``from_json(text, trusted=("my_package",))``): reading never runs code that
     the reader did not ask for.
     """
 

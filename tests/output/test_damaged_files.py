@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 
 from scm_world import SCM
+from scm_world.backends import read_model
 from scm_world.curricula import Curriculum
+from scm_world.discovery.data.files import load as dataset_of
+from scm_world.discovery.data.folders import SIDECAR
 from scm_world.errors import ModelError, ScmWorldError, UnreadableFile
 from scm_world.evaluation import Evaluation, evaluate
+from scm_world.evaluation.players import as_player
+from scm_world.evaluation.recording import Recording
+from scm_world.geometry.hulls import load_hull
+from scm_world.graph.exchange import read_graph
 from scm_world.graph.files import from_dict, from_json
+from scm_world.output import reading
+from scm_world.policies import load_sb2
 from scm_world.queries import Plan, World, load_episode, save_episode
+from scm_world.queries.tables import read_protocol
+from scm_world.training.recipe import Recipe
 from scm_world.variables import Derived, Exogenous
 
 DEEP = "[" * 100_000
@@ -34,6 +49,68 @@ def test_texts_of_something_else_are_refused(kind: str, text: str) -> None:
     """With an error of this package, also where they are nested deeply."""
     with pytest.raises(ModelError):
         TEXTS[kind](text)
+
+
+MESH = """<mujoco><asset><mesh name="it" file="{}"/></asset><worldbody/></mujoco>"""
+INCLUDE = """<mujoco><include file="{}"/><worldbody/></mujoco>"""
+
+
+def _named_by(text: str, path: Path) -> Any:
+    """Read a model that names a file."""
+    model = path.with_name("model.xml")
+    model.write_text(text.format(path))
+    return read_model(model)
+
+
+READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    "policy": (".safetensors", as_player),
+    "network": (".onnx", as_player),
+    "archive": (".zip", load_sb2),
+    "episode": (".npz", load_episode),
+    "recording": (".parquet", Recording.load),
+    "results": (".json", Evaluation.load),
+    "curriculum": (".json", Curriculum.load),
+    "recipe": (".json", Recipe.load),
+    "dataset": ("", lambda path: dataset_of(path.parent)),
+    "settings": (".csv", lambda path: read_protocol(path, World("pushing", backend="fake").model)),
+    "graph": (".gml", lambda path: read_graph(path, format="gml")),
+    "model": (".xml", read_model),
+    "mesh": (".stl", lambda path: _named_by(MESH, path)),
+    "included": (".xml", lambda path: _named_by(INCLUDE, path)),
+    "shape": (".stl", load_hull),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_files_without_an_end_are_not_opened(reader: str, tmp_path: Path) -> None:
+    """Nobody waits for a pipe, reads a device to its end, or fills the memory."""
+    ending, read = READERS[reader]
+    path = tmp_path / (f"it{ending}" if reader != "dataset" else SIDECAR)
+    os.mkfifo(path)
+    with pytest.raises(ScmWorldError, match="no regular file"):
+        read(path)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    with pytest.raises(ScmWorldError, match="no regular file"):
+        read(path)
+    path.unlink()
+    with path.open("wb") as stream:
+        stream.truncate(2**40)
+    with pytest.raises(ScmWorldError, match=r"at most|cannot be read as a mesh"):
+        read(path)
+
+
+def test_what_is_packed_in_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small archive or table of large arrays is refused before it is unpacked."""
+    many = np.zeros(100_000)
+    np.savez_compressed(tmp_path / "it.npz", many=many)
+    stream = io.BytesIO()
+    pyarrow.parquet.write_table(pyarrow.table({"many": many}), stream)
+    monkeypatch.setattr(reading, "LARGEST_TABLE", 700_000)
+    with pytest.raises(OSError, match="at most 700,000"):
+        reading.read_arrays(tmp_path / "it.npz", 700_000)
+    with pytest.raises(ValueError, match="at most 700,000"):
+        reading.read_table(stream.getvalue())
 
 
 def test_functions_that_are_no_mechanisms_are_not_trusted() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from worlds import (
+    NEEDS_BULLET,
     PARAMS,
     PHYSICS,
     PUSHING,
@@ -22,6 +23,8 @@ from worlds import (
     shared,
 )
 
+from scm_world.errors import InterventionError
+from scm_world.tasks import tasks
 from scm_world.variables import Draw, Natural, Scale, Shift
 
 
@@ -134,27 +137,33 @@ def test_what_physics_did_can_always_be_restored(backend: str, task: str) -> Non
 def _undo_at_random(backend: str, task: str, cases: int, seed: int) -> None:
     """Compare futures without an intervention and with one that is undone, at random instants.
 
-    What is undone is drawn among all that can be set; half of the cases write back the present
-    value only.
+    What is undone is drawn among all that can be set; every other case writes back the present
+    value only, and every third looks 50 steps ahead instead of one. A refused intervention is
+    undone, too: it changed nothing.
     """
     rng = np.random.default_rng(seed)
     world = shared(backend, task)
+    world.reset(seed=0)
     names = settable(world)
     if cases < len(names):
         names = [name for name in names if world.model.targets(name) != (name,)]
-    for case in range(cases):
+    refused = 0
+    for case, name in enumerate(rng.permutation(np.resize(names, cases)).tolist()):
         world.reset(seed=int(rng.integers(1000)))
         play(world, actions(int(rng.integers(1, 5)), seed=case))
-        horizon = 50 if case % 10 == 0 else 1
+        horizon = 50 if case % 3 == 0 else 1
         start, commands = world.snapshot(), actions(horizon, seed=case)
         values, future = world.values(), play(world, commands)
         world.restore(start)
-        name = names[case % len(names)]
-        if case // len(names) % 2 == 0:
-            world.do({name: other(world, name)})
+        if case % 2 == 0:
+            try:
+                world.do({name: other(world, name)})
+            except InterventionError:
+                refused += 1
         world.do({name: values[name]})
         assert same(world.values(), values), name
         np.testing.assert_array_equal(play(world, commands), future, err_msg=name)
+    assert refused < max(2, cases / 4)
 
 
 @pytest.mark.parametrize(("backend", "task"), PARAMS)
@@ -164,10 +173,13 @@ def test_what_is_undone_in_its_own_coordinates_leaves_no_trace(backend: str, tas
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("backend", "task"), [p for p in PARAMS if "fake" not in str(p.id)])
-def test_what_is_undone_leaves_no_trace_a_thousand_times(backend: str, task: str) -> None:
-    """Any variable, written back or set and set back, at random states."""
-    _undo_at_random(backend, task, 1000, seed=1)
+@pytest.mark.parametrize("task", tasks())
+@pytest.mark.parametrize("backend", ["mujoco", pytest.param("bullet", marks=NEEDS_BULLET)])
+def test_what_is_undone_leaves_no_trace_in_any_task(backend: str, task: str) -> None:
+    """Each variable is written back, or set and set back, at random states: no bit differs."""
+    world = shared(backend, task)
+    world.reset(seed=0)
+    _undo_at_random(backend, task, 2 * len(settable(world)), seed=1)
 
 
 @pytest.mark.parametrize(("backend", "task"), PUSHING)

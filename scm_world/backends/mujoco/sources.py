@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -19,6 +19,7 @@ import numpy as np
 
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.output.reading import read_bytes, read_text, regular
 
 _CHOICES = {
     "integrator": mujoco.mjtIntegrator,
@@ -178,9 +179,9 @@ def _contents(path: Path) -> str:
     """
     advice = "give the path of an MJCF (.xml, .mjcf) or URDF (.urdf) file, or XML text"
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_text(path, "utf-8-sig")
     except OSError as error:
-        raise UnreadableFile(str(path), (error.strerror or "?").lower(), advice) from error
+        raise UnreadableFile(str(path), (error.strerror or str(error)).lower(), advice) from error
     except UnicodeDecodeError as error:
         raise UnreadableFile(str(path), "it is no text", advice) from error
 
@@ -207,20 +208,40 @@ def _parsed(text: str, where: str, path: Path | None = None) -> mujoco.MjSpec:
             ]
         )
     with understood(where):
+        included = _included(text, Path() if path is None else path.parent)
         if path is not None and path.suffix in (".xml", ".urdf"):
             return mujoco.MjSpec.from_file(str(path))
-        included = {} if path is None else dict(_included(text, path.parent))
-        return mujoco.MjSpec.from_string(text, include=included)
+        return mujoco.MjSpec.from_string(text, include={} if path is None else included)
 
 
-def _included(text: str, folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Read the files that an MJCF text includes, and those that they include."""
-    for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", text):
-        path = folder / name
-        if path.is_file():
-            content = path.read_bytes()
-            yield name, content
-            yield from _included(content.decode(errors="replace"), folder)
+def _included(text: str, folder: Path) -> dict[str, bytes]:
+    """Read the files that an MJCF text includes, and those that they include.
+
+    Raises:
+        UnreadableFile: One cannot be read to its end.
+    """
+    found: dict[str, bytes] = {}
+    texts = [text]
+    for one in texts:  # which grows
+        for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
+            path = folder / name
+            if name not in found and path.exists():
+                found[name] = _part(path, read_bytes)
+                texts.append(found[name].decode(errors="replace"))
+    return found
+
+
+def _part(path: Path, read: Callable[[Path], Any]) -> Any:
+    """Read a file that a model names, or look whether it can be read.
+
+    Raises:
+        UnreadableFile: It is a folder, a device or a pipe, or too large.
+    """
+    try:
+        return read(path)
+    except OSError as error:
+        advice = "correct the path that the model names"
+        raise UnreadableFile(str(path), error.strerror or str(error), advice) from None
 
 
 @contextmanager
@@ -304,7 +325,8 @@ def _path(name: str, directory: str, folder: Path) -> Path | None:
         above = [folder, *folder.resolve().parents]
         inside = Path(*Path(plain).parts[1:])
         candidates += [root / part for part in (plain, inside) for root in above]
-    return next((path for path in candidates if path.is_file()), None)
+    found = next((path for path in candidates if path.exists() and not path.is_dir()), None)
+    return found if found is None else _part(found, regular)
 
 
 def _repair(spec: mujoco.MjSpec, where: str) -> None:
@@ -369,7 +391,7 @@ def _written(
     assets = dict(spec.assets)
     for path, name in files.items():
         text = text.replace(f'"{escape(path)}"', f'"{name}"')
-        assets[name] = Path(path).read_bytes()
+        assets[name] = _part(Path(path), read_bytes)
     return text, assets
 
 

@@ -17,6 +17,7 @@ from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
 from scm_world.output.durable import is_draft, locked, removed, write_durably
 from scm_world.output.locations import Location, located
+from scm_world.output.reading import LARGEST_TABLE, read_bytes, read_text
 from scm_world.output.remote import PARTIAL, said
 
 SIDECAR = "dataset.json"
@@ -115,7 +116,7 @@ class Folder:
         path = self.shard(index)
         head = self.head
         try:
-            data = path.read_bytes()
+            data = read_bytes(path, LARGEST_TABLE)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -239,7 +240,7 @@ def read_sidecar(folder: Location) -> dict[str, Any]:
     """
     path, advice = folder / SIDECAR, "give a folder that collect or save wrote"
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_text(path))
         head = head_of(found)
         is_right = (
             found["format"] == FORMAT

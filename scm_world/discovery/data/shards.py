@@ -17,6 +17,7 @@ from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
 from scm_world.discovery.data.sources import Part
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.output.reading import read_table
 from scm_world.queries.plans import FORMAT as PLAN
 from scm_world.queries.plans import Plan
 
@@ -201,12 +202,7 @@ def _to_parquet(raw: Raw, names: Sequence[str]) -> bytes:
 
 
 def _from_parquet(data: bytes, names: Sequence[str]) -> Raw:
-    arrow = load_library("pyarrow", "pyarrow", "data")
-    parquet = load_library("pyarrow.parquet", "pyarrow", "data")
-    try:
-        table = parquet.read_table(arrow.BufferReader(data), use_threads=False)
-    except (arrow.ArrowException, OSError) as error:
-        raise ValueError(f"it is no whole Parquet file ({error})") from None
+    table = read_table(data)
     if table.column_names != [*RESERVED, *names]:
         raise ValueError("it has other columns")
     rows = [table[name].to_numpy() for name in names]

@@ -16,6 +16,7 @@ from scm_world.graph.exchange import dot, html, networks, table
 from scm_world.graph.exchange.model import CausalGraph, causal_graph
 from scm_world.graph.exchange.slices import VIEWS, View, read_as, seen_as
 from scm_world.graph.scm import SCM
+from scm_world.output.reading import read_text
 
 _WRONG = (
     *DAMAGED,
@@ -158,7 +159,7 @@ def read_graph(
     known = _format(format, readable=True)
     chosen = _view(known, view)
     with reading(str(source) if isinstance(source, Path) else "the text", f"{format} graph"):
-        text = source.read_text(encoding="utf-8") if isinstance(source, Path) else source
+        text = read_text(source) if isinstance(source, Path) else source
         if known.read is None:
             raise TypeError
         return read_as(known.read(text), chosen)
