@@ -184,12 +184,12 @@ class Evaluator:
         found = given.function.bind()(*arguments)
         value = np.asarray(found)
         if value.dtype.kind not in ("iuf" if requested.dtype == "real" else "biuf"):
-            raise WrongType(name, found, f"numbers of shape {requested.shape}")
+            raise WrongType(requested.name, found, f"numbers of shape {requested.shape}")
         if value.shape[value.ndim - len(requested.shape) :] != requested.shape:
             try:
                 value = requested.array(value)
             except (TypeError, ValueError):
-                raise WrongShape(name, given, requested.shape, value.shape) from None
+                raise WrongShape(requested.name, given, requested.shape, value.shape) from None
         if requested.dtype != "real":
             value = np.rint(value).astype(np.int64)
         return self._given(requested, name, value)

@@ -21,7 +21,7 @@ from scm_world.world.compiled_task import PendingInterventions, Plan
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WorldSnapshot:
     """All that decides how a world goes on: physics, causes, noise, clock and memory.
 
@@ -119,9 +119,7 @@ def _unpickled(content: bytes, checksum: bytes) -> WorldSnapshot:
 
 def reference(structure: Any) -> str | None:
     """Say which model something is, if it is one."""
-    if isinstance(structure, StepModel):
-        return f"step function {structure.name}"
-    return structure.digest if isinstance(structure, Model) else None
+    return structure.digest if isinstance(structure, Model | StepModel) else None
 
 
 class _Pickler(pickle.Pickler):

@@ -11,10 +11,12 @@ from functools import cached_property
 from hashlib import blake2b
 from os import PathLike
 from typing import Any, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from scm_world._types import Values
+from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, Moment
 from scm_world.models import Model, State
@@ -28,10 +30,13 @@ from scm_world.world.compiled_task import (
     StepBase,
     refuse_impossible,
 )
-from scm_world.world.snapshot import reference
+from scm_world.world.snapshot import WorldSnapshot, reference
 
 KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
+
+CheckedSnapshot = tuple[str, EngineSnapshot, StepBase, StepBase | None]
+"""Name and version of the engine, its part, what holds, and the world before an intervention."""
 
 
 @final
@@ -46,6 +51,7 @@ class StructureCache:
         task: Without a plan.
         head: The model of what decides which entities there are, on its own.
         steps: Length of an episode in control steps, by the structure without interventions.
+        checked: What is known of snapshots that were taken, or restored, in this process.
     """
 
     def __init__(self, task: Task, options: Options) -> None:
@@ -53,6 +59,7 @@ class StructureCache:
         self.task = task.at(None, options.conventions)
         with _refused(self.task):
             self.head = _head(self.task)
+        self.checked: WeakKeyDictionary[WorldSnapshot, CheckedSnapshot] = WeakKeyDictionary()
         self._compiled: OrderedDict[Plan, CompiledTask] = OrderedDict()
         first = self.task.at(self.plan(self.head.solve())[0], options.conventions)
         seconds = first.seconds

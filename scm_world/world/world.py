@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -14,20 +15,24 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import (
+    CyclicModel,
     EngineFailure,
     InterventionError,
+    NotFinite,
     NotReset,
     ScmWorldError,
     SnapshotMismatch,
     UnknownOption,
+    WrongShape,
     in_one_line,
 )
 from scm_world.graph import SCM, Moment, flatten
 from scm_world.models import ControlMode, Difference, Scene, State
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
-from scm_world.variables import Draw, Mechanism, Noise, Subset
+from scm_world.variables import Draw, Intervention, Mechanism, Noise, Subset
 from scm_world.variables.checks import check_subset
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.attributes import WorldAttributes
 from scm_world.world.audit import Audit, report
@@ -42,9 +47,10 @@ from scm_world.world.feasibility import Present, feasible_plan, refusal
 from scm_world.world.plan import InterventionPlan
 from scm_world.world.snapshot import WorldSnapshot
 from scm_world.world.solver import same
-from scm_world.world.structures import StructureCache, as_structures, as_task
+from scm_world.world.structures import CheckedSnapshot, StructureCache, as_structures, as_task
 from scm_world.world.values import PresentValues
 
+_INTERVENTIONS = get_args(get_args(Intervention)[0])
 READ_BACK = 1e-6  # how far an engine may report a number from what it was given
 
 
@@ -381,6 +387,7 @@ class World(WorldAttributes):
         twice: list[InterventionError] = []
         flat = flatten(request, twice)
         base = self._base or self._step_base()
+        twice += self._wrong_actions(flat)
         region = self.variables_space if space is None else space
         key = self.moment(base.index)
         plan, change = feasible_plan(
@@ -391,6 +398,36 @@ class World(WorldAttributes):
         if base.at_start:
             self._forget()
         return audit
+
+    def _wrong_actions(self, request: Mapping[str, Any]) -> list[InterventionError]:
+        """List mechanisms of actions that give no action at this instant."""
+        problems: list[InterventionError] = []
+        for name, act in request.items():
+            if not isinstance(act, Mechanism) or name not in self.model:
+                continue
+            targets, parents = self.model.targets(name), [p.name for p in act.parents if not p.lag]
+            known = len(parents) == len(act.parents) and all(p in self.model for p in parents)
+            if not known or not self.compiled.actions.keys() >= {*targets}:
+                continue  # parents are refused with the reason
+            try:
+                model, values = (
+                    self.model.with_interventions({name: act}),
+                    self.evaluate((*parents,)),
+                )
+                for target in targets:
+                    value, declared = model.evaluate(target, values), model.declared(target)
+                    if np.shape(value) != declared.shape:
+                        raise WrongShape(name, act, declared.shape, np.shape(value))
+                    if not np.isfinite(value).all():
+                        raise NotFinite(name, value)
+            except CyclicModel:
+                continue  # refused with the reason
+            except InterventionError as problem:
+                problems.append(problem)
+            except Exception as error:
+                said = f"do({name}): its function raised {in_one_line(error)}"
+                problems.append(InterventionError(said, variable=name, value=act))
+        return problems
 
     def _step_base(self, *, at_start: bool = False) -> StepBase:
         values, state = self._values, self._values.state.copy()
@@ -410,20 +447,30 @@ class World(WorldAttributes):
         Raises:
             EngineFailure: The engine does not report what it was given.
         """
-        kept, numbers, index = self._values, self._values.matrix.copy(), self._index
-        model, static, state = self._held, kept.static, kept.state.copy()
-        before = Present(self.compiled, self.structure, dict(kept.now), state)
+        values = self._values
+        before = Present(self.compiled, self.structure, dict(values.now), values.state.copy())
         undo = before.inverse(change)
-        try:
+        with self._all_or_nothing(lambda: self.backend.apply(undo) if change else None):
             inertia = self._inertia(change)
             if change:
                 self.backend.apply(change)
                 self._check_applied(change)
             self._adopt(plan.compiled, plan.model, plan.static, plan.index)
             return report(request, plan, change, before, self._present(), inertia, self.backend)
+
+    @contextmanager
+    def _all_or_nothing(self, undo: Callable[[], None]) -> Iterator[None]:
+        """Put everything back, should something fail half way.
+
+        Args:
+            undo: Puts the engine back.
+        """
+        kept, numbers, index = self._values, self._values.matrix.copy(), self._index
+        model, static, state = self._held, kept.static, kept.state.copy()
+        try:
+            yield
         except BaseException:
-            if change:
-                self.backend.apply(undo)
+            undo()
             self._values = kept
             self._adopt(kept.compiled, model, static, index, state)
             kept.matrix[...] = numbers
@@ -523,8 +570,13 @@ class World(WorldAttributes):
         return self._values.now, self._values.state
 
     def snapshot(self) -> WorldSnapshot:
-        """Save everything that decides how the world goes on. It can be pickled."""
-        self._require_episode()
+        """Save everything that decides how the world goes on. It can be pickled.
+
+        Raises:
+            NotReset: There is no episode yet.
+            EngineFailure: The engine has lost the state.
+        """
+        self._require_state()
         base = self._base
         saved = base and WorldSnapshot(
             engine=None,
@@ -536,9 +588,10 @@ class World(WorldAttributes):
             pending=dict(base.pending),
             at_start=base.at_start,
         )
-        return WorldSnapshot(
-            engine=self.backend.snapshot(),
-            kept=self._values.static,
+        static, engine = self._values.static, self.backend.snapshot()
+        found = WorldSnapshot(
+            engine=engine,
+            kept=static,
             interventions=self._held.interventions,
             previous=self.previous(),
             action=np.array(self._values.action),
@@ -549,79 +602,134 @@ class World(WorldAttributes):
             plan=self.compiled.plan,
             base=saved,
         )
+        present = StepBase(self.compiled, self._held, static, self._values.state, self._index)
+        self.structures.checked[found] = self.engine, engine, present, base
+        return found
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Go back to a snapshot, bit for bit.
 
+        What a snapshot holds is checked when a world of this process meets it for the first time.
+
         Raises:
-            SnapshotMismatch: It is one of another task or engine.
+            SnapshotMismatch: It is one of another task or engine, or damaged. The world is as it
+                was.
+            EngineFailure: The engine failed on the way. Where the snapshot had been checked before,
+                the world goes on only after a reset, or from a snapshot.
         """
+        known = self._known(snapshot)
+        found = known or self._validated(snapshot)
+        _, engine, present, base = found
+        if not self._started:
+            self._begin()
+        before = None if known else self.backend.snapshot()
+
+        def undo() -> None:
+            if before is not None:
+                self.backend.restore(before)
+            else:
+                self._lost = "a snapshot was restored in part"
+
+        try:
+            with self._all_or_nothing(undo):
+                self.backend.restore(engine)
+                if not known:
+                    self._check_restored(present)
+                self._adopt(present.compiled, present.model, present.static, snapshot.index)
+                self._values.action[:] = snapshot.action
+                for name, value in snapshot.previous.items():
+                    self._values.before[name][...] = value
+        except Exception as error:
+            if isinstance(error, ScmWorldError):
+                raise
+            raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
+        self._lost = ""
+        self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
+        self._base = base
+        self.structures.checked[snapshot] = found
+
+    def _known(self, snapshot: WorldSnapshot) -> CheckedSnapshot | None:
+        """Give what is known of a snapshot that has been checked with this engine."""
         if not isinstance(snapshot, WorldSnapshot):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
+        found = self.structures.checked.get(snapshot)
+        if found is None or found[0] != self.engine:
+            return None
+        compiled = found[2].compiled  # it may have been compiled again since
+        return found if self.structures.compiled(compiled.plan) is compiled else None
+
+    def _validated(self, snapshot: WorldSnapshot) -> CheckedSnapshot:
+        """Check a snapshot; the world stays as it is. See ``StructureCache.checked``.
+
+        Raises:
+            SnapshotMismatch: It is one of another task, or damaged.
+        """
         if snapshot.world != self.identity:
             raise SnapshotMismatch(
                 "the snapshot is one of another task, of other arguments of it or of other options"
             )
-        engine = snapshot.unpacked(self.structure)
-        present, saved = self._checked_base(snapshot), snapshot.base
-        base = None if saved is None else self._checked_base(saved)
-        noise = Noise(snapshot.seed)
-        if not self._started:
-            self._begin()
-        before = self.backend.snapshot()
+        engine, saved = snapshot.unpacked(self.structure), snapshot.base
         try:
-            self.backend.restore(engine)
-            self._check_restored(present)
-        except BaseException as error:
-            self.backend.restore(before)
-            if isinstance(error, ScmWorldError) or not isinstance(error, Exception):
-                raise
-            raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
-        self._lost = ""
-        self.noise, self.episode = noise, snapshot.episode
-        self._adopt(present.compiled, present.model, present.static, snapshot.index)
-        self._values.action[:] = snapshot.action
-        for name, value in snapshot.previous.items():
-            self._values.before[name][...] = value
-        self._base = base
-
-    def _checked_base(self, saved: WorldSnapshot) -> StepBase:
-        """Return what a snapshot holds of a control step; the world stays as it is.
-
-        Raises:
-            SnapshotMismatch: It is damaged.
-        """
-        try:
-            compiled = self.structures.compiled(saved.plan)
-            declared = compiled.model.declared
-            vector = saved.vector if saved.engine is None else compiled.empty_state().vector
-            parts = {**saved.kept, **saved.previous}
-            wrong = [name for name, value in parts.items() if value.shape != declared(name).shape]
-            missing = {*saved.kept} ^ {*compiled.static_names}
-            if saved.engine is not None:
-                missing |= {*saved.previous} ^ {*compiled.mechanisms.earlier}
-            if saved.engine is not None and saved.action.shape != (compiled.n_actions,):
-                wrong.append("the action")
-            if vector.shape != compiled.empty_state().vector.shape:
-                wrong.append("the state")
-            if wrong or missing:
-                raise ValueError(f"no values of {', '.join(sorted([*wrong, *missing]))}")
-            return StepBase(
-                compiled,
-                compiled.model.with_interventions(saved.interventions),
-                saved.kept,
-                compiled.empty_state(vector.copy()),
-                whole_number("index", saved.index, least=0),
-                dict(saved.pending),
-                saved.at_start,
-            )
+            present = self._checked_base(snapshot, is_present=True)
+            base = None if saved is None else self._checked_base(saved, is_present=False)
+            if base and base.index != present.index and CONTROL_INDEX not in base.pending:
+                raise ValueError(f"its base is of control step {base.index}")
+            whole_number("seed", snapshot.seed, least=0)
+            whole_number("episode", snapshot.episode, least=0)
         except Exception as error:
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
+        return self.engine, engine, present, base
+
+    def _checked_base(self, saved: WorldSnapshot, *, is_present: bool) -> StepBase:
+        """Return what a snapshot holds of a control step.
+
+        Raises:
+            Exception: It is damaged.
+        """
+        arranged, absent = saved.plan
+        compiled = self.structures.compiled((arranged, frozenset()))
+        unknown = arranged is not None and not len(self.structures.head)
+        if unknown or not compiled.entity_names.issuperset(absent):
+            raise ValueError(f"there is no structure {saved.plan!r}")
+        compiled = self.structures.compiled(saved.plan)
+        model, state = compiled.model, compiled.empty_state()
+        vector = state.vector if is_present else saved.vector
+        shapes = {name: model.declared(name).shape for name in (*saved.kept, *saved.previous)}
+        parts = [(name, value, shapes[name]) for name, value in saved.kept.items()]
+        parts += [(name, value, shapes[name]) for name, value in saved.previous.items()]
+        parts += [("the state", vector, state.vector.shape)]
+        parts += [("the action", saved.action, (compiled.n_actions,))] if is_present else []
+        wrong = [name for name, value, shape in parts if not _numbers(value, shape)]
+        missing = {*saved.kept} ^ {*compiled.static_names}
+        if is_present:
+            missing |= {*saved.previous} ^ {*compiled.mechanisms.earlier}
+        if wrong or missing:
+            raise ValueError(f"no values of {', '.join(sorted([*wrong, *missing]))}")
+        if not isinstance(saved.at_start, bool) or not (is_present or saved.base is None):
+            raise ValueError("its base is no base")
+        for name, act in (*saved.interventions.items(), *saved.pending.values()):
+            if not isinstance(name, str) or not isinstance(act, _INTERVENTIONS):
+                raise ValueError(f"{name!r} holds no intervention: {act!r}")
+        return StepBase(
+            compiled,
+            model.with_interventions(saved.interventions),
+            saved.kept,
+            compiled.empty_state(vector.copy()),
+            whole_number("index", saved.index, least=0),
+            dict(saved.pending),
+            saved.at_start,
+        )
 
     def _check_restored(self, present: StepBase) -> None:
         """Refuse an engine's part that does not belong to the rest of a snapshot."""
         if self.backend.structure != present.compiled.structure(present.static):
             raise SnapshotMismatch("the snapshot is damaged: the engine has another structure")
+        keys = {key: name for name, key in present.compiled.parameter_keys.items()}
+        reported = self.backend.parameters(keys)
+        wrong = [n for key, n in keys.items() if not _close(present.static[n], reported[key])]
+        if wrong:
+            told = f"the engine has other values of {', '.join(wrong)}"
+            raise SnapshotMismatch(f"the snapshot is damaged: {told}")
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""
@@ -643,6 +751,12 @@ class World(WorldAttributes):
         if self._lost:
             advice = "reset the world, or restore a snapshot"
             raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> bool:
+    """Tell whether something is an array of finite numbers of a shape."""
+    right = isinstance(value, np.ndarray) and value.shape == shape and value.dtype.kind in "biuf"
+    return right and bool(np.isfinite(value).all())
 
 
 def _copies(values: Values) -> dict[str, Value]:

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from worlds import PUSHING, REST, begin, play, same
 
+from scm_world.backends import make_backend
+from scm_world.backends.wrapper import BackendWrapper
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import SnapshotMismatch, WrongType
+from scm_world.errors import (
+    EngineFailure,
+    InterventionError,
+    SeveralProblems,
+    SnapshotMismatch,
+    WrongType,
+)
 from scm_world.tasks import ModelTask, StepTask
-from scm_world.variables import Exogenous, Measured, Mechanism
+from scm_world.variables import Exogenous, Hard, Measured, Mechanism
 from scm_world.world import World
 
 
@@ -54,10 +62,21 @@ def _grow(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
     return {"x": state["x"] + parameters["rate"]}
 
 
-def _growing(default: float) -> World:
+def _shrink(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
+    return {"x": state["x"] - parameters["rate"]}
+
+
+def _scaled(factor: float) -> Any:
+    def move(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
+        return {"x": _grow(parameters, state, action, noise)["x"] * factor}
+
+    return move
+
+
+def _growing(default: float, step: Any = _grow) -> World:
     rate = Exogenous(name="rate", default=default)
     x = Measured(name="x", settable_state=True, default=0.0, parents=("rate",))
-    return World(StepTask(_grow, parameters=[rate], states=[x], control_dt=0.1))
+    return World(StepTask(step, name="grow", parameters=[rate], states=[x], control_dt=0.1))
 
 
 _POLE = (
@@ -67,8 +86,10 @@ _POLE = (
 
 
 def test_a_snapshot_of_other_arguments_is_refused() -> None:
-    """Tasks of one name with other arguments, or of another model, are not the same world."""
+    """Tasks of one name with other arguments, model or step function are not the same world."""
     pairs = [(_growing(0.1), _growing(0.2))]
+    pairs.append((_growing(0.1), _growing(0.1, _shrink)))
+    pairs.append((_growing(0.1, _scaled(1.0)), _growing(0.1, _scaled(2.0))))
     pairs.append((World(ModelTask(_POLE.format(0.02))), World(ModelTask(_POLE.format(0.03)))))
     for first, second in pairs:
         first.reset(seed=0)
@@ -89,31 +110,87 @@ def test_a_damaged_snapshot_leaves_the_world_as_it_was(backend: str, task: str) 
     there, values = world.snapshot(), world.values()
     future = play(world, [REST] * 5)
     world.restore(there)
-    other = {**good.kept, "tool_block.mass": np.zeros(2)}
-    few = {name: value for name, value in good.kept.items() if name != "tool_block.mass"}
     assert good.base is not None
-    damaged = [
-        replace(good, **field)
-        for field in (
-            {"kept": other},
-            {"kept": few},
-            {"previous": {}},
-            {"action": np.zeros(2)},
-            {"index": -1},
-            {"plan": None},
-            {"engine": b"no pickle"},
-            {"engine": None},
-            {"engine": replace(good.engine, payload=None)},
-            {"engine": replace(good.engine, engine="another engine")},
-            {"base": replace(good.base, kept=few)},
-            {"base": replace(good.base, vector=np.zeros(2))},
-        )
+    nan, name, first = np.array(np.nan), "tool_block.mass", next(iter(good.previous))
+    few = {other: value for other, value in good.kept.items() if other != name}
+    unknown = {"no_such": Hard(1.0)}
+    masses = (np.zeros(2), nan, 0.1, np.array("x"), np.array(1j), np.array(0.2))
+    changes: list[dict[str, Any]] = [
+        *({"kept": {**good.kept, name: mass}} for mass in masses),
+        *({"kept": kept} for kept in (few, {**good.kept, "no_such": nan}, None)),
+        *({"previous": {**good.previous, other: nan}} for other in (first, "no_such")),
+        *({"previous": previous} for previous in ({}, None)),
+        *({"action": action} for action in (np.zeros(2), good.action * nan, None, "x")),
+        *({"index": index} for index in (-1, 1.5, "x")),
+        *({"seed": -1}, {"seed": "x"}, {"episode": -1}, {"episode": None}, {"world": ()}),
+        *({"plan": plan} for plan in (None, (None, frozenset({"no_such"})))),
+        *({"interventions": acts} for acts in (unknown, {name: 1.0}, None)),
+        *({"engine": engine} for engine in (b"no pickle", None)),
+        {"engine": replace(good.engine, payload=None)},
+        {"engine": replace(good.engine, engine="another engine")},
+        *({"base": replace(good.base, vector=v)} for v in (np.zeros(2), good.base.vector * nan)),
+        *({"base": replace(good.base, pending=p)} for p in ({"x": 1}, {name: (name, 1.0)})),
+        {"base": replace(good.base, index=7)},
+        {"base": replace(good.base, kept=few)},
+        {"base": replace(good.base, at_start="x")},
+        {"base": good},
+        {"base": "x"},
     ]
+    damaged = [replace(good, **change) for change in changes]
     for snapshot in damaged:
         with pytest.raises(SnapshotMismatch):
             world.restore(snapshot)
         assert same(world.values(), values)
     np.testing.assert_array_equal(play(world, [REST] * 5), future)
+
+
+class _Failing(BackendWrapper):
+    """Fails once, in the middle of going to a snapshot."""
+
+    name: ClassVar[str] = "failing"
+    fails: type[BaseException] | None = None
+
+    def read(self, into: Any) -> None:
+        error, self.fails = self.fails, None
+        if error is not None:
+            raise error("no luck")
+        super().read(into)
+
+
+@pytest.mark.parametrize("fails", [ValueError, KeyboardInterrupt])
+def test_what_fails_after_the_engine_went_back_is_undone(fails: type[BaseException]) -> None:
+    """A snapshot that is met for the first time is restored as a whole, or not at all."""
+    backend = _Failing(make_backend("fake"))
+    world = World("pushing", backend=backend)
+    world.reset(seed=0)
+    written = pickle.dumps(world.snapshot())
+    world.do({"tool_block.mass": 0.1, "gravity": [0.0, 0.0, -5.0]})
+    world.step(REST)
+    values = world.values()
+    backend.fails = fails
+    with pytest.raises(SnapshotMismatch if fails is ValueError else fails, match="no luck"):
+        world.restore(pickle.loads(written))  # noqa: S301 # our own
+    assert same(world.values(), values)
+    assert backend.parameters([("tool_block", "mass")])["tool_block", "mass"] == 0.1
+    world.do({"gravity": [0.0, 0.0, -6.0]})
+
+
+def test_a_world_that_was_left_between_two_instants_says_so() -> None:
+    """Where an engine fails on the way to a snapshot of this process, the world is lost."""
+    backend = _Failing(make_backend("fake"))
+    world = World("pushing", backend=backend)
+    world.reset(seed=0)
+    start, values = world.snapshot(), world.values()
+    world.step(REST)
+    backend.fails = KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        world.restore(start)
+    for goes_on in (lambda: world.step(REST), world.snapshot, lambda: world.do({})):
+        with pytest.raises(EngineFailure, match="restored in part"):
+            goes_on()
+    world.restore(start)
+    assert same(world.values(), values)
+    world.step(REST)
 
 
 def test_a_pickled_snapshot_has_a_checksum() -> None:
@@ -143,3 +220,19 @@ def test_mechanisms_give_numbers(given: Any) -> None:
     with pytest.raises(WrongType, match="floor_color"):
         world.do({"floor_color": Mechanism(lambda friction: given, ["floor_friction"])})
     assert same(world.values(), values)
+
+
+@pytest.mark.parametrize("given", [np.zeros(8), np.zeros((2, 9)), np.full(9, np.nan), "x", None])
+@pytest.mark.parametrize("resolution", ["vector", "joint"])
+def test_mechanisms_of_actions_give_actions(given: Any, resolution: str) -> None:
+    """What would fail at every step is refused, with the other problems of the request."""
+    world = World("pushing", backend="fake", resolution=resolution)
+    world.reset(seed=0)
+    wrong = Mechanism(lambda joints: given, ["joint_positions"])
+    with pytest.raises(SeveralProblems, match=r"(?s)2 problems.*do\(action\).*do\(gravity\)"):
+        world.do({"action": wrong, "gravity": [0.0, 0.0, 1e9]})
+    fails = Mechanism(lambda joints: joints[11], ["joint_positions"])
+    with pytest.raises(InterventionError, match="raised IndexError"):
+        world.do({"action": fails})
+    world.do({"action": Mechanism(lambda joints: 0.9 * joints, ["joint_positions"])})
+    world.step(REST)
