@@ -39,9 +39,9 @@ from evaluation_policy import Mlp
 from evaluation_steps import shares
 
 from scm_world.evaluation.benchmark import protocols_of
-from scm_world.evaluation.parts import FOLDER
 from scm_world.evaluation.pipeline import evaluate, played
 from scm_world.evaluation.setups import SHARD, prepare
+from scm_world.evaluation.shards import FOLDER
 
 TASK = "pushing"
 PUBLISHED = 200  # episodes of a protocol in the predecessor's benchmark

@@ -27,10 +27,10 @@ from scm_world.cli.working import Work
 from scm_world.errors import UnknownOption
 from scm_world.evaluation import METRICS, Evaluation, evaluate
 from scm_world.evaluation.files import CODECS
-from scm_world.evaluation.parts import FOLDER
 from scm_world.evaluation.players import NAMES
 from scm_world.evaluation.reporting import write_outputs
 from scm_world.evaluation.setups import task_of
+from scm_world.evaluation.shards import FOLDER
 from scm_world.output.locations import Location
 
 INTERRUPTED = 130

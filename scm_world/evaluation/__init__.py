@@ -8,9 +8,9 @@ An evaluation is one call::
     found.save("results")
 """
 
-from scm_world.evaluation.arena import METRICS
 from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.checking import Check, check
+from scm_world.evaluation.episodes import METRICS
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
 from scm_world.evaluation.files import merge
 from scm_world.evaluation.pipeline import evaluate

@@ -13,12 +13,12 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world.curricula.parts import Do
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.arena import Arena
-from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.agents import AgentRun, listed
+from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.seats import Seat, listed
 from scm_world.evaluation.setups import Place, Setup
 from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
@@ -52,13 +52,13 @@ class Check:
         return not self.wrong
 
 
-def bench_of(
+def shard_runner_of(
     evaluation: Evaluation,
     *,
     policy: Any = None,
     task: Task | str | None = None,
     trusted: Sequence[str] = (),
-) -> Bench:
+) -> ShardRunner:
     """Prepare to run episodes of an evaluation again.
 
     Args:
@@ -79,14 +79,14 @@ def bench_of(
     protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
     setup = Setup(
         place,
-        tuple(_seats(evaluation, policy, trusted)),
+        tuple(_agent_runs(evaluation, policy, trusted)),
         tuple(about["engines"]),
         tuple(protocols),
         tuple(about["seeds"]),
         about["n"],
         about["versions"],
     )
-    return Bench(setup, trusted)
+    return ShardRunner(setup, trusted)
 
 
 def _place(
@@ -130,7 +130,7 @@ def _place(
     return place
 
 
-def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[Seat]:
+def _agent_runs(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Iterator[AgentRun]:
     """Find who acted: the policy given now, one in a file, one given then, or one by its name.
 
     Raises:
@@ -153,7 +153,7 @@ def _seats(evaluation: Evaluation, policy: Any, trusted: Sequence[str]) -> Itera
             player = as_player(evaluation.policies[who])
         else:
             player = player_from(what, trusted=trusted)
-        yield Seat(*who, player, what, one.get("env"))
+        yield AgentRun(*who, player, what, one.get("env"))
 
 
 def _acts(options: Any, trusted: Sequence[str]) -> Any:
@@ -175,9 +175,9 @@ def _acts(options: Any, trusted: Sequence[str]) -> Any:
 
 def _same_versions(place: Place, made: Mapping[str, Mapping[str, str]]) -> None:
     for engine, then in made.items():
-        arena = Arena(place.env(engine))
-        now = versions(arena.env.world.engine)
-        arena.close()
+        runner = EpisodeRunner(place.env(engine))
+        now = versions(runner.env.world.engine)
+        runner.close()
         differ = [
             f"{package} {then.get(package, 'none')} (here {now.get(package, 'none')})"
             for package in sorted(then.keys() | now.keys())
@@ -219,27 +219,27 @@ def check(
     count = min(whole_number("episodes", episodes, least=1), len(evaluation))
     drawn = secrets.randbits(32) if seed is None else whole_number("seed", seed, least=0)
     places = np.random.default_rng(drawn).choice(len(evaluation), count, replace=False)
-    bench = bench_of(evaluation, policy=policy, task=task, trusted=trusted)
+    shard_runner = shard_runner_of(evaluation, policy=policy, task=task, trusted=trusted)
     wrong = []
     try:
         for done, place in enumerate(sorted(places.tolist())):
-            wrong += _compared(bench, evaluation, place)
+            wrong += _compared(shard_runner, evaluation, place)
             if progress is not None:
                 progress(done + 1, count)
     finally:
-        bench.close()
+        shard_runner.close()
     return Check(count, drawn, tuple(wrong))
 
 
-def _compared(bench: Bench, evaluation: Evaluation, place: int) -> list[str]:
+def _compared(shard_runner: ShardRunner, evaluation: Evaluation, place: int) -> list[str]:
     """Run the episode of one row again; name each difference."""
     row = {name: column[place].item() for name, column in evaluation.columns.items()}
-    shard = bench.setup.shard_of(row)
-    found = Evaluation.of({}, [bench.play(shard, shard.first)])
+    shard = shard_runner.setup.shard_of(row)
+    found = Evaluation.of({}, [shard_runner.play(shard, shard.first)])
     again = {name: column[0].item() for name, column in found.columns.items()}
     where = ", ".join(f"{key} {row[key]}" for key in KEYS)
     if again["hash"] != row["hash"]:
-        noisy = bench.setup.seats[shard.seat].about.get("repeats") == "no"
+        noisy = shard_runner.setup.agents[shard.agent].about.get("repeats") == "no"
         why = "; the policy gives two actions for one observation" if noisy else ""
         return [f"{where}: other states or actions{why}"]
     wrong = []

@@ -13,9 +13,9 @@ from scm_world.curricula.parts import Acts, AnyPart, Part
 from scm_world.curricula.situations import Situation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.arena import Arena, Row
-from scm_world.evaluation.checking import bench_of
-from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.checking import shard_runner_of
+from scm_world.evaluation.episodes import EpisodeRunner, Row
+from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Shard
@@ -180,40 +180,40 @@ def why(
     one = evaluation.only(**where, episode=episode)
     if versus not in (None, *VERSUS):
         raise UnknownOption("versus", versus, VERSUS)
-    bench = bench_of(evaluation, policy=policy, task=task, trusted=trusted)
+    shard_runner = shard_runner_of(evaluation, policy=policy, task=task, trusted=trusted)
     try:
-        shard = bench.setup.shard_of({**where, "episode": episode})
-        row = bench.play(shard, episode)
+        shard = shard_runner.setup.shard_of({**where, "episode": episode})
+        row = shard_runner.play(shard, episode)
         if row.hash != one.columns["hash"][0]:
             raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
-        return _others(bench, shard, row, metric, versus, progress)
+        return _others(shard_runner, shard, row, metric, versus, progress)
     finally:
-        bench.close()
+        shard_runner.close()
 
 
 def _others(
-    bench: Bench,
+    shard_runner: ShardRunner,
     shard: Shard,
     row: Row,
     metric: str,
     versus: str | None,
     progress: Progress | None,
 ) -> Explanation:
-    protocol = bench.setup.protocols[shard.protocol]
+    protocol = shard_runner.setup.protocols[shard.protocol]
     if not row.drawn:
         allowed = ("an episode in which a protocol varies something",)
         raise UnknownOption("episode", f"{row.protocol}, {row.episode}", allowed)
-    arena = bench.arena(shard)
+    runner = shard_runner.runner(shard)
     where: Any = {"seed": shard.seed, "episode": row.episode, "who": (row.agent, row.run)}
-    usual = _natural(arena, shard, row)
-    against: dict[str, Any] = {n: versus or _versus(arena, usual, n, row) for n in row.drawn}
+    usual = _natural(runner, shard, row)
+    against: dict[str, Any] = {n: versus or _versus(runner, usual, n, row) for n in row.drawn}
     found, left_out = [], {}
     for done, (name, how) in enumerate(against.items()):
         part = Instead(of=protocol.part, name=name, versus=how)
         other = Protocol(f"{protocol.name} without {name}", act=part)
         look = _Look(name, protocol.step)
         try:
-            then = arena.play(bench.player(shard.seat), other, **where, watch=look)
+            then = runner.play(shard_runner.player(shard.agent), other, **where, watch=look)
         except EvaluationError as error:
             left_out[name] = error.reason
         else:
@@ -222,7 +222,7 @@ def _others(
             scores = row.scores[metric], then.scores[metric], reached
             would_be = tuple(then.drawn.get(name, look.value))
             one = Otherwise(name, tuple(row.drawn[name]), would_be, *scores)
-            reason = _no_answer(one, row, then, part.found, arena.env.world)
+            reason = _no_answer(one, row, then, part.found, runner.env.world)
             if reason:
                 left_out[name] = reason
             else:
@@ -282,15 +282,15 @@ class _Look:
             self.value = tuple(np.ravel(world[self.name]).astype(float).tolist())
 
 
-def _natural(arena: Arena, shard: Shard, row: Row) -> dict[str, Any]:
+def _natural(runner: EpisodeRunner, shard: Shard, row: Row) -> dict[str, Any]:
     """Give the values of an episode in which nobody intervenes."""
-    arena.env.reset(seed=shard.seed, options={"episode": row.episode})
-    return arena.env.world.values()
+    runner.env.reset(seed=shard.seed, options={"episode": row.episode})
+    return runner.env.world.values()
 
 
-def _versus(arena: Arena, usual: Mapping[str, Any], name: str, row: Row) -> str:
+def _versus(runner: EpisodeRunner, usual: Mapping[str, Any], name: str, row: Row) -> str:
     """Say what a variable is held against: A, unless it lies there already."""
-    model = arena.env.world.model
+    model = runner.env.world.model
     if name not in model:
         return "default"
     variable = model.declared(name)

@@ -14,8 +14,8 @@ import numpy as np
 
 from scm_world._arguments import load as load_library
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
+from scm_world.evaluation.agents import what_it_is
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.seats import what_it_is
 from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
 from scm_world.output.durable import locked, removed, write_durably, write_whole
 from scm_world.output.locations import Location

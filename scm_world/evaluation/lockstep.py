@@ -13,7 +13,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.env.batched.inside import Inside
 from scm_world.env.batched.native import NativeCrew
 from scm_world.env.batched.sheet import FLAGS, FRACTION
-from scm_world.evaluation.arena import Arena, Game, Row
+from scm_world.evaluation.episodes import EpisodeRunner, Row, RunningEpisode
 from scm_world.evaluation.players import Actions, Player
 from scm_world.evaluation.protocols import Protocol
 
@@ -47,13 +47,13 @@ class _Seat:
     """One of the episodes that are under way.
 
     Attributes:
-        game: What is kept of it.
+        episode_run: What is kept of it.
         place: Agent, run, engine, protocol, seed and episode.
         seen: What is needed to ask the policy again, if that has to be done.
         success: Whether the last control step was a success, if the task says so.
     """
 
-    game: Game
+    episode_run: RunningEpisode
     place: tuple[str, int, str, str, int, int]
     seen: Seen | None
     success: bool | None = None
@@ -65,7 +65,7 @@ class _Seat:
             shown: Gives a copy of the observation of a row.
             row: Of this episode.
         """
-        action = self.game.act(shown(row))
+        action = self.episode_run.act(shown(row))
         if self.seen is not None:
             self.seen.append((shown(row), action.tobytes()))
         return action
@@ -73,12 +73,12 @@ class _Seat:
     @property
     def row(self) -> Row:
         """What is kept in the end."""
-        return self.game.row(self.place, success=self.success)
+        return self.episode_run.row(self.place, success=self.success)
 
 
 @final
 class Lockstep:
-    """Plays episodes of one engine side by side; the rows are, bit for bit, those of ``Arena``.
+    """Runs episodes of one backend together, bit for bit as ``EpisodeRunner`` does one by one.
 
     Only a policy whose actions follow from what it observed in the same episode can play several
     of them at once. Where that is not known of a policy, it is asked again: for each episode
@@ -95,7 +95,7 @@ class Lockstep:
     def __init__(self, env: ScmWorldEnv, most: int, threads: int) -> None:
         self._env, self._most, self._threads = env, most, threads
         self._crew: NativeCrew | None = None
-        self._arenas: dict[int, Arena] = {}
+        self._arenas: dict[int, EpisodeRunner] = {}
         self._apart: list[Player] = []  # who plays one episode at a time
 
     def play(self, player: Player, episodes: Episodes) -> list[Row] | None:
@@ -107,13 +107,13 @@ class Lockstep:
 
         Returns:
             A row for each; None if they have to be played one after another. That is so, too,
-            where anything goes wrong: an arena says in which episode.
+            where anything goes wrong: a runner says in which episode.
         """
         if not self._takes(player) or not 1 < len(episodes.numbers) <= self._most:
             return None
         try:
             return self._played(player, episodes)
-        except Exception:  # whatever it was: it happens again in the arena, which tells the place
+        except Exception:  # whatever it was: it happens again in the runner, which tells the place
             self.close()
             return None
 
@@ -145,11 +145,11 @@ class Lockstep:
         engine, seats = self._env.world.backend.name, []
         for index, number in enumerate(episodes.numbers):
             with crew.alone(index) as env:
-                arena = self._arenas.setdefault(index, Arena(env))
-                turn, _ = arena.begin(episodes.protocol, seed=episodes.seed, episode=number)
-                game = Game(env, player.twin(), turn)
+                runner = self._arenas.setdefault(index, EpisodeRunner(env))
+                turn, _ = runner.begin(episodes.protocol, seed=episodes.seed, episode=number)
+                episode_run = RunningEpisode(env, player.twin(), turn)
             place = (*episodes.who, engine, episodes.protocol.name, episodes.seed, number)
-            seats.append(_Seat(game, place, None if player.is_plain else []))
+            seats.append(_Seat(episode_run, place, None if player.is_plain else []))
         return seats
 
     def _go(self, seats: list[_Seat]) -> None:
@@ -165,12 +165,12 @@ class Lockstep:
             self._note(seats, rows)
             which[rows] &= ~(crew.sheet.terminations | crew.sheet.truncations)[rows]
             for row in rows:
-                if which[row] and seats[row].game.is_due:
+                if which[row] and seats[row].episode_run.is_due:
                     with crew.alone(row) as env:
-                        seats[row].game.intervene(env)
-                        seats[row].game.mark.look()
+                        seats[row].episode_run.intervene(env)
+                        seats[row].episode_run.mark.look()
                 else:
-                    seats[row].game.mark.look(crew.state(row))
+                    seats[row].episode_run.mark.look(crew.state(row))
 
     def _note(self, seats: list[_Seat], rows: list[int]) -> None:
         """Take down what a control step gave."""
@@ -180,7 +180,7 @@ class Lockstep:
         fractions, successes = infos.get(FRACTION), infos.get(FLAGS[0])
         for row in rows:
             fraction = None if fractions is None else float(fractions[row])
-            seats[row].game.stepped(rewards[row], fraction)
+            seats[row].episode_run.stepped(rewards[row], fraction)
             seats[row].success = None if successes is None else bool(successes[row])
 
     def _acts_alike_alone(self, player: Any, seat: _Seat) -> bool:

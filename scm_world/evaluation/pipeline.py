@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.errors import UnreadableFile
-from scm_world.evaluation.arena import Arena, Row
+from scm_world.evaluation.agents import AgentRun
+from scm_world.evaluation.episodes import EpisodeRunner, Row
 from scm_world.evaluation.lockstep import Episodes, Lockstep
-from scm_world.evaluation.parts import read_part, write_part
 from scm_world.evaluation.players import Player, as_player
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.seats import Seat
 from scm_world.evaluation.setups import SHARD, Setup, Shard, prepare
+from scm_world.evaluation.shards import read_part, write_part
 from scm_world.evaluation.tables import columns_of
 from scm_world.output.durable import locked
 from scm_world.output.locations import Location, located
@@ -28,8 +28,8 @@ from scm_world.work.threads import cores
 
 @final
 @dataclass
-class Bench:
-    """Plays shards one after another, and keeps what it has made for the next one.
+class ShardRunner:
+    """Runs shards one after another; keeps environments and policies for the next one.
 
     Attributes:
         setup: Of the evaluation.
@@ -40,76 +40,76 @@ class Bench:
     setup: Setup
     trusted: Sequence[str] | None = None
     threads: int = 1
-    arenas: dict[str, Arena] = field(default_factory=dict)  # by engine and form
+    runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
     locksteps: dict[str, Lockstep] = field(default_factory=dict)
     players: dict[int, Player] = field(default_factory=dict)
 
     def __call__(self, shard: Shard) -> list[Row]:
         """Play all episodes of a shard, side by side where that is faster."""
-        seat, numbers = self.setup.seats[shard.seat], range(shard.first, shard.stop)
+        agent_run, numbers = self.setup.agents[shard.agent], range(shard.first, shard.stop)
         protocol = self.setup.protocols[shard.protocol]
-        episodes = Episodes((seat.agent, seat.run), protocol, shard.seed, numbers)
-        rows = self.lockstep(shard).play(self.player(shard.seat), episodes)
+        episodes = Episodes((agent_run.agent, agent_run.run), protocol, shard.seed, numbers)
+        rows = self.lockstep(shard).play(self.player(shard.agent), episodes)
         return rows or [self.play(shard, episode) for episode in numbers]
 
     def play(self, shard: Shard, episode: int, watch: Any = None) -> Row:
         """Play one episode of it."""
-        seat = self.setup.seats[shard.seat]
-        return self.arena(shard).play(
-            self.player(shard.seat),
+        agent_run = self.setup.agents[shard.agent]
+        return self.runner(shard).play(
+            self.player(shard.agent),
             self.setup.protocols[shard.protocol],
             seed=shard.seed,
             episode=episode,
-            who=(seat.agent, seat.run),
+            who=(agent_run.agent, agent_run.run),
             watch=watch,
         )
 
-    def arena(self, shard: Shard) -> Arena:
+    def runner(self, shard: Shard) -> EpisodeRunner:
         """Give where the episodes of a shard happen: on its engine, in the form of its agent."""
         key = self.setup.where(shard)
-        if key not in self.arenas:
-            self.arenas[key] = Arena(self.setup.env(shard))
-        return self.arenas[key]
+        if key not in self.runners:
+            self.runners[key] = EpisodeRunner(self.setup.env(shard))
+        return self.runners[key]
 
     def lockstep(self, shard: Shard) -> Lockstep:
         """Give where the episodes of a shard happen side by side."""
         key = self.setup.where(shard)
         if key not in self.locksteps:
-            env, most = self.arena(shard).env, min(SHARD, self.setup.n)
+            env, most = self.runner(shard).env, min(SHARD, self.setup.n)
             self.locksteps[key] = Lockstep(env, most, self.threads)
         return self.locksteps[key]
 
-    def player(self, seat: int) -> Player:
+    def player(self, number: int) -> Player:
         """Give who acts.
 
         Raises:
             UnreadableFile: It is a file, and another one than it was when the evaluation began.
         """
-        if seat not in self.players:
-            given = self.setup.seats[seat]
+        if number not in self.players:
+            given = self.setup.agents[number]
             player = as_player(given.policy, trusted=self.trusted)
             _refuse_another(player, given)
-            self.players[seat] = player
-        return self.players[seat]
+            self.players[number] = player
+        return self.players[number]
 
     def close(self) -> None:
         """Free the engines."""
         for lockstep in self.locksteps.values():
             lockstep.close()
-        for arena in self.arenas.values():
-            arena.close()
+        for runner in self.runners.values():
+            runner.close()
         self.locksteps.clear()
-        self.arenas.clear()
+        self.runners.clear()
 
 
-def _refuse_another(player: Player, seat: Seat) -> None:
+def _refuse_another(player: Player, agent_run: AgentRun) -> None:
     """Refuse a file that was written anew meanwhile, as a training does it."""
-    if isinstance(seat.policy, str | Path):
-        then, now = (about.get("sha256") for about in (seat.about, player.about))
+    if isinstance(agent_run.policy, str | Path):
+        then, now = (about.get("sha256") for about in (agent_run.about, player.about))
         if then != now:
             advice = "copy it if a training still writes it, and evaluate the copy"
             raise UnreadableFile(
-                str(seat.policy), "it has changed since the evaluation began", advice
+                str(agent_run.policy), "it has changed since the evaluation began", advice
             )
 
 
@@ -189,7 +189,7 @@ def evaluate(
         locked(folder) if folder is not None else nullcontext(),
     ):
         rows = played(setup, executor, folder=folder, trusted=trusted, progress=progress)
-    policies = {(seat.agent, seat.run): seat.policy for seat in setup.seats}
+    policies = {(agent_run.agent, agent_run.run): agent_run.policy for agent_run in setup.agents}
     return Evaluation(setup.about(), columns_of(rows), policies)
 
 
@@ -214,7 +214,7 @@ def played(
     keys = [setup.key(shard) if folder is not None else "" for shard in shards]
     found: dict[int, list[Row]] = {}
     for place, (shard, key) in enumerate(zip(shards, keys, strict=True)):
-        noisy = setup.seats[shard.seat].about.get("repeats") == "no"  # who may be another by now
+        noisy = setup.agents[shard.agent].about.get("repeats") == "no"  # who may be another by now
         count = shard.stop - shard.first
         kept = None if folder is None or noisy else read_part(folder, key, count)
         if kept is not None:
@@ -225,10 +225,10 @@ def played(
     with opened(executor) as player:
         if not isinstance(player, Serial):
             setup.place.refuse_unsent(player)
-        for seat in setup.seats:
-            player.check(f"policy {seat.agent!r} with several workers", seat.policy)
+        for agent_run in setup.agents:
+            player.check(f"policy {agent_run.agent!r} with several workers", agent_run.policy)
         threads = cores() if isinstance(player, Serial) else 1  # workers share the cores
-        make = partial(Bench, setup, trusted, threads)
+        make = partial(ShardRunner, setup, trusted, threads)
         for index, rows in player.run(make, [shards[place] for place in missing]):
             place = missing[index]
             found[place] = rows

@@ -7,7 +7,7 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from scm_world.evaluation.checking import bench_of
+from scm_world.evaluation.checking import shard_runner_of
 from scm_world.evaluation.outputs import (
     bars_figure,
     causes_figure,
@@ -70,10 +70,10 @@ def write_outputs(
     films: list[Location] = []
     doers = [(agent, engine) for agent in evaluation.agents for engine in evaluation.engines]
     if videos:
-        with closing(bench_of(evaluation, policy=policy, trusted=trusted)) as bench:
+        with closing(shard_runner_of(evaluation, policy=policy, trusted=trusted)) as shard_runner:
             for agent, engine in doers:
                 who: Any = {"agent": agent, "engine": engine, "metric": metric}
-                films += record_videos(bench, evaluation, place, **who, progress=progress)
+                films += record_videos(shard_runner, evaluation, place, **who, progress=progress)
     drawn: dict[str, Callable[[], Figure]] = {"bars": lambda: bars_figure(evaluation, metric)}
     if len(evaluation.protocols) >= CORNERS:
         drawn["radar"] = lambda: radar_figure(evaluation, metric)

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.arena import FRACTIONS, Row
+from scm_world.evaluation.episodes import FRACTIONS, Row
 from scm_world.evaluation.statistics import (
     LEVEL,
     Causes,

@@ -16,11 +16,11 @@ from scm_world._arguments import whole_number
 from scm_world.backends import backends
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.arena import Arena
+from scm_world.evaluation.agents import AgentRun, LoadedAgent, load_agents, source_of
 from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.episodes import EpisodeRunner
 from scm_world.evaluation.forms import form_of, in_form, shared_options, task_for
 from scm_world.evaluation.protocols import Protocol, chosen
-from scm_world.evaluation.seats import Entry, Seat, entries_of, source_of
 from scm_world.models import Model
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
@@ -125,7 +125,7 @@ class Shard:
     """Some episodes in a row of one policy on one engine in one protocol.
 
     Attributes:
-        seat: Place of the policy among the policies.
+        agent: Place of the policy among the policies.
         engine: Name of the engine.
         protocol: Place of the protocol among the protocols.
         seed: Of the noise.
@@ -133,7 +133,7 @@ class Shard:
         stop: Number after the last one.
     """
 
-    seat: int
+    agent: int
     engine: str
     protocol: int
     seed: int
@@ -148,7 +148,7 @@ class Setup:
 
     Attributes:
         place: Where.
-        seats: Who.
+        agents: Who.
         engines: On which engines.
         protocols: What is done.
         seeds: Of the noise.
@@ -157,7 +157,7 @@ class Setup:
     """
 
     place: Place
-    seats: tuple[Seat, ...]
+    agents: tuple[AgentRun, ...]
     engines: tuple[str, ...]
     protocols: tuple[Protocol, ...]
     seeds: tuple[int, ...]
@@ -166,21 +166,21 @@ class Setup:
 
     def env(self, shard: Shard) -> ScmWorldEnv:
         """Make the environment of a shard: on its engine, in the form of its agent."""
-        return self.place.env(shard.engine, self.seats[shard.seat].form)
+        return self.place.env(shard.engine, self.agents[shard.agent].form)
 
     def where(self, shard: Shard) -> str:
         """Name this environment; it is the same one for agents of the same form."""
-        return json.dumps([shard.engine, self.seats[shard.seat].form], sort_keys=True)
+        return json.dumps([shard.engine, self.agents[shard.agent].form], sort_keys=True)
 
     def shards(self) -> list[Shard]:
         """List everything that has to be played; what is compared with one another is near."""
         return [
-            Shard(seat, engine, protocol, seed, first, min(first + SHARD, self.n))
+            Shard(agent_run, engine, protocol, seed, first, min(first + SHARD, self.n))
             for protocol in range(len(self.protocols))
             for seed in self.seeds
             for first in range(0, self.n, SHARD)
             for engine in self.engines
-            for seat in range(len(self.seats))
+            for agent_run in range(len(self.agents))
         ]
 
     def shard_of(self, row: Mapping[str, Any]) -> Shard:
@@ -192,22 +192,22 @@ class Setup:
         Raises:
             SnapshotMismatch: There is no such agent, run or protocol.
         """
-        seats = [(seat.agent, seat.run) for seat in self.seats]
+        agents = [(agent_run.agent, agent_run.run) for agent_run in self.agents]
         names = [protocol.name for protocol in self.protocols]
         who = (row["agent"], row["run"])
-        if who not in seats or row["protocol"] not in names:
+        if who not in agents or row["protocol"] not in names:
             where = ", ".join(f"{name} {row[name]}" for name in ("agent", "run", "protocol"))
             raise SnapshotMismatch(f"{where}: what is given has no such agent, run or protocol")
         episode = row["episode"]
-        seat, protocol = seats.index(who), names.index(row["protocol"])
-        return Shard(seat, row["engine"], protocol, row["seed"], episode, episode + 1)
+        agent_run, protocol = agents.index(who), names.index(row["protocol"])
+        return Shard(agent_run, row["engine"], protocol, row["seed"], episode, episode + 1)
 
     def key(self, shard: Shard) -> str:
         """Sum up everything that decides what a shard gives."""
-        seat = self.seats[shard.seat]
+        agent_run = self.agents[shard.agent]
         content = {
             "place": self.place.about(),
-            "agent": seat.identity(),
+            "agent": agent_run.identity(),
             "engine": dict(self.versions[shard.engine]),
             "protocol": self.protocols[shard.protocol].as_dict(),
             "episodes": [shard.engine, shard.seed, shard.first, shard.stop],
@@ -220,7 +220,7 @@ class Setup:
         return {
             **self.place.about(),
             "engines": list(self.engines),
-            "agents": [seat.as_dict() for seat in self.seats],
+            "agents": [agent_run.as_dict() for agent_run in self.agents],
             "protocols": [protocol.as_dict() for protocol in self.protocols],
             "seeds": list(self.seeds),
             "n": self.n,
@@ -255,8 +255,8 @@ def prepare(
     Raises:
         ScmWorldError: What is wrong, by name.
     """
-    entries = entries_of(policy, trusted)
-    place = _place(task, env, entries, trusted or ())
+    loaded = load_agents(policy, trusted)
+    place = _place(task, env, loaded, trusted or ())
     engines = _several("backend", backend)
     for engine in engines:
         if not isinstance(engine, str) or engine not in backends():
@@ -266,17 +266,17 @@ def prepare(
     count = whole_number("n", n, least=1)
     noises = tuple(_seed(seed) for seed in _several("seeds", seeds))
     found: dict[str, dict[str, str]] = {}
-    seats: tuple[Seat, ...] = ()
+    agents: tuple[AgentRun, ...] = ()
     for engine in engines:
-        arena = Arena(place.env(engine))
+        runner = EpisodeRunner(place.env(engine))
         try:
             for protocol in wanted:
-                arena.try_out(protocol, seed=noises[0])
-            found[engine] = versions(arena.env.world.engine)
-            seats = seats or tuple(_seated(entries, place, arena.env))
+                runner.try_out(protocol, seed=noises[0])
+            found[engine] = versions(runner.env.world.engine)
+            agents = agents or tuple(_tried_out(loaded, place, runner.env))
         finally:
-            arena.close()
-    setup = Setup(place, seats, engines, wanted, noises, count, found)
+            runner.close()
+    setup = Setup(place, agents, engines, wanted, noises, count, found)
     setup.about()  # refuses what cannot be written down, before any time is spent
     return setup
 
@@ -291,27 +291,29 @@ def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
     Raises:
         ScmWorldError: A policy cannot be read, or they were trained for several tasks.
     """
-    agents = [(entry.agent, entry.made_for) for entry in entries_of(policy, trusted)]
+    agents = [(agent.agent, agent.made_for) for agent in load_agents(policy, trusted)]
     return str(task_for(None, agents, trusted or ()))
 
 
-def _seated(entries: Sequence[Entry], place: Place, shared: ScmWorldEnv) -> Iterator[Seat]:
+def _tried_out(
+    loaded: Sequence[LoadedAgent], place: Place, shared: ScmWorldEnv
+) -> Iterator[AgentRun]:
     """Try everybody out, each in an environment of its own form if it has one."""
     engine = shared.world.backend.name
-    for entry in entries:
-        form = form_of(entry.made_for)
+    for agent in loaded:
+        form = form_of(agent.made_for)
         env = shared if form is None else place.env(engine, form)
         try:
-            yield entry.seated(env)
+            yield agent.tried_out(env)
         finally:
             if env is not shared:
                 env.close()
 
 
 def _place(
-    task: Task | str | None, env: Any, entries: Sequence[Entry], trusted: Sequence[str]
+    task: Task | str | None, env: Any, loaded: Sequence[LoadedAgent], trusted: Sequence[str]
 ) -> Place:
-    agents = [(entry.agent, entry.made_for) for entry in entries]
+    agents = [(agent.agent, agent.made_for) for agent in loaded]
     task = task_for(task, agents, trusted)
     if not isinstance(task, Task | str):
         raise UnknownOption("task", task, tasks())

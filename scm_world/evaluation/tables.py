@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.arena import METRICS, Row
+from scm_world.evaluation.episodes import METRICS, Row
 from scm_world.evaluation.statistics import Interval, difference_interval, is_binary
 
 TEXTS = ("agent", "engine", "protocol", "hash")

@@ -18,8 +18,8 @@ from scm_world._arguments import load, whole_number
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.episodes import EpisodeRunner
 from scm_world.evaluation.protocols import chosen
 from scm_world.evaluation.recording import Recording
 from scm_world.output.durable import locked, made, write_durably
@@ -284,7 +284,7 @@ def demonstrated(
             episodes end.
     """
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
-    arena = Arena(env)
+    runner = EpisodeRunner(env)
     try:
         told = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
         if not told:
@@ -297,13 +297,13 @@ def demonstrated(
         for number in numbers:
             protocol = taught[number % len(taught)]
             random = np.random.default_rng([seed, round_, number])
-            turn, observation = arena.begin(protocol, seed=SEED + seed, episode=number)
+            turn, observation = runner.begin(protocol, seed=SEED + seed, episode=number)
             pairs, info = _episode(lesson, env, turn, observation, random, learner)
             seen.append(np.array([one for one, _ in pairs], np.float32))
             done.append(np.array([one for _, one in pairs], np.float32))
             scores.append(float(info[told[0]]))
     finally:
-        arena.close()
+        runner.close()
     kept = np.array(scores) >= lesson.keep
     empty = slice(0, 0)
     return Demonstrations(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.evaluation import METRICS, Evaluation, evaluate
-from scm_world.evaluation.arena import Row
+from scm_world.evaluation.episodes import Row
 
 rng = np.random.default_rng(0)
 WEIGHTS = rng.normal(size=(56, 9)).astype(np.float32)

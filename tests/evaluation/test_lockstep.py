@@ -13,14 +13,14 @@ from evaluation_samples import Waning, contents, linear
 from scm_world.errors import EvaluationError
 from scm_world.evaluation import Protocol, WorldPolicy, evaluate
 from scm_world.evaluation import pipeline as pipelines
-from scm_world.evaluation.arena import Row
+from scm_world.evaluation.episodes import Row
 from scm_world.evaluation.lockstep import Lockstep
-from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.setups import prepare
 from scm_world.policies import Layer, MlpPolicy
 
 WITHIN = Protocol("late", act={"tool_block.cartesian_position": [0.2, 0.2, 0.0325]}).at(3)
-"""Refused in the fourth control step: the block would be outside of the arena."""
+"""Refused in the fourth control step: the block would be outside of the runner."""
 
 
 class Found(NamedTuple):
@@ -37,11 +37,11 @@ def found(policy: Any, protocols: Any, threads: int, n: int = 3, **env: Any) -> 
     setup = prepare(
         {"a": policy}, protocols, task=task, n=n, seeds=2, backend="mujoco", env=env, trusted=None
     )
-    bench = Bench(setup, None, threads)
-    rows = [row for shard in setup.shards() for row in bench(shard)]
-    crews = [lockstep._crew is not None for lockstep in bench.locksteps.values()]
-    apart = [lockstep._apart for lockstep in bench.locksteps.values()]
-    bench.close()
+    shard_runner = ShardRunner(setup, None, threads)
+    rows = [row for shard in setup.shards() for row in shard_runner(shard)]
+    crews = [lockstep._crew is not None for lockstep in shard_runner.locksteps.values()]
+    apart = [lockstep._apart for lockstep in shard_runner.locksteps.values()]
+    shard_runner.close()
     return Found(rows, any(crews) and not any(apart))
 
 

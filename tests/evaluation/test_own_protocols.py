@@ -12,8 +12,8 @@ from scm_world.curricula import Resample, every, stages, together
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ModelError, ScmWorldError, UnknownOption
 from scm_world.evaluation import Protocol, evaluate, protocols_of
-from scm_world.evaluation.arena import Arena
 from scm_world.evaluation.benchmark import ROLES, ROWS
+from scm_world.evaluation.episodes import EpisodeRunner
 from scm_world.evaluation.players import as_player
 from scm_world.evaluation.protocols import chosen
 from scm_world.tasks import TASKS
@@ -35,7 +35,7 @@ def test_one_line_makes_a_protocol() -> None:
         Protocol("part", act=together({"floor_friction": 0.7}, Resample(mass, space="A"))),
         Protocol("fixed", act={T: {"mass": 0.03}}),
     ]
-    here = Arena(ScmWorldEnv(backend="fake"))
+    here = EpisodeRunner(ScmWorldEnv(backend="fake"))
     found = {}
     for protocol in mine:
         here.begin(protocol, seed=0, episode=0)
@@ -52,7 +52,7 @@ def test_one_line_makes_a_protocol() -> None:
 
 def test_within_the_episode_it_acts_at_its_step() -> None:
     """``P2@3`` changes the mass after three control steps, in every episode, and not before."""
-    here = Arena(ScmWorldEnv(backend="fake", max_episode_length=6))
+    here = EpisodeRunner(ScmWorldEnv(backend="fake", max_episode_length=6))
     (late,) = chosen("P2@3", protocols_of("pushing"))
     for episode in range(3):
         masses: list[float] = []
@@ -127,7 +127,7 @@ def test_bad_protocols_are_refused_before_any_episode(
     def play(*_: Any, **__: Any) -> None:
         pytest.fail("an episode was played")
 
-    monkeypatch.setattr(Arena, "play", play)
+    monkeypatch.setattr(EpisodeRunner, "play", play)
     with pytest.raises(ScmWorldError, match=said):
         evaluate("still", protocols, n=2, backend="fake", env={"max_episode_length": 40})
 
@@ -201,7 +201,7 @@ def test_functions_in_files_have_to_be_trusted() -> None:
 
 def test_d11_every_step_of_an_episode_can_be_acted_at() -> None:
     """The control step counts, not the episode: a part that acts every second step does."""
-    here = Arena(ScmWorldEnv(backend="fake", max_episode_length=6))
+    here = EpisodeRunner(ScmWorldEnv(backend="fake", max_episode_length=6))
     often = Protocol("often", act=every(2, Resample("floor_friction", space="B"), first=2))
     for episode in range(3):
         here.play(as_player("still"), often, seed=0, episode=episode)

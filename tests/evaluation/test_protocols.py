@@ -16,9 +16,9 @@ import pytest
 
 from scm_world.env import ScmWorldEnv
 from scm_world.evaluation import Protocol, protocols_of
-from scm_world.evaluation.arena import Arena, Row, _drawn
 from scm_world.evaluation.benchmark import REACHING as REACHING_ROW
 from scm_world.evaluation.benchmark import ROLES, ROWS
+from scm_world.evaluation.episodes import EpisodeRunner, Row, _drawn
 from scm_world.evaluation.players import as_player
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.feasibility import overlaps
@@ -33,9 +33,9 @@ STAGE |= {f"{link}.{what}" for link in LINKS for what in ("mass", "color")}
 
 
 @cache
-def arena(task: str, conventions: str) -> Arena:
+def runner(task: str, conventions: str) -> EpisodeRunner:
     """Make where episodes of a task begin."""
-    return Arena(ScmWorldEnv(task, backend="fake", conventions=conventions))
+    return EpisodeRunner(ScmWorldEnv(task, backend="fake", conventions=conventions))
 
 
 def named(task: str, name: str) -> Protocol:
@@ -47,7 +47,7 @@ def begun(
     task: str, protocol: Protocol, conventions: str, episodes: int, seed: int = 0
 ) -> Iterator[tuple[set[str], dict[str, Any], dict[str, Any]]]:
     """Begin episodes; what was set, and all values without and with the protocol."""
-    here = arena(task, conventions)
+    here = runner(task, conventions)
     for episode in range(episodes):
         here.env.reset(seed=seed, options={"episode": episode})
         before = here.env.world.values()
@@ -59,7 +59,7 @@ def begun(
 @cache
 def drawn(task: str, name: str, conventions: str, n: int) -> dict[str, list[list[float]]]:
     """Draw all variables of a protocol again and again; lists of numbers by name."""
-    here, found = arena(task, conventions), defaultdict[str, list[list[float]]](list)
+    here, found = runner(task, conventions), defaultdict[str, list[list[float]]](list)
     for episode in range(n):
         here.begin(named(task, name), seed=0, episode=episode)
         for variable, value in _drawn(here.env, 0).items():
@@ -127,7 +127,7 @@ def test_protocols_move_what_is_published(task: str, name: str, conventions: str
     protocol = named(task, name)
     assert protocol.space == SPACES[name]
     wanted = set(PUBLISHED[task][name].split())
-    model = arena(task, conventions).env.world.model
+    model = runner(task, conventions).env.world.model
     follow = {name for one in wanted for name in model.descendants(model.target(one))}
     moved: set[str] = set()
     for done, before, now in begun(task, protocol, conventions, 6):
@@ -246,7 +246,7 @@ def test_draws_lie_in_their_space(task: str) -> None:
     for protocol in protocols_of(task)[1:]:
         few = 1 if task == "towers" and protocol.name == "P11" else 3  # up to 216 blocks
         for done, _, now in begun(task, protocol, "scm_world", few):
-            model = arena(task, "scm_world").env.world.model
+            model = runner(task, "scm_world").env.world.model
             for name in done - {"wall_pattern"}:
                 variable = model.declared(name)
                 assert variable.in_space(now[name], protocol.space, now), (protocol.name, name)
@@ -314,7 +314,7 @@ def test_d22_protocols_leave_no_trace(task: str) -> None:
 
     def run(order: Any) -> dict[tuple[str, int], Row]:
         env = ScmWorldEnv(task, backend="fake", max_episode_length=2)
-        here, player = Arena(env), as_player("still")
+        here, player = EpisodeRunner(env), as_player("still")
         return {
             (name, episode): here.play(player, named(task, name), seed=1, episode=episode)
             for name in order
@@ -330,7 +330,7 @@ SMALL = {"stacked_blocks": {"num_of_levels": 2}, "creative_stacked_blocks": {"nu
 @pytest.mark.parametrize("task", TASKS)
 def test_d27_no_two_bodies_are_in_one_place(task: str) -> None:
     """In no protocol of any task a body begins inside of another one; goals may be anywhere."""
-    here = Arena(ScmWorldEnv(task, backend="fake", task_options=SMALL.get(task)))
+    here = EpisodeRunner(ScmWorldEnv(task, backend="fake", task_options=SMALL.get(task)))
     for protocol in protocols_of(task):
         if task == "towers" and protocol.name == "P11":
             continue  # hundreds of blocks: the same draws are checked in test_towers

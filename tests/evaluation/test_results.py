@@ -21,7 +21,7 @@ from scm_world.errors import (
     UnwritableFolder,
 )
 from scm_world.evaluation import METRICS, Evaluation
-from scm_world.evaluation.arena import scored
+from scm_world.evaluation.episodes import scored
 from scm_world.output import durable
 
 # --- scores ---------------------------------------------------------------------------------------

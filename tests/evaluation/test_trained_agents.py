@@ -13,7 +13,7 @@ from policy_samples import RELATIVE, policy, trained
 from scm_world.errors import EvaluationError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation, WorldPolicy, check, evaluate, merge, why
 from scm_world.evaluation.forms import shared_options, task_for
-from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.setups import prepare
 from scm_world.policies import PolicyAbout
 
@@ -113,10 +113,10 @@ def test_a_file_that_a_training_replaces_is_told_of(tmp_path: Path) -> None:
         trusted=None,
     )
     trained(path, seed=1)
-    bench = Bench(setup)
+    shard_runner = ShardRunner(setup)
     with pytest.raises(UnreadableFile, match="changed since the evaluation began"):
-        bench(setup.shards()[0])
-    bench.close()
+        shard_runner(setup.shards()[0])
+    shard_runner.close()
 
 
 def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:
@@ -133,10 +133,10 @@ def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:
     )
     rows, crews = [], []
     for threads in (1, 3):
-        bench = Bench(setup, None, threads)
-        rows.append([row for shard in setup.shards() for row in bench(shard)])
-        crews.append([lockstep._crew is not None for lockstep in bench.locksteps.values()])
-        bench.close()
+        shard_runner = ShardRunner(setup, None, threads)
+        rows.append([row for shard in setup.shards() for row in shard_runner(shard)])
+        crews.append([lockstep._crew is not None for lockstep in shard_runner.locksteps.values()])
+        shard_runner.close()
     assert rows[0] == rows[1]
     assert crews == [[False], [True]]
 

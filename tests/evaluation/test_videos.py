@@ -15,7 +15,7 @@ from output_samples import made
 from scm_world.errors import MissingExtra, SnapshotMismatch, UnknownOption, UnwritableFolder
 from scm_world.evaluation.outputs import record_videos
 from scm_world.evaluation.outputs.videos import captioned, choose
-from scm_world.evaluation.pipeline import Bench, played
+from scm_world.evaluation.pipeline import ShardRunner, played
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, prepare
 from scm_world.tasks.trifinger.cameras import OVERVIEW
@@ -41,9 +41,9 @@ def evaluation(setup: Setup) -> Evaluation:
 
 
 @pytest.fixture
-def bench(setup: Setup) -> Iterator[Bench]:
+def shard_runner(setup: Setup) -> Iterator[ShardRunner]:
     """Give where it can be played again."""
-    made = Bench(setup)
+    made = ShardRunner(setup)
     yield made
     made.close()
 
@@ -121,37 +121,42 @@ def test_videos_show_the_episodes(setup: Setup, evaluation: Evaluation, tmp_path
     assert pictures[0][124:, :300].min() < 100 < 250 < pictures[0][124:, :300].max()
 
 
-def test_another_episode_is_no_video(bench: Bench, evaluation: Evaluation, tmp_path: Path) -> None:
+def test_another_episode_is_no_video(
+    shard_runner: ShardRunner, evaluation: Evaluation, tmp_path: Path
+) -> None:
     """If something else happens when it is played again, nothing is written."""
     columns = dict(evaluation.columns)
     columns["hash"] = np.array(["other"] * len(evaluation))
     with pytest.raises(SnapshotMismatch, match="protocol P"):
-        record_videos(bench, Evaluation(evaluation.about, columns), tmp_path, camera=SMALL)
+        record_videos(shard_runner, Evaluation(evaluation.about, columns), tmp_path, camera=SMALL)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_bench_of_others_is_refused(bench: Bench, tmp_path: Path) -> None:
+def test_a_shard_runner_of_others_is_refused(shard_runner: ShardRunner, tmp_path: Path) -> None:
     """The agent of the evaluation does not act there."""
     with pytest.raises(SnapshotMismatch, match="no such agent"):
-        record_videos(bench, made(1, 1, n=1), tmp_path)
+        record_videos(shard_runner, made(1, 1, n=1), tmp_path)
 
 
 def test_a_folder_that_cannot_be_made_is_said(
-    bench: Bench, evaluation: Evaluation, tmp_path: Path
+    shard_runner: ShardRunner, evaluation: Evaluation, tmp_path: Path
 ) -> None:
     """A file is in its place."""
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(UnwritableFolder):
-        record_videos(bench, evaluation, tmp_path / "file", camera=SMALL, which=("best",))
+        record_videos(shard_runner, evaluation, tmp_path / "file", camera=SMALL, which=("best",))
 
 
 def test_moviepy_is_optional(
-    bench: Bench, evaluation: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shard_runner: ShardRunner,
+    evaluation: Evaluation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Without it the message says what to install, before anything is played."""
     monkeypatch.setitem(sys.modules, "moviepy.video.io.ffmpeg_writer", None)
     with pytest.raises(MissingExtra, match=r"scm-world\[video\]"):
-        record_videos(bench, evaluation, tmp_path)
+        record_videos(shard_runner, evaluation, tmp_path)
 
 
 def test_captions_are_cut_where_they_do_not_fit() -> None:

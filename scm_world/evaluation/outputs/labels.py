@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.arena import LAST, METRICS
+from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
 
 WORDS: Mapping[str, str] = {

@@ -19,7 +19,7 @@ from scm_world._arguments import load
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import SnapshotMismatch, UnknownOption, UnwritableFolder
 from scm_world.evaluation.outputs.labels import metric_words, protocol_words
-from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.results import DRAWN, KEYS, Evaluation
 from scm_world.evaluation.setups import Setup
 from scm_world.models.camera import Camera
@@ -35,7 +35,7 @@ MOST = 7  # lines of drawn values
 
 
 def record_videos(
-    given: Setup | Bench,
+    given: Setup | ShardRunner,
     evaluation: Evaluation,
     folder: Location | str,
     *,
@@ -53,7 +53,7 @@ def record_videos(
     real time, with at most 25 frames per second; what was drawn stands below the picture.
 
     Args:
-        given: What was evaluated; ``checking.bench_of`` makes it from an evaluation.
+        given: What was evaluated; ``checking.shard_runner_of`` makes it from an evaluation.
         evaluation: What came out.
         folder: Where the videos are put, under names such as ``worst-P6-episode17.mp4``; run and
             seed stand in them if there are several, agent and engine as well.
@@ -79,7 +79,9 @@ def record_videos(
     steps = {word: int(evaluation.columns["steps"][place]) for word, place in chosen.items()}
     files, done, total = [], 0, sum(steps.values())
     with (
-        nullcontext(given) if isinstance(given, Bench) else closing(Bench(given)) as bench,
+        nullcontext(given)
+        if isinstance(given, ShardRunner)
+        else closing(ShardRunner(given)) as shard_runner,
         TemporaryDirectory(prefix="videos-") as drafts,
     ):
         for word, place in chosen.items():
@@ -90,7 +92,7 @@ def record_videos(
                 if progress is not None and step:
                     progress(before + step, total)
 
-            _film(bench, evaluation, place, partial(writer, str(draft)), camera, texts, tell)
+            _film(shard_runner, evaluation, place, partial(writer, str(draft)), camera, texts, tell)
             path = located(folder) / draft.name
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -137,7 +139,7 @@ def choose(
 
 
 def _film(
-    bench: Bench,
+    shard_runner: ShardRunner,
     evaluation: Evaluation,
     place: int,
     opened: Callable[..., Any],
@@ -148,12 +150,12 @@ def _film(
     """Play an episode again and write its frames.
 
     Raises:
-        SnapshotMismatch: Something else happened, or it is none of the bench.
+        SnapshotMismatch: Something else happened, or it is none of the shard_runner.
     """
     from scm_world.backends.renderer import render, scene_camera
 
     row = {name: evaluation.columns[name][place].item() for name in (*KEYS, "hash")}
-    shard = bench.setup.shard_of(row)
+    shard = shard_runner.setup.shard_of(row)
     video: Any = None
 
     def watch(env: ScmWorldEnv) -> None:
@@ -170,7 +172,7 @@ def _film(
         tell(step)
 
     try:
-        again = bench.play(shard, shard.first, watch=watch)
+        again = shard_runner.play(shard, shard.first, watch=watch)
     finally:
         if video is not None:
             video.close()

@@ -1,4 +1,4 @@
-"""Finished shards of an evaluation: small files that are whole or absent."""
+"""Files of finished shards of an evaluation: whole or absent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hashlib import blake2b
 from typing import Any
 
 from scm_world.errors import DAMAGED, UnreadableFile
-from scm_world.evaluation.arena import Row
+from scm_world.evaluation.episodes import Row
 from scm_world.output.durable import made, write_whole
 from scm_world.output.locations import Location
 from scm_world.output.reading import read_text

@@ -1,4 +1,4 @@
-"""Who acts in an evaluation: policies, what they are called, and how they are told apart."""
+"""The agents of an evaluation: policies, their names and their identities."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PLACE = ("path",)  # where a policy lies does not say which one it is
 
 @final
 @dataclass(frozen=True)
-class Seat:
+class AgentRun:
     """A policy and what it is called.
 
     Attributes:
@@ -42,26 +42,26 @@ class Seat:
     form: Mapping[str, Any] | None = None
 
     def identity(self) -> list[Any]:
-        """Say who it is, as plain data: the same wherever its file lies."""
+        """Return its identity as plain data: the same wherever its file lies."""
         own = [] if self.form is None else [dict(self.form)]
         return [self.agent, self.run, what_it_is(self.about), *own]
 
     def as_dict(self) -> dict[str, Any]:
-        """Say who it is and in which form of the environment it acts, as plain data."""
+        """Return it, with the options of its environment, as plain data."""
         own = {} if self.form is None else {"env": dict(self.form)}
         return {"agent": self.agent, "run": self.run, "policy": dict(self.about), **own}
 
 
 @final
 @dataclass(frozen=True)
-class Entry:
+class LoadedAgent:
     """A policy that was read, and not yet tried out.
 
     Attributes:
         agent: Name of the agent.
         run: Number of its training run.
         policy: What a user gave.
-        player: Who acts.
+        player: The policy that is called.
     """
 
     agent: str
@@ -74,11 +74,11 @@ class Entry:
         """What it was trained for, if it says so."""
         return getattr(self.player, "made_for", None)
 
-    def seated(self, env: ScmWorldEnv) -> Seat:
-        """Try it out.
+    def tried_out(self, env: ScmWorldEnv) -> AgentRun:
+        """Call it a few times, and return the agent.
 
         Args:
-            env: Where.
+            env: The environment.
 
         Raises:
             EvaluationError: It does not fit the environment; with its name.
@@ -91,7 +91,7 @@ class Entry:
             error.add_note(f"agent {self.agent}, run {self.run}, before the first episode")
             raise
         about = {**self.player.about, **traits}
-        return Seat(self.agent, self.run, self.policy, about, form_of(self.made_for))
+        return AgentRun(self.agent, self.run, self.policy, about, form_of(self.made_for))
 
 
 def what_it_is(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,8 +104,8 @@ def what_it_is(about: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in about.items() if name not in _PLACE}
 
 
-def entries_of(policy: Any, trusted: Sequence[str] | None) -> tuple[Entry, ...]:
-    """Read who acts.
+def load_agents(policy: Any, trusted: Sequence[str] | None) -> tuple[LoadedAgent, ...]:
+    """Load the agents.
 
     Args:
         policy: A policy; a list of them, one for each training run; or either by the name of the
@@ -115,15 +115,15 @@ def entries_of(policy: Any, trusted: Sequence[str] | None) -> tuple[Entry, ...]:
     Raises:
         UnknownOption: There is none, or two have one name.
     """
-    entries: list[Entry] = []
+    loaded: list[LoadedAgent] = []
     for agent, run, one in listed(policy):
         player = as_player(one, trusted=trusted)
         name = _short(str(player.about["name"])) if agent is None else agent
-        name = entries[0].agent if agent is None and entries else name  # a list is one agent
-        entries.append(Entry(named("name of an agent", name), run, one, player))
-    if not entries:
+        name = loaded[0].agent if agent is None and loaded else name  # a list is one agent
+        loaded.append(LoadedAgent(named("name of an agent", name), run, one, player))
+    if not loaded:
         raise UnknownOption("policy", policy, ("one or several",))
-    return tuple(entries)
+    return tuple(loaded)
 
 
 def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
@@ -164,7 +164,7 @@ def _short(name: str) -> str:
 
 
 def _traits(policy: Any, player: Player, env: ScmWorldEnv) -> dict[str, str]:
-    """Tell policies of one name apart by what they do, where no file says what they are.
+    """Return what identifies a policy that has no file: its actions and its source.
 
     It also shows at once that a policy does not fit the environment. One that gives two actions
     for one observation draws from a noise of its own: what it does then says nothing.
@@ -181,7 +181,7 @@ def _traits(policy: Any, player: Player, env: ScmWorldEnv) -> dict[str, str]:
 
 
 def _walked(player: Player, env: Any, steps: int) -> list[bytes]:
-    """Ask a player on a walk that is always the same one."""
+    """Return its actions along a random walk that is always the same one."""
     observation, _ = env.reset(seed=0)
     player.begin(env)
     walk = np.random.default_rng(0)
@@ -198,7 +198,7 @@ def _walked(player: Player, env: Any, steps: int) -> list[bytes]:
 
 
 def source_of(policy: Any) -> bytes:
-    """Give the text of a function or class, where there is one."""
+    """Return the source of a function or class, if there is one."""
     inside = policy.policy if isinstance(policy, WorldPolicy) else policy
     inside = inside if inspect.isroutine(inside) or isinstance(inside, type) else type(inside)
     try:

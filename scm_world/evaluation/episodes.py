@@ -1,4 +1,4 @@
-"""One episode of an evaluation: an environment, a player, a protocol."""
+"""Run an episode of an evaluation: an environment, a policy, a protocol."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Row:
     """What is kept of an episode.
 
     Attributes:
-        agent: Who acted.
+        agent: Name of the agent.
         run: Number of the training run of this agent.
         engine: Name of the physics engine.
         protocol: Name of the protocol.
@@ -105,12 +105,12 @@ class Fingerprint:
 
 
 @final
-class Game:
+class RunningEpisode:
     """An episode under way, and what is kept of it.
 
     Args:
         env: At the beginning of the episode, with what the protocol does at its reset.
-        player: Who acts.
+        player: The policy.
         turn: What acts within the episode.
 
     Attributes:
@@ -187,8 +187,8 @@ def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
 
 
 @final
-class Arena:
-    """Where episodes of one engine are played.
+class EpisodeRunner:
+    """Runs episodes in one environment.
 
     Args:
         env: It is reset again and again.
@@ -208,15 +208,15 @@ class Arena:
         who: tuple[str, int] = ("", 0),
         watch: Watch | None = None,
     ) -> Row:
-        """Play an episode.
+        """Run an episode.
 
         Args:
-            player: Who acts.
+            player: The policy.
             protocol: What is done.
             seed: Of the noise.
             episode: Its number within the noise.
             who: Name and number of the run, for the row.
-            watch: Called at every instant.
+            watch: Called before every control step and at the end.
 
         Raises:
             EvaluationError: The policy gave no action, or an intervention was refused; with the
@@ -227,28 +227,32 @@ class Arena:
         place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
         with _placed(place, self.env):
             turn, observation = self.begin(protocol, seed=seed, episode=episode)
-            game = Game(self.env, player, turn)
-            success = self._finish(game, observation, watch)
-        return game.row((*who, engine, protocol.name, seed, episode), success=success)
+            episode_run = RunningEpisode(self.env, player, turn)
+            success = self._finish(episode_run, observation, watch)
+        return episode_run.row((*who, engine, protocol.name, seed, episode), success=success)
 
-    def _finish(self, game: Game, observation: Any, watch: Watch | None) -> bool | None:
-        """Play an episode that has begun; tell whether it succeeded, if the task has that."""
+    def _finish(
+        self, episode_run: RunningEpisode, observation: Any, watch: Watch | None
+    ) -> bool | None:
+        """Run an episode that has begun; return whether it succeeded, if the task has that."""
         env, over = self.env, False
         while not over:
             if watch is not None:
                 watch(env)
-            observation, reward, terminated, truncated, info = env.step(game.act(observation))
-            game.stepped(reward, info.get(FRACTION))
+            observation, reward, terminated, truncated, info = env.step(
+                episode_run.act(observation)
+            )
+            episode_run.stepped(reward, info.get(FRACTION))
             over = terminated or truncated
-            if not over and game.intervene(env):
+            if not over and episode_run.intervene(env):
                 observation = env.observe()
-            game.mark.look()
+            episode_run.mark.look()
         if watch is not None:
             watch(env)
         return info.get(SUCCESS)
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
-        """See whether a protocol fits: begin the first episode with it.
+        """Check that a protocol fits: begin the first episode with it.
 
         Raises:
             UnknownOption: It depends on what happened in other episodes, or acts after their end.
@@ -341,7 +345,7 @@ def _drawn(env: ScmWorldEnv, step: int) -> dict[str, list[float]]:
 
 @contextmanager
 def _placed(place: dict[str, Any], env: ScmWorldEnv) -> Iterator[None]:
-    """Say of an error in which episode it happened."""
+    """Add the episode to an error."""
     try:
         yield
     except EvaluationError as error:
