@@ -755,7 +755,8 @@ class World(WorldAttributes):
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> bool:
     """Tell whether something is an array of finite numbers of a shape."""
-    right = isinstance(value, np.ndarray) and value.shape == shape and value.dtype.kind in "biuf"
+    is_array = isinstance(value, np.ndarray | np.generic)
+    right = is_array and value.shape == shape and value.dtype.kind in "biuf"
     return right and bool(np.isfinite(value).all())
 
 
