@@ -69,6 +69,7 @@ def test_a_report_prints_its_numbers(pushing: Verification) -> None:
         assert words in text
 
 
+@pytest.mark.slow
 def test_pushing_on_one_engine_is_verified() -> None:
     """Every declared edge is seen before the probe states run out, and then it ends."""
     found = verify("pushing")
@@ -171,7 +172,7 @@ def agreement() -> Agreement:
     """Verify pushing on both engines with few probe states."""
     if not HAS_BULLET:
         pytest.skip("Bullet is not installed")
-    return verify_engines("pushing", probes=4)
+    return verify_engines("pushing", probes=2)
 
 
 def test_engines_agree_on_the_sign_of_clear_effects(agreement: Agreement) -> None:
