@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import sys
 
-from scm_world.discovery import Design, Found, TaskView, collect, evaluate, learn, problem
+from scm_world.discovery import Design, EstimatedGraph, TaskView, collect, evaluate, learn, problem
 from scm_world.discovery.problems import Problem, random_model
 from scm_world.variables import Normal
 
 CAUSES = ("block.size", "gravity", "*friction", "tool_block.mass", "tool_block.color")
 
 
-def shown(title: str, found: Found, given: Problem) -> None:
+def shown(title: str, found: EstimatedGraph, given: Problem) -> None:
     """Print how near a graph comes to the true one."""
     truth = given.truth
     scores = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)

@@ -14,7 +14,7 @@ from scm_world.cli.console import RESULTS, check_writable, console, table, writt
 from scm_world.cli.questions import POLICIES
 from scm_world.cli.tasks import build, suffix
 from scm_world.cli.working import Work
-from scm_world.discovery.benchmark_report import COLUMNS, HEADS, STANDARDISED, Row, summary
+from scm_world.discovery.benchmark_report import COLUMNS, HEADS, STANDARDISED, SummaryRow, summary
 from scm_world.discovery.benchmarks import BenchmarkResult, benchmark, slug
 from scm_world.discovery.problems import FAMILIES, GroundTruth, TaskView
 from scm_world.errors import UnknownOption
@@ -135,7 +135,7 @@ def shown_runs() -> Iterator[Progress]:
         yield lambda done, planned: bar.update(task, completed=done, total=planned)
 
 
-def _table(truth: GroundTruth, rows: list[Row]) -> Any:
+def _table(truth: GroundTruth, rows: list[SummaryRow]) -> Any:
     """Write the means over seeds of one problem; the ranges are in ``results.md``."""
     from rich.text import Text
 

@@ -12,7 +12,7 @@ from rich.text import Text
 from scm_world.cli.console import RESULTS, check_writable, console, staged, table, written
 from scm_world.cli.discovery import INTERRUPTED, shown_progress
 from scm_world.cli.tasks import suffix, system, tag
-from scm_world.discovery.coverage import draw_verification
+from scm_world.discovery.plots import draw_verification
 from scm_world.output.locations import Location
 from scm_world.queries import SCM
 from scm_world.queries.agreement import Agreement

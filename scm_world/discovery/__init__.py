@@ -13,22 +13,18 @@ if TYPE_CHECKING:
     from scm_world.discovery import learners
     from scm_world.discovery.benchmarks import BenchmarkResult, benchmark
     from scm_world.discovery.data import Dataset, Design, Levels, collect, sweep
-    from scm_world.discovery.learners import Found, Learner, learn, register
-    from scm_world.discovery.metrics import evaluate
+    from scm_world.discovery.learners import EstimatedGraph, Learner, learn, register
+    from scm_world.discovery.metrics import GraphScore, evaluate, score
     from scm_world.discovery.problems import TaskView, problem
-    from scm_world.discovery.report import DiscoveryReport
-    from scm_world.discovery.run import discover
-    from scm_world.discovery.scores import Score, score
+    from scm_world.discovery.run import DiscoveryReport, discover
 
 _HOMES = {
     **dict.fromkeys(("Dataset", "Design", "Levels", "collect", "sweep"), "data"),
-    "DiscoveryReport": "report",
-    **dict.fromkeys(("Found", "Learner", "learn", "register"), "learners"),
-    **dict.fromkeys(("Score", "score"), "scores"),
+    **dict.fromkeys(("EstimatedGraph", "Learner", "learn", "register"), "learners"),
+    **dict.fromkeys(("GraphScore", "evaluate", "score"), "metrics"),
     **dict.fromkeys(("BenchmarkResult", "benchmark"), "benchmarks"),
     **dict.fromkeys(("TaskView", "problem"), "problems"),
-    "discover": "run",
-    "evaluate": "metrics",
+    **dict.fromkeys(("DiscoveryReport", "discover"), "run"),
 }
 
 __all__ = [
@@ -36,10 +32,10 @@ __all__ = [
     "Dataset",
     "Design",
     "DiscoveryReport",
-    "Found",
+    "EstimatedGraph",
+    "GraphScore",
     "Learner",
     "Levels",
-    "Score",
     "TaskView",
     "benchmark",
     "collect",

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
 import numpy as np
 
-from scm_world.discovery.benchmarks import BenchmarkResult, Run
-from scm_world.discovery.learners.found import Found
+from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
+from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.problems import GroundTruth
 from scm_world.output.canvas import PALETTE, blank, save, small_png, styled
 from scm_world.output.durable import write_whole
@@ -37,8 +37,8 @@ NOTE = (
 )
 
 
-class Column(NamedTuple):
-    """A number that is shown of every group of runs: its key, its title, which way is better."""
+class ScoreColumn(NamedTuple):
+    """A number of every group of runs: its key, its title, which way is better."""
 
     key: str
     title: str
@@ -48,18 +48,18 @@ class Column(NamedTuple):
 
 STANDARDISED = "shd_standardised"
 COLUMNS = (
-    Column("shd", "SHD", "less"),
-    Column(STANDARDISED, "SHD standardised", "less"),
-    Column("f1", "F1", "more", 2),
-    Column("precision", "precision", "more", 2),
-    Column("recall", "recall", "more", 2),
-    Column("auprc", "AUPRC", "more", 2),
-    Column("auroc", "AUROC", "more", 2),
-    Column("sid", "SID", "less"),
-    Column("effect_rmse", "effect RMSE", "less"),
-    Column("seconds", "seconds"),
-    Column("experiments", "experiments"),
-    Column("bound", "bound"),
+    ScoreColumn("shd", "SHD", "less"),
+    ScoreColumn(STANDARDISED, "SHD standardised", "less"),
+    ScoreColumn("f1", "F1", "more", 2),
+    ScoreColumn("precision", "precision", "more", 2),
+    ScoreColumn("recall", "recall", "more", 2),
+    ScoreColumn("auprc", "AUPRC", "more", 2),
+    ScoreColumn("auroc", "AUROC", "more", 2),
+    ScoreColumn("sid", "SID", "less"),
+    ScoreColumn("effect_rmse", "effect RMSE", "less"),
+    ScoreColumn("seconds", "seconds"),
+    ScoreColumn("experiments", "experiments"),
+    ScoreColumn("bound", "bound"),
 )
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -76,7 +76,7 @@ class Spread(NamedTuple):
 
 @final
 @dataclass(frozen=True)
-class Row:
+class SummaryRow:
     """The runs of a learner on a problem with one kind of data and one budget.
 
     Attributes:
@@ -86,7 +86,7 @@ class Row:
         best: Keys of the columns in which no row of the problem is better.
     """
 
-    run: Run
+    run: BenchmarkRun
     statuses: tuple[str, ...]
     spreads: dict[str, Spread]
     best: set[str] = field(default_factory=set)
@@ -98,7 +98,7 @@ class Row:
 
     @property
     def heads(self) -> tuple[str, str, str, str, str]:
-        """What stands before the numbers."""
+        """The cells before the numbers."""
         ended = [f"{self.statuses.count('done')} of {len(self.statuses)}"]
         for status, words in (("timeout", "timed out"), ("failed", "failed")):
             if status in self.statuses:
@@ -106,7 +106,7 @@ class Row:
         run = self.run
         return (run.problem, self.data, run.learner, str(run.budget), ", ".join(ended))
 
-    def text(self, column: Column) -> str:
+    def text(self, column: ScoreColumn) -> str:
         """Write one number."""
         spread = self.spreads.get(column.key)
         if spread is None:
@@ -116,7 +116,7 @@ class Row:
         return text + (f" (n = {spread.n})" if spread.n < len(self.statuses) else "")
 
 
-def number(value: float | None, column: Column) -> str:
+def number(value: float | None, column: ScoreColumn) -> str:
     """Write a number with the digits of its column."""
     if value is None:
         return NONE
@@ -125,18 +125,15 @@ def number(value: float | None, column: Column) -> str:
     return f"{value:.0f}" if abs(value) >= 1000 or float(value).is_integer() else f"{value:.3g}"
 
 
-def summary(result: BenchmarkResult) -> dict[str, list[Row]]:
-    """Take the seeds together.
+def summary(result: BenchmarkResult) -> dict[str, list[SummaryRow]]:
+    """Take the seeds together: by problem a row per kind of data, learner and budget.
 
     The best of a column is the best mean over all seeds that were started: without one of them,
     the hard one may be missing. There are several if they are equally good, none if all are.
-
-    Returns:
-        By problem a row per kind of data, learner and budget, in this order.
     """
-    rows: dict[str, list[Row]] = {name: [] for name in result.problems}
+    rows: dict[str, list[SummaryRow]] = {name: [] for name in result.problems}
 
-    def key(run: Run) -> tuple[str, str, str, int]:
+    def key(run: BenchmarkRun) -> tuple[str, str, str, int]:
         return (run.problem, run.data, run.learner, run.budget)
 
     for _, group in groupby(sorted(result.runs, key=key), key):
@@ -152,7 +149,7 @@ def summary(result: BenchmarkResult) -> dict[str, list[Row]]:
                 mean = sum(known) / len(known)
                 spreads[column.key] = Spread(mean, min(known), max(known), len(known))
         statuses = tuple(run.status for run in shown)
-        rows[shown[0].problem].append(Row(shown[0], statuses, spreads))
+        rows[shown[0].problem].append(SummaryRow(shown[0], statuses, spreads))
     for column in (column for column in COLUMNS if column.better):
         for found in rows.values():
             whole = [
@@ -218,7 +215,7 @@ def _markdown(result: BenchmarkResult) -> str:
 
 
 def _safe(text: str) -> str:
-    """Escape what means something in Markdown."""
+    """Escape Markdown."""
     escaped = re.sub(r"([\\|*`\[\]])", r"\\\1", " ".join(text.split()))
     return escaped.replace("&", "&amp;").replace("<", "&lt;")
 
@@ -280,7 +277,7 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
     return figure
 
 
-def _line(ax: Axes, rows: Sequence[Row], key: str, aside: float, style: int) -> Any:
+def _line(ax: Axes, rows: Sequence[SummaryRow], key: str, aside: float, style: int) -> Any:
     """Draw the means of one learner, a little aside so that lines do not hide one another."""
     mean, low, high, _ = zip(*(row.spreads[key] for row in rows), strict=True)
     return ax.errorbar(
@@ -310,7 +307,7 @@ NAMED = 25  # wrong edges of a kind that are named in words
 
 
 class Link(NamedTuple):
-    """An edge and its verdict; one without direction has its true direction, if it has one."""
+    """An edge and its verdict; an undirected one has its true direction, if it has one."""
 
     cause: str
     effect: str
@@ -320,30 +317,21 @@ class Link(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Cause, effect and lag in words.
-
-        Example:
-            >>> Link("x", "y", 1, "extra").words
-            'x → y, t−1'
-        """
+        """Cause, effect and lag, such as ``"x → y, t−1"``."""
         between = "→" if self.directed else "—"
         return f"{self.cause} {between} {self.effect}" + f", t−{self.lag}" * (self.lag > 0)
 
 
-def compare(truth: GroundTruth, found: Found) -> list[Link]:
-    """Compare an estimated graph with the true one, edge by edge.
+def compare(truth: GroundTruth, found: EstimatedGraph) -> list[Link]:
+    """Compare an estimated graph with the true one: one link per edge, sorted.
 
-    Args:
-        truth: The true graph.
-        found: Over the same variables; others of it are left out.
-
-    Returns:
-        One link per edge, sorted. A reversed edge is one link, in the direction that was found.
+    A reversed edge is one link, in the direction that was found.
 
     Example:
         >>> edges = (("x", "y", 0), ("y", "z", 0))
         >>> truth = GroundTruth(name="chain", names=("x", "y", "z"), edges=edges)
-        >>> links = compare(truth, Found.of_edges(["x", "y", "z"], [("y", "x", 0), ("x", "z", 1)]))
+        >>> found = EstimatedGraph.of_edges(truth.names, [("y", "x", 0), ("x", "z", 1)])
+        >>> links = compare(truth, found)
         >>> [(link.words, link.verdict) for link in links]
         [('x → z, t−1', 'extra'), ('y → x', 'reversed'), ('y → z', 'missing')]
     """
@@ -381,7 +369,7 @@ def report(result: BenchmarkResult) -> str:
     """
     problems = []
     for name, truth in result.problems.items():
-        groups: dict[tuple[str, str, bool], Run] = {}
+        groups: dict[tuple[str, str, bool], BenchmarkRun] = {}
         for run in (run for run in result.runs if run.problem == name):
             key = (run.learner, run.data, run.standardised)
             groups[key] = max(groups.get(key, run), run, key=lambda r: (r.budget, -r.seed))
@@ -406,13 +394,12 @@ def report(result: BenchmarkResult) -> str:
     )
 
 
-def _entry(row: Row, column: Column) -> Entry:
+def _entry(row: SummaryRow, column: ScoreColumn) -> Entry:
     by = f"{row.spreads[column.key].mean:.6g}" if column.key in row.spreads else ""
     return Entry(row.text(column), by=by, looks="best" if column.key in row.best else "")
 
 
-def _compared(truth: GroundTruth, run: Run) -> dict[str, Any]:
-    """Compare the graph of a run with the true one, for the report."""
+def _compared(truth: GroundTruth, run: BenchmarkRun) -> dict[str, Any]:
     links = [] if run.found is None else compare(truth, run.found)
     cells: dict[tuple[str, str], list[Link]] = {}
     named: dict[str, str] = {}

@@ -24,7 +24,7 @@ from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
 from scm_world._arguments import whole_number
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.learners.found import Found
+from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
 from scm_world.discovery.metrics import effect_rmse, evaluate
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
@@ -58,7 +58,7 @@ LONGEST = 1e6  # [s] that can be waited for at once
 
 @final
 @dataclass(frozen=True, kw_only=True)
-class Run:
+class BenchmarkRun:
     """One learner on one problem with one budget and one seed.
 
     Attributes:
@@ -87,7 +87,9 @@ class Run:
     standardised: bool = False
     status: Literal["done", "timeout", "failed"] = "done"
     message: str = ""
-    found: Annotated[Found | None, PlainValidator(lambda v: v and Found.from_dict(v))] = None
+    found: Annotated[
+        EstimatedGraph | None, PlainValidator(lambda v: v and EstimatedGraph.from_dict(v))
+    ] = None
     scores: dict[str, int | FiniteFloat | None] = field(default_factory=dict)
     seconds: float = 0.0
     experiments: int = 0
@@ -96,7 +98,7 @@ class Run:
 
     @property
     def key(self) -> tuple[str, str, str, bool, int, int]:
-        """What it is a run of."""
+        """The problem, learner, data, standardisation, budget and seed."""
         return (
             self.problem, self.learner, self.data, self.standardised, self.budget, self.seed
         )  # fmt: skip
@@ -114,25 +116,25 @@ class Run:
         return {**plain, "found": None if self.found is None else self.found.as_dict()}
 
 
-_RUN, _TRUTHS = TypeAdapter(Run), TypeAdapter(list[GroundTruth])
+_RUN, _TRUTHS = TypeAdapter(BenchmarkRun), TypeAdapter(list[GroundTruth])
 
 
 @final
 @dataclass(frozen=True)
 class BenchmarkResult:
-    """Everything that a benchmark found.
+    """All runs of a benchmark.
 
     Attributes:
         problems: The true graphs by name; of a family, that of seed 0.
         runs: By problem, learner, data, budget and seed.
-        settings: What was asked for, and the versions of all libraries.
+        settings: The arguments, and the versions of all libraries.
 
     Raises:
         ModelError: A run has no problem, or there are two of one kind.
     """
 
     problems: dict[str, GroundTruth]
-    runs: tuple[Run, ...]
+    runs: tuple[BenchmarkRun, ...]
     settings: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -147,7 +149,7 @@ class BenchmarkResult:
         ordered = sorted(self.runs, key=lambda run: (place[run.problem], run.key))
         object.__setattr__(self, "runs", tuple(ordered))
 
-    def truth_of(self, run: Run) -> GroundTruth:
+    def truth_of(self, run: BenchmarkRun) -> GroundTruth:
         """Return the graph that a run is compared with."""
         truth = self.problems[run.problem]
         return truth if run.edges is None else replace(truth, edges=run.edges)
@@ -228,10 +230,10 @@ def benchmark(
     address: str | None = None,
     progress: Progress | None = None,
 ) -> BenchmarkResult:
-    """Run learners on problems and score the graphs that they find.
+    """Run learners on problems and score the estimated graphs.
 
     With ``out`` every run is a file of its own, written whole or not at all. A benchmark that was
-    interrupted or killed resumes with the same call: at most the runs in work are lost.
+    interrupted or killed resumes with the same call: at most the unfinished runs are lost.
 
     Args:
         learners: Names, or ``"module:attribute"`` of custom ones.
@@ -300,7 +302,9 @@ def benchmark(
     groups = []
     for (name, label), seed in product(zip(problems, shown, strict=True), range(seeds)):
         runs = [
-            Run(problem=label, learner=who, data=kind, budget=n, seed=seed, standardised=even)
+            BenchmarkRun(
+                problem=label, learner=who, data=kind, budget=n, seed=seed, standardised=even
+            )
             for who in learners
             for kind, n, even in product(kinds[who], spent, (False, True))
             if not even or (standardised and n == spent[-1] and kind != "paired")
@@ -330,12 +334,7 @@ def _check_names(**given: Sequence[str]) -> None:
 
 
 def _kinds(chosen: Learner, problems: Sequence[str], wanted: Sequence[str]) -> list[Source]:
-    """Return the kinds of data that a learner is given: the richest that it takes by default.
-
-    Raises:
-        UnknownOption: It cannot use one, or cannot be benchmarked on these problems.
-        MissingExtra: It is not installed.
-    """
+    """Return the kinds of data for a learner, by default the richest that it takes."""
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
     refused = ""
@@ -399,18 +398,18 @@ def _claim(folder: Location, settings: dict[str, Any]) -> None:
 @final
 @dataclass(frozen=True)
 class _Job:
-    """What to run: a learner on a problem.
+    """A learner on a problem.
 
     Attributes:
         name: Of the problem, as ``problem`` takes it.
         run: The run without its results.
-        collected: Largest budget of the benchmark: so much is collected.
+        collected: Rows, episodes or steps to collect: the largest budget of the benchmark.
         view: Of a task or a world.
         folder: Where collected data are kept; nowhere if None.
     """
 
     name: str
-    run: Run
+    run: BenchmarkRun
     collected: int
     view: TaskView
     folder: Location | None
@@ -428,14 +427,14 @@ def slug(name: str) -> str:
     return plain if plain == name else f"{plain}-{mark}"
 
 
-def run_path(folder: Location, run: Run) -> Location:
+def run_path(folder: Location, run: BenchmarkRun) -> Location:
     """Return where a run is kept."""
     even = "-standardised" if run.standardised else ""
     name = f"{slug(run.learner)}-{run.data}-{run.budget}-seed{run.seed}{even}.json"
     return folder / "runs" / slug(run.problem) / name
 
 
-def _kept(folder: Location | None, run: Run) -> Run | None:
+def _kept(folder: Location | None, run: BenchmarkRun) -> BenchmarkRun | None:
     """Read a run; None if it was not done."""
     path = None if folder is None else run_path(folder, run)
     if path is None or not path.exists():
@@ -457,7 +456,7 @@ def _all_runs(
     executor: Executor,
     timeout: float | None,
     progress: Progress | None,
-) -> list[Run]:
+) -> list[BenchmarkRun]:
     """Read the runs that are done and do the others."""
     runs, missing, lock = [], [], Lock()
     for group in groups:
@@ -469,7 +468,7 @@ def _all_runs(
         for number in range(len(runs)):
             progress(number + 1, planned)
 
-    def keep(run: Run) -> None:
+    def keep(run: BenchmarkRun) -> None:
         if run.edges == truths[run.problem].edges:
             run = replace(run, edges=None)
         with lock:
@@ -494,7 +493,7 @@ def _run_here(
     groups: Sequence[Sequence[_Job]],
     workers: int,
     timeout: float | None,
-    keep: Callable[[Run], None],
+    keep: Callable[[BenchmarkRun], None],
 ) -> None:
     """Do the runs of each group in one process of this machine, which collects their data once.
 
@@ -525,30 +524,21 @@ def _run_here(
 
 @final
 class _Isolated:
-    """Does jobs in a process of its own, which is replaced if one takes too long.
-
-    Args:
-        timeout: Of a job [s]; None for no limit.
-    """
+    """Does jobs in a process of its own, which is replaced if one takes longer than the timeout."""
 
     def __init__(self, timeout: float | None) -> None:
         self._timeout = None if timeout is None else min(timeout, LONGEST)
         self._worker = Worker(_Runner)
         self.interrupt, self.close = self._worker.interrupt, self._worker.stop
 
-    def __call__(self, job: _Job) -> Run:
-        """Do a job; a learner that ends its process has failed.
-
-        Raises:
-            ScmWorldError: The problem cannot be made, its data cannot be collected, or the learner
-                is not installed.
-        """
+    def __call__(self, job: _Job) -> BenchmarkRun:
+        """Do a job; a learner that ends its process has failed."""
         try:
             self._worker.ask("prepare", job)  # the time of a learner is that of learning
         except Ended as ended:
             raise EngineFailure(f"{job.name}: {ended}", PROCESS) from None
         try:
-            run: Run = self._worker.ask("run", job, timeout=self._timeout)
+            run: BenchmarkRun = self._worker.ask("run", job, timeout=self._timeout)
         except TookTooLong:
             said = f"stopped after {self._timeout:g} s"
             return replace(
@@ -586,8 +576,8 @@ class _Runner:
                 options = {"out": job.folder / f"{run.data}-seed{run.seed}", "format": written}
             self._data[run.data] = self._problem.data(run.data, job.collected, run.seed, **options)
 
-    def run(self, job: _Job) -> Run:
-        """Do a job that is prepared; what goes wrong in a learner is written down in the run."""
+    def run(self, job: _Job) -> BenchmarkRun:
+        """Do a prepared job; a failure of the learner is recorded in the run."""
         table = None if job.run.data == "paired" else self._rows(job.run)
         started = time.perf_counter()
         try:
@@ -600,13 +590,13 @@ class _Runner:
             return replace(job.run, status="failed", message=said, seconds=seconds)
         return run
 
-    def _rows(self, run: Run) -> Dataset:
+    def _rows(self, run: BenchmarkRun) -> Dataset:
         whole = self._data[run.data]
         each = len(whole) / len(np.unique(whole.episode))
         part = whole.first(math.ceil(run.budget / each))
         return part.standardised() if run.standardised else part
 
-    def _learned(self, run: Run, table: Dataset | None) -> Run:
+    def _learned(self, run: BenchmarkRun, table: Dataset | None) -> BenchmarkRun:
         made: Any = self._problem
         truth, chosen = made.truth, learner(run.learner)
         if table is None:

@@ -1,4 +1,4 @@
-"""Many names in few words, for tables and pictures."""
+"""Short names for many variables, for tables and figures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import final
 from scm_world.queries.experiments.effects import EdgeKey
 
 _NUMBER = re.compile(r"\d+")
-_LINK = "robot_finger_{}_link_{}."
 
 
 def _template(name: str) -> str:
@@ -62,9 +61,9 @@ def by_entity(names: Iterable[str]) -> list[str]:
 
 @final
 class Families:
-    """Variables that differ in numbers only and play the same part in a graph, taken as one.
+    """Variables that differ in numbers only and have the same edges, taken as one.
 
-    Two of them play the same part if their edges lead to as many variables of each family, with
+    Two of them have the same edges if these lead to as many variables of each family, with
     the same lags, and to those of the same number (the same block, say) alike.
 
     Args:
@@ -83,16 +82,12 @@ class Families:
     def __init__(self, names: Iterable[str], edges: Iterable[EdgeKey]) -> None:
         around: dict[str, list[tuple[str, int, bool, str]]] = {name: [] for name in names}
         for cause, effect, lag in edges:
-            own = _numbers(cause) == _numbers(effect)
+            own = _NUMBER.findall(cause) == _NUMBER.findall(effect)
             around.setdefault(cause, []).append(("out", lag, own, effect))
             around.setdefault(effect, []).append(("in", lag, own, cause))
         alike = _refined(around)
         self.members = dict(zip(_labels(alike), map(tuple, alike), strict=True))
         self.of = {name: label for label, found in self.members.items() for name in found}
-
-
-def _numbers(name: str) -> list[str]:
-    return _NUMBER.findall(name)
 
 
 def _refined(around: Mapping[str, Sequence[tuple[str, int, bool, str]]]) -> list[list[str]]:
@@ -117,8 +112,8 @@ def _refined(around: Mapping[str, Sequence[tuple[str, int, bool, str]]]) -> list
 
 
 def _labels(families: Sequence[Sequence[str]]) -> list[str]:
-    """Name every family: in few words where they are not those of another one."""
-    whole, short = [_label(found) for found in families], [_short(found) for found in families]
+    """Name every family, by its short name if no other one has it."""
+    whole, short = [", ".join(braces(m)) for m in families], [_short(m) for m in families]
     return [
         few if len(few) < len(all_) and short.count(few) == 1 and few not in whole else all_
         for all_, few in zip(whole, short, strict=True)
@@ -130,19 +125,6 @@ def _short(members: Sequence[str]) -> str:
     entity, dot, quantity = _template(members[0]).partition(".")
     first = entity.partition("{}")[0]
     kind = first.rstrip("_").rpartition("_")[0]
-    if len(members) == 1 or entity.count("{}") < 2 or entity.startswith(_LINK.rstrip(".")):
-        return _label(members)
+    if len(members) == 1 or entity.count("{}") < 2:
+        return ", ".join(braces(members))
     return f"{kind}_{{…}}{dot}{quantity} ({len(members)})"
-
-
-def _label(members: Sequence[str]) -> str:
-    if len(members) == 1:
-        return members[0]
-    template = _template(members[0])
-    if template.startswith(_LINK):
-        links = sorted({_NUMBER.findall(name)[1] for name in members})
-        which = links[0] if len(links) == 1 else f"{links[0]}-{links[-1]}"
-        fingers = {_NUMBER.findall(name)[0] for name in members}
-        if len(fingers) * len(links) == len(members):
-            return f"robot links {which}.{template.removeprefix(_LINK)} ({len(members)})"
-    return ", ".join(braces(members))

@@ -1,9 +1,9 @@
-"""Figures of graphs: the declared beside the estimated one, and a model in layers."""
+"""Figures: estimated graphs beside declared ones, a model in layers, and verifications."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, final
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, final
 import networkx as nx
 
 from scm_world.discovery.names import Families, by_entity
-from scm_world.discovery.report import DiscoveryReport
+from scm_world.discovery.run import DiscoveryReport
 from scm_world.graph import SCM
-from scm_world.graph.exchange.html import FILLS
-from scm_world.graph.exchange.layout import (
+from scm_world.graph.exchange.html import (
+    FILLS,
     columns_of,
     forward,
     heights_of,
@@ -23,10 +23,13 @@ from scm_world.graph.exchange.layout import (
 )
 from scm_world.output.canvas import DPI, FAINT, INK, WIDTH, blank, save
 from scm_world.output.locations import Location
+from scm_world.queries.agreement import FACTORS, Agreement
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.queries.verification import Verification, arrow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DECLARED, MATCHED, EXTRA, MISSING = "#4a5568", "#1f6fb4", "#f28e2b", "#d62728"
 LAG_0, LAG_1 = "#5f6b7a", "#9a6fb0"
@@ -46,7 +49,7 @@ def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
     left out.
 
     Args:
-        report: What was found.
+        report: The result of a discovery.
         path: Of the PNG, 1600 x 900 pixels.
     """
     found, declared = set(report.found), set(report.declared)
@@ -133,7 +136,6 @@ def _entities_together(families: Families, edges: Iterable[EdgeKey]) -> list[str
 
 
 def _grid(ax: Axes, causes: Sequence[str], effects: Sequence[str]) -> None:
-    """Label rows and columns, and set off the entities from one another."""
     ax.set_xlim(-0.5, max(len(causes), 1) - 0.5)
     ax.set_ylim(max(len(effects), 1) - 0.5, -0.5)
     size = max(5.0, min(10.0, 260.0 / max(len(effects), len(causes), 1)))
@@ -172,7 +174,7 @@ def _key(marker: str, label: str, color: str, *, hollow: bool = False, size: flo
 
 @final
 @dataclass(frozen=True)
-class Drawing:
+class LayeredModel:
     """A model in layers [pixels], y downwards.
 
     Attributes:
@@ -194,8 +196,8 @@ class Drawing:
     height: float
 
 
-def lay_out(model: SCM) -> Drawing:
-    """Find a place for every family of variables; lagged edges of many causes run through hubs."""
+def lay_out(model: SCM) -> LayeredModel:
+    """Return places for families of variables; lagged edges of many causes run through hubs."""
     families = Families(model, (edge.key for edge in model.edges))
     graph = nx.DiGraph()
     for edge in model.edges:
@@ -225,7 +227,7 @@ def lay_out(model: SCM) -> Drawing:
             points = tuple((x, height + aside) for x, height in (start, *lanes, end))
             arrows.append((points, lag, back))
     first: dict[str, Any] = {name: model.declared(m[0]) for name, m in families.members.items()}
-    return Drawing(
+    return LayeredModel(
         places={name: at[name] for name in graph},
         kinds={name: "hub" if name in hubs else first[name].kind for name in graph},
         box=(2.0 * half, BOX),
@@ -329,3 +331,109 @@ def _legend(ax: Axes, kinds: set[str]) -> None:
         handles.append(Patch(fc=INK, label=label))
     place: Any = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
     ax.legend(handles=handles, ncol=4, frameon=False, fontsize=10, **place)
+
+
+SHADES = ("#1f6fb4", "#f28e2b", "#4c9a6a", "#9a6fb0")
+GOOD, BAD = "#4c9a6a", "#d62728"
+LISTED = 26  # lines of names that fit
+
+
+def draw_verification(found: Verification | Agreement, path: Location | str) -> None:
+    """Draw how soon edges fired, what is wrong, and the signs on two engines.
+
+    Args:
+        found: A verification, or that of two engines.
+        path: Of the PNG, 1600 x 900 pixels.
+    """
+    both = isinstance(found, Agreement)
+    reports = found.verifications if isinstance(found, Agreement) else (found,)
+    figure = blank()
+    color, verdict = (GOOD, "passed") if found.passed else (BAD, "not passed")
+    title: Any = {"fontsize": 18, "weight": "bold"}
+    figure.text(0.02, 0.945, f"Verification of {reports[0].task}", color=INK, **title)
+    figure.text(0.98, 0.945, verdict, ha="right", color=color, **title)
+    words = "     ".join(
+        f"{one.backend} {one.versions.get(one.backend, '')}: floor {one.floor:g}, "
+        f"{len(one.undeclared)} undeclared, {len(one.never_fired)} never seen, "
+        f"{one.rollouts:,} rollouts"
+        for one in reports
+    )
+    figure.text(0.02, 0.9, words, fontsize=11, color=INK)
+    _coverage(figure.add_axes((0.055, 0.09, 0.36, 0.72)), reports)
+    if isinstance(found, Agreement):
+        _signs(figure.add_axes((0.46, 0.09, 0.27, 0.72)), found)
+    _names(figure, 0.765 if both else 0.47, found)
+    save(figure, path)
+
+
+def _coverage(ax: Axes, reports: Iterable[Verification]) -> None:
+    """Draw the share of the declared edges that had fired after each probe state."""
+    from matplotlib.ticker import MaxNLocator
+
+    lowest = 1.0
+    for found, shade in zip(reports, SHADES, strict=False):
+        declared = len(found.declared)
+        share = [count / declared if declared else 1.0 for count in found.coverage]
+        label = f"{found.backend}: {len(found.fired)} of {declared}"
+        numbers = range(1, len(share) + 1)
+        ax.step(numbers, share, where="mid", color=shade, lw=2.2, label=label, alpha=0.85)
+        lowest = min(lowest, *share)
+    ax.axhline(1.0, color=FAINT, lw=1.0, zorder=0)
+    ax.set_ylim(lowest - 0.08 * (1.02 - lowest) - 0.002, 1.0 + 0.06 * (1.02 - lowest))
+    ax.yaxis.set_major_formatter(lambda y, _: f"{round(100 * y, 3):g} %" if y <= 1.0 else "")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_title("declared edges seen", loc="left", fontsize=13, color=INK)
+    ax.set_xlabel("probe states", fontsize=11, color=INK)
+    ax.legend(loc="lower right", frameon=False, fontsize=11)
+    _plain(ax)
+
+
+def _signs(ax: Axes, found: Agreement) -> None:
+    """Draw bars of equal signs: the clearer the effects, the further to the right."""
+    shares = [found.at(factor) for factor in FACTORS]
+    for number, share in enumerate(shares):
+        part = share.edges_equal / share.edges if share.edges else 0.0
+        ax.bar(number, part, color=GOOD, alpha=0.35 + 0.2 * number, width=0.7)
+        label = f"{100 * part:.1f} %\n{share.edges_equal}/{share.edges}" if share.edges else "none"
+        ax.text(number, part + 0.015, label, ha="center", fontsize=9, color=INK)
+    ax.set_ylim(0.0, 1.12)
+    ax.set_xticks(range(len(shares)), [f"> {share.factor:g}" for share in shares])
+    ax.set_yticks([])
+    ax.set_title(f"same sign on {' and '.join(found.backends)}", loc="left", fontsize=13, color=INK)
+    ax.set_xlabel("effect / what the engines differ by anyway", fontsize=11, color=INK)
+    _plain(ax)
+
+
+def _plain(ax: Axes) -> None:
+    ax.tick_params(colors=INK)
+    for side, spine in ax.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(FAINT)
+
+
+def _wrong(found: Verification | Agreement) -> Iterator[tuple[str, tuple[EdgeKey, ...]]]:
+    if isinstance(found, Agreement):
+        for report in found.verifications:
+            yield from _wrong(report)
+        yield "sign not the same", found.opposite
+        return
+    yield f"{found.backend}, never seen", found.never_fired
+    yield f"{found.backend}, undeclared", tuple(edge.key for edge in found.undeclared)
+    yield f"{found.backend}, color moves something", found.colors
+
+
+def _names(figure: Figure, left: float, found: Verification | Agreement) -> None:
+    """Name the edges with which something is wrong."""
+    lines: list[tuple[str, str]] = []
+    for title, edges in _wrong(found):
+        if edges:
+            lines.append((f"{title}: {len(edges)}", "bold"))
+            for edge in edges:
+                parts = textwrap.wrap(arrow(edge), 48, subsequent_indent="    ")
+                lines += [(part, "normal") for part in parts]
+    if not lines:
+        lines = [("Every declared edge was seen, and nothing else.", "normal")]
+    if len(lines) > LISTED:
+        lines = [*lines[: LISTED - 1], ("and more, see report.json", "normal")]
+    for number, (line, weight) in enumerate(lines):
+        figure.text(left, 0.8 - 0.028 * number, line, fontsize=9.5, weight=weight, color=INK)

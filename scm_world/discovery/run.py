@@ -1,17 +1,20 @@
-"""Discovery from beginning to end."""
+"""Discovery from beginning to end: experiments, checkpoints, report."""
 
 from __future__ import annotations
 
+import json
 import time
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, final
 
-from scm_world.discovery.checkpoints import Checkpoint
-from scm_world.discovery.design import bounds
-from scm_world.discovery.report import DiscoveryReport
-from scm_world.discovery.scores import score
+from scm_world.discovery.metrics import GraphScore, score
+from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.graph import SCM
-from scm_world.output.locations import Location
-from scm_world.queries.experiments.effects import Effects
+from scm_world.output.durable import made, removed, write_durably, write_whole
+from scm_world.output.locations import Location, located
+from scm_world.output.reading import read_text
+from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -19,6 +22,103 @@ from scm_world.queries.experiments.series import Series, checked_count
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.world import World
+
+REPORT = "scm_world/discovery/1"
+CHECKPOINT = "scm_world/discovery-progress/2"
+
+
+@final
+@dataclass(frozen=True)
+class DiscoveryReport:
+    """A graph recovered from interventional experiments, compared with the declared one.
+
+    Attributes:
+        task: Name of the task or model.
+        backend: Name of the engine; ``"none"`` for a model without physics.
+        preset: Numerical settings of the engine.
+        seed: Of the experiments.
+        probes: Probe states that were used.
+        planned: Probe states that were asked for; more than ``probes`` if it was interrupted.
+        rollouts: Control steps simulated in an experiment of their own.
+        bound: Fewest of them that find a graph without prior knowledge: one for each variable that
+            can be set, in each probe state.
+        floor: Largest difference after something was done and undone.
+        threshold: An effect must exceed it.
+        inert: Largest effect among the pairs that are no edge in the estimated graph.
+        score: The comparison.
+        found: Edges of the estimated graph.
+        declared: Edges of the declared graph.
+        effects: Largest effect of each estimated edge, in the unit of the child.
+        refused: Targets that found no feasible value in some probes, with how often.
+        seconds: Wall time.
+        versions: Of everything that decides the result.
+        arguments: What the task was made with, each as ``name=value``, where that is known.
+    """
+
+    task: str
+    backend: str
+    preset: str
+    seed: int
+    probes: int
+    planned: int
+    rollouts: int
+    bound: int
+    floor: float
+    threshold: float
+    inert: float
+    score: GraphScore
+    found: tuple[EdgeKey, ...]
+    declared: tuple[EdgeKey, ...]
+    effects: dict[EdgeKey, float]
+    refused: dict[str, int]
+    seconds: float
+    versions: dict[str, str]
+    arguments: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain data."""
+        return {
+            "format": REPORT,
+            "task": self.task,
+            "arguments": list(self.arguments),
+            "backend": self.backend,
+            "preset": self.preset,
+            "seed": self.seed,
+            "probes": self.probes,
+            "planned_probes": self.planned,
+            "complete": self.probes == self.planned,
+            "rollouts": self.rollouts,
+            "fewest_rollouts": self.bound,
+            "floor": self.floor,
+            "threshold": self.threshold,
+            "largest_effect_without_edge": self.inert,
+            **asdict(self.score),
+            "edges": [
+                {"cause": c, "effect": e, "lag": lag, "largest": self.effects[c, e, lag]}
+                for c, e, lag in self.found
+            ],
+            "declared": [list(edge) for edge in self.declared],
+            "refused": self.refused,
+            "seconds": self.seconds,
+            "versions": self.versions,
+        }
+
+    def save(self, path: Location | str) -> None:
+        """Write the report as JSON, whole or not at all.
+
+        Raises:
+            UnwritableFolder: There is no such folder, no room, or no permission.
+        """
+        write_whole(json.dumps(self.as_dict(), indent=1) + "\n", path)
+
+    def __str__(self) -> str:
+        s = self.score
+        return (
+            f"{self.task} on {self.backend}: {len(self.found)} edges found, "
+            f"{len(self.declared)} declared, SHD {s.shd}, precision {s.precision:.3f}, "
+            f"recall {s.recall:.3f}, F1 {s.f1:.3f}; {self.probes} probe states, "
+            f"{self.rollouts} rollouts, floor {self.floor:g}"
+        )
 
 
 def discover(
@@ -41,7 +141,7 @@ def discover(
         probes: How many states to experiment in.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
-        checkpoint: A file to write to after each probe state of a world; the same call goes on
+        checkpoint: A file to write to after each probe state of a world; the same call resumes
             from there, with the same result. It is removed when all are finished.
         options: Arguments of ``World``, where ``system`` is a name.
 
@@ -63,18 +163,14 @@ def discover(
     if isinstance(system, SCM):
         series = Series(PairedEquations(system, seed), probes, progress)
         series.run(range(probes))
-        about = {"task": "model", "backend": "none", "preset": "none", "engine": ""}
-        return _report(system, series.effects, series.done, probes, seed, about, started)
+        return _report(system, series, seed, ("model", "none", "none", ""), started)
     world = World(system, **options) if isinstance(system, str) else system
     try:
-        effects, done = _experiments(world, probes, seed, progress, checkpoint)
-        about = {
-            "task": world.task.name,
-            "backend": world.backend.name,
-            "preset": world.options.preset,
-            "engine": f"{world.backend.name} {world.backend.version}",
-        }
-        return _report(world.model, effects, done, probes, seed, about, started)
+        series = _experiments(world, probes, seed, progress, checkpoint)
+        backend = world.backend
+        about = (world.task.name, backend.name, world.options.preset)
+        engine = f"{backend.name} {backend.version}"
+        return _report(world.model, series, seed, (*about, engine), started)
     finally:
         if isinstance(system, str):
             world.close()
@@ -82,7 +178,7 @@ def discover(
 
 def _experiments(
     world: World, probes: int, seed: int, progress: Progress | None, path: Location | str | None
-) -> tuple[Effects, int]:
+) -> Series:
     paired = Paired(world, seed)
     saved = None if path is None else Checkpoint(path, _terms(world, seed))
     first = 0 if saved is None else min(saved.read(paired), probes)
@@ -96,19 +192,15 @@ def _experiments(
     series.run(probe_states(world, probes, seed, first=first), written)
     if saved is not None and series.done == probes:
         saved.end()
-    return series.effects, series.done
+    return series
 
 
 def _terms(world: World, seed: int) -> dict[str, Any]:
-    given = {name: str(value) for name, value in sorted(world.task.given.items())}
-    backend = world.backend
-    finer = (
-        {} if world.resolution == world.task.resolutions[0] else {"resolution": world.resolution}
-    )
+    backend, usual = world.backend, world.resolution == world.task.resolutions[0]
     return {
-        **finer,
+        **({} if usual else {"resolution": world.resolution}),
         "task": world.task.name,
-        "arguments": given,
+        "arguments": {name: str(value) for name, value in sorted(world.task.given.items())},
         "action_mode": world.action_mode,
         "preset": world.options.preset,
         "seed": seed,
@@ -117,26 +209,21 @@ def _terms(world: World, seed: int) -> dict[str, Any]:
 
 
 def _report(
-    model: SCM,
-    effects: Effects,
-    done: int,
-    planned: int,
-    seed: int,
-    about: dict[str, str],
-    started: float,
+    model: SCM, series: Series, seed: int, about: tuple[str, str, str, str], started: float
 ) -> DiscoveryReport:
-    declared = {edge.key for edge in model.edges}
+    effects, declared = series.effects, {edge.key for edge in model.edges}
     found = effects.edges(declared)
     inert = [size for key, size in effects.largest.items() if key not in found]
+    task, backend, preset, engine = about
     return DiscoveryReport(
-        task=about["task"],
-        backend=about["backend"],
-        preset=about["preset"],
+        task=task,
+        backend=backend,
+        preset=preset,
         seed=seed,
-        probes=done,
-        planned=planned,
+        probes=series.done,
+        planned=series.planned,
         rollouts=effects.rollouts,
-        bound=done * bounds.paired_single_target(len(effects.undone) or len(list(model))),
+        bound=series.done * (len(effects.undone) or len(model)),
         floor=effects.floor,
         threshold=effects.threshold,
         inert=max(inert, default=0.0),
@@ -146,5 +233,70 @@ def _report(
         effects={key: effects.largest[key] for key in found},
         refused=effects.refused,
         seconds=time.perf_counter() - started,
-        versions=versions(about["engine"]),
+        versions=versions(engine),
     )
+
+
+@final
+class Checkpoint:
+    """A file that is written after each probe state, whole or not at all.
+
+    Args:
+        path: Of the file.
+        terms: Everything that decides the result; a file with other terms is refused.
+    """
+
+    def __init__(self, path: Location | str, terms: Mapping[str, Any]) -> None:
+        self._path = located(path)
+        self._terms = json.loads(json.dumps(terms))
+
+    def read(self, paired: Paired) -> int:
+        """Resume from the file, and return how many probe states are finished.
+
+        Raises:
+            UnreadableFile: It is damaged, or of another discovery.
+        """
+        try:
+            data = json.loads(read_text(self._path))
+            if data["format"] != CHECKPOINT:
+                raise ValueError(f"expected the format {CHECKPOINT!r}")
+            if data["terms"] != self._terms:
+                other = [key for key, value in self._terms.items() if data["terms"][key] != value]
+                raise ValueError(f"it is of another discovery: {', '.join(other)} differ")
+            effects = Effects(
+                largest={(str(c), str(e), int(lag)): float(x) for c, e, lag, x in data["largest"]},
+                states={(str(c), str(e), int(lag)): int(n) for c, e, lag, n in data["states"]},
+                floor=float(data["floor"]),
+                exact=paired.effects.exact,
+                undone=set(map(str, data["undone"])),
+                rollouts=int(data["rollouts"]),
+                refused={str(name): int(n) for name, n in data["refused"].items()},
+            )
+            paired.remember(effects, data["memory"])
+            return int(data["done"])
+        except FileNotFoundError:
+            return 0
+        except DAMAGED as error:
+            advice = "delete it to begin anew, or give another folder"
+            raise UnreadableFile(str(self._path), str(error), advice) from None
+
+    def write(self, effects: Effects, done: int, paired: Paired) -> None:
+        """Write the results of the probe states that are finished."""
+        data = {
+            "format": CHECKPOINT,
+            "terms": self._terms,
+            "done": done,
+            "largest": [[*key, size] for key, size in effects.largest.items()],
+            "states": [[*key, count] for key, count in effects.states.items()],
+            "floor": effects.floor,
+            "undone": sorted(effects.undone),
+            "rollouts": effects.rollouts,
+            "refused": effects.refused,
+            "memory": paired.memory(),
+        }
+        made(self._path.parent)
+        write_durably(self._path, json.dumps(data).encode())
+
+    def end(self) -> None:
+        """Remove the file: there is a result now."""
+        removed(self._path)

@@ -78,5 +78,5 @@ def beginning_structure(world: World, acts: Mapping[str, Any]) -> CompiledTask:
                 mine[name] = family.head.accept(name, value)
             except InterventionError:  # the reset will say so
                 continue
-    found = family.after(mine, family.head, family.head.solve(), world.moment(0))
+    found = family.after(mine, family.head, family.head.solve(), world.noise_key(0))
     return found or family.natural(None)

@@ -148,8 +148,8 @@ class Vector:
 
     def _sensed(self, raw: Floats) -> Floats:
         """Add the noise of the sensors, the same whenever this instant is observed."""
-        moment = self._world.moment(self._world.index)
-        drawn: Any = moment.draw(Normal(), STREAM, raw.shape, {})
+        key = self._world.noise_key(self._world.index)
+        drawn: Any = key.draw(Normal(), STREAM, raw.shape, {})
         noisy: Floats = raw + self._noise * self._spread * drawn
         return noisy
 

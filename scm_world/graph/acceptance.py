@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scm_world.errors import InterventionError, UnknownVariable
-from scm_world.graph.evaluate import Act, source_of
+from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.variables import (
     Draw,
     Hard,
@@ -24,12 +24,7 @@ from scm_world.variables.checks import check_bounds, check_draw, coerce
 
 
 def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
-    """Check an intervention: type, shape, finite, fixed bounds, parents that exist.
-
-    Args:
-        declared: All variables, by name.
-        variable: That is set.
-        value: A plain value, or an intervention.
+    """Return a checked intervention: type, shape, finite, fixed bounds, known parents.
 
     Raises:
         InterventionError: What is wrong with it.
@@ -37,7 +32,7 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
     match value:
         case Draw():
             check_draw(variable, value)
-            _known(declared, source_of(Act(value, variable)).parents())
+            _known(declared, source_of(AppliedIntervention(value, variable)).parents())
             return value
         case Mechanism():
             _known(declared, (parent.name for parent in value.parents))
@@ -75,7 +70,6 @@ def _known(declared: Mapping[str, Variable], names: Any) -> None:
 
 
 def _plain(variable: Variable, value: Any) -> Any:
-    """Take a value out of ``Hard``, which holds the numbers of a matrix in one row."""
     if not isinstance(value, Hard):
         return value
     matrix = len(variable.shape) > 1 and np.size(value.value) == np.prod(variable.shape)
@@ -83,7 +77,7 @@ def _plain(variable: Variable, value: Any) -> Any:
 
 
 def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
-    """Name the nearest causes that can be set, past others that cannot."""
+    """Return the nearest causes that can be set, past others that cannot."""
     found: dict[str, None] = {}
     stack, seen = [name], {name}
     while stack:
@@ -98,8 +92,8 @@ def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
     return list(found)
 
 
-def adds_edges(act: Act) -> bool:
-    """Tell whether an intervention gives its target causes: then the order has to be found anew."""
+def adds_edges(act: AppliedIntervention) -> bool:
+    """Return whether an intervention gives its target causes: then the order is computed anew."""
     if isinstance(act.intervention, Draw):
         return bool(source_of(act).parents())
     return isinstance(act.intervention, Mechanism)

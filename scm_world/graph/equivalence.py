@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from scm_world.errors import ModelError
 
@@ -20,7 +21,7 @@ Bools = NDArray[np.bool_]
 
 
 def as_graph(matrix: NDArray[np.generic]) -> Bools:
-    """Take a matrix for a graph: an edge wherever it is not zero. Always a new array.
+    """Return a new graph with an edge wherever a matrix is not zero.
 
     Raises:
         ModelError: It is not square, or something acts on itself.
@@ -44,10 +45,6 @@ def random_dag(n: int, density: float, rng: np.random.Generator) -> Bools:
 
     Source:
         Erdős and Rényi, *On random graphs I*, Publicationes Mathematicae 1959, for the skeleton.
-
-    Example:
-        >>> int(random_dag(3, 1.0, np.random.default_rng(0)).sum())
-        3
     """
     upper = np.triu(rng.random((n, n)) < density, 1)
     order = rng.permutation(n)
@@ -56,26 +53,15 @@ def random_dag(n: int, density: float, rng: np.random.Generator) -> Bools:
 
 
 def is_acyclic(graph: Bools) -> bool:
-    """Tell whether no node acts on itself, even through others; no edge without direction either.
-
-    Example:
-        >>> is_acyclic(np.array([[0, 1], [0, 0]], bool))
-        True
-        >>> is_acyclic(np.array([[0, 1], [1, 0]], bool))
-        False
-    """
+    """Return whether no node acts on itself, even through others; no undirected edge either."""
     return len(_order(graph)) == len(graph)
 
 
 def topological_order(dag: Bools) -> tuple[int, ...]:
-    """List all nodes, causes before their effects.
+    """Return all nodes, causes before their effects.
 
     Raises:
         ModelError: The graph has a cycle.
-
-    Example:
-        >>> topological_order(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]], bool))
-        (2, 1, 0)
     """
     order = _order(dag)
     if len(order) < len(dag):
@@ -97,17 +83,12 @@ def _order(graph: Bools) -> tuple[int, ...]:
 
 
 def skeleton(graph: Bools) -> Bools:
-    """Forget the directions."""
+    """Return the graph without directions."""
     return graph | graph.T
 
 
 def reaches(graph: Bools) -> Bools:
-    """Tell from where one can come where: [i, j] if i is j or one of its ancestors.
-
-    Example:
-        >>> reaches(np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)).astype(int).tolist()
-        [[1, 1, 1], [0, 1, 1], [0, 0, 1]]
-    """
+    """Return from where one can come where: [i, j] if i is j or one of its ancestors."""
     closure: Bools = graph | np.eye(len(graph), dtype=bool)
     for _ in range(max(len(graph) - 1, 1).bit_length()):
         closure = meets(closure, closure)
@@ -121,12 +102,7 @@ def meets(left: Bools, right: Bools) -> Bools:
 
 
 def v_structures(graph: Bools) -> frozenset[tuple[int, int, int]]:
-    """List all ``(i, k, j)`` with i -> k <- j, i < j, and no edge between i and j.
-
-    Example:
-        >>> v_structures(np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]], bool))
-        frozenset({(0, 2, 1)})
-    """
+    """Return all ``(i, k, j)`` with i -> k <- j, i < j, and no edge between i and j."""
     directed, apart = graph & ~graph.T, _apart(graph)
     found = []
     for k in range(len(graph)):
@@ -137,17 +113,13 @@ def v_structures(graph: Bools) -> frozenset[tuple[int, int, int]]:
 
 
 def covered_edges(dag: Bools) -> Bools:
-    """Find the edges i -> j for which the other parents of j are the parents of i.
+    """Return the edges i -> j for which the other parents of j are the parents of i.
 
     Turning one of them around gives an equivalent graph.
 
     Source:
         Chickering, *A transformational characterization of equivalent Bayesian network
         structures*, UAI 1995, definition 2.
-
-    Example:
-        >>> covered_edges(np.array([[0, 1, 1], [0, 0, 1], [0, 0, 0]], bool)).astype(int).tolist()
-        [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
     """
     dag = as_graph(dag)
     i, j = np.nonzero(dag)
@@ -161,20 +133,16 @@ def covered_edges(dag: Bools) -> Bools:
 
 
 def cpdag(dag: Bools) -> Bools:
-    """Give the essential graph: an edge keeps its direction if all equivalent graphs agree on it.
+    """Return the essential graph: an edge keeps its direction if all equivalent graphs agree on it.
 
     Raises:
         ModelError: The graph has a cycle.
-
-    Example:
-        >>> cpdag(np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)).astype(int).tolist()
-        [[0, 1, 0], [1, 0, 1], [0, 1, 0]]
     """
     return essential_graph(dag, ())
 
 
 def essential_graph(dag: Bools, targets: Iterable[Iterable[int]]) -> Bools:
-    """Give what is known of a graph once some interventions were done, besides looking.
+    """Return the interventional essential graph (I-MEC) after some interventions.
 
     Args:
         dag: The true graph, shape (p, p).
@@ -217,10 +185,6 @@ def meek(graph: Bools) -> Bools:
     Source:
         Meek, *Causal inference and causal explanation with background knowledge*, UAI 1995,
         rules 1 to 4.
-
-    Example:
-        >>> meek(np.array([[0, 1, 0], [0, 0, 1], [0, 1, 0]], bool)).astype(int).tolist()
-        [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
     """
     graph = as_graph(graph)
     while True:
@@ -265,15 +229,10 @@ def _apart(graph: Bools) -> Bools:
 
 
 def extension(graph: Bools, rng: np.random.Generator | None = None) -> Bools | None:
-    """Direct all edges, without a cycle or another v-structure.
+    """Direct all edges, without a cycle or another v-structure; None if that is impossible.
 
-    Args:
-        graph: Edges with and without direction.
-        rng: Chooses among the possible sinks; the first is taken if None. Every member of the
-            class can come, but not all with the same probability.
-
-    Returns:
-        An acyclic graph; None if there is none.
+    ``rng`` chooses among the possible sinks; the first is taken if None. Every member of the class
+    can come, but not all with the same probability.
 
     Source:
         Dor and Tarsi, *A simple algorithm to construct a consistent extension of a partially
@@ -299,13 +258,7 @@ def extension(graph: Bools, rng: np.random.Generator | None = None) -> Bools | N
 
 
 def extensions(graph: Bools) -> Iterator[Bools]:
-    """List all acyclic graphs with these directions and v-structures; there can be p! of them.
-
-    Example:
-        >>> triangle = ~np.eye(3, dtype=bool)
-        >>> len(list(extensions(triangle)))
-        6
-    """
+    """Yield all acyclic graphs with these directions and v-structures; there can be p! of them."""
     if extension(graph) is not None:
         yield from _members(meek(graph))
 
@@ -323,35 +276,7 @@ def _members(graph: Bools) -> Iterator[Bools]:
 
 
 def chain_components(graph: Bools) -> tuple[tuple[int, ...], ...]:
-    """Take together what edges without direction connect.
-
-    Example:
-        >>> chain_components(np.array([[0, 1, 1], [1, 0, 1], [0, 0, 0]], bool))
-        ((0, 1), (2,))
-    """
-    together = reaches(graph & graph.T)
-    return tuple(
-        tuple(np.flatnonzero(row).tolist())
-        for node, row in enumerate(together)
-        if row.argmax() == node  # its lowest number stands for the component
-    )
-
-
-__all__ = [
-    "Bools",
-    "as_graph",
-    "chain_components",
-    "covered_edges",
-    "cpdag",
-    "essential_graph",
-    "extension",
-    "extensions",
-    "is_acyclic",
-    "meek",
-    "meets",
-    "random_dag",
-    "reaches",
-    "skeleton",
-    "topological_order",
-    "v_structures",
-]
+    """Return the sets of nodes that undirected edges connect."""
+    count, label = connected_components(graph & graph.T, directed=False)
+    parts = (tuple(np.flatnonzero(label == number).tolist()) for number in range(count))
+    return tuple(sorted(parts))

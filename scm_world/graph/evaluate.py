@@ -1,4 +1,4 @@
-"""How the value of one variable is computed."""
+"""Evaluation of one variable of a causal model."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from scm_world.variables import (
 
 @final
 @dataclass(frozen=True)
-class Moment:
+class NoiseKey:
     """Where in a noise stream a draw is taken.
 
     Attributes:
@@ -39,8 +39,8 @@ class Moment:
         step: The control step.
         count: For how many episodes in a row; None for a single one without a batch axis.
         origin: The control step at which variables got their own noise, if that was another one:
-            what nature drew at the start of an episode stays, however late one intervenes.
-        attempt: How many draws were rejected before, because the world could not be like that.
+            what was drawn at the start of an episode stays, however late one intervenes.
+        attempt: How many draws were rejected before, because they were infeasible.
         kept: Variables that are not drawn anew at another attempt.
     """
 
@@ -56,10 +56,10 @@ class Moment:
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
     ) -> Value:
         """Draw what a variable has by itself, without intervention."""
-        moment = replace(self, attempt=0) if self.attempt else self
+        key = replace(self, attempt=0) if self.attempt else self
         if self.origin is not None:
-            moment = replace(moment, step=self.origin, origin=None)
-        return moment.draw(source, name, shape, values)
+            key = replace(key, step=self.origin, origin=None)
+        return key.draw(source, name, shape, values)
 
     def draw(
         self,
@@ -85,21 +85,21 @@ class Moment:
 
 @final
 @dataclass(frozen=True)
-class Act:
+class AppliedIntervention:
     """An intervention on a variable.
 
     Attributes:
         intervention: What is done.
-        requested: The variable that it says something about: the variable itself, other
-            coordinates of it, or a bundle that it is a part of.
+        requested: The variable it was requested of: the variable itself, other coordinates of it,
+            or a bundle that it is a part of.
     """
 
     intervention: Intervention
     requested: Variable
 
 
-def source_of(act: Act) -> Distribution:
-    """Give the distribution that a draw is taken from."""
+def source_of(act: AppliedIntervention) -> Distribution:
+    """Return the distribution that a draw is taken from."""
     draw = act.intervention
     if not isinstance(draw, Draw):
         raise TypeError(f"{draw!r} draws nothing")
@@ -129,20 +129,21 @@ class Evaluator:
         """Copy and pickle without the functions that were looked up."""
         return Evaluator, (self._declared,)
 
-    def forced(self, name: str, act: Act, values: Values, moment: Moment | None) -> Value:
+    def forced(
+        self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey | None
+    ) -> Value:
         """Compute what a hard intervention or a draw puts in the place of a variable."""
         requested = act.requested
         if isinstance(act.intervention, Hard):
             value = requested.array(act.intervention.value)
-        elif moment is None:
-            raise ModelError([f"{requested.name!r} is drawn: solve needs a moment to draw at"])
+        elif key is None:
+            raise ModelError([f"{requested.name!r} is drawn: solve needs a noise key to draw with"])
         else:
             source, stream = source_of(act), getattr(act.intervention, "stream", None)
-            value = moment.draw(source, requested.name, requested.shape, values, stream)
+            value = key.draw(source, requested.name, requested.shape, values, stream)
         return self._given(requested, name, value)
 
     def _given(self, requested: Variable, name: str, value: Value) -> Value:
-        """Give the value of a variable that a value of what was asked for stands for."""
         if requested.name == name:
             return np.asarray(value)
         if requested.parts:
@@ -153,19 +154,19 @@ class Evaluator:
     def evaluate(
         self,
         name: str,
-        act: Act | None,
+        act: AppliedIntervention | None,
         values: Values,
         previous: Values,
-        moment: Moment | None,
+        key: NoiseKey | None,
     ) -> Value:
         """Compute a variable from the values so far, under an intervention or none."""
         if act is None:
-            return self._natural(self._declared[name], values, previous, moment)
+            return self._natural(self._declared[name], values, previous, key)
         if isinstance(act.intervention, Mechanism):
             return self._followed(name, act, act.intervention, values, previous)
         if not isinstance(act.intervention, SOFT):
-            return self.forced(name, act, values, moment)
-        natural = self._natural(self._declared[name], values, previous, moment)
+            return self.forced(name, act, values, key)
+        natural = self._natural(self._declared[name], values, previous, key)
         requested, by = act.requested, np.asarray(act.intervention.by)
         there = natural
         if requested.name != name:
@@ -176,9 +177,13 @@ class Evaluator:
         return self._given(requested, name, moved)
 
     def _followed(
-        self, name: str, act: Act, given: Mechanism, values: Values, previous: Values
+        self,
+        name: str,
+        act: AppliedIntervention,
+        given: Mechanism,
+        values: Values,
+        previous: Values,
     ) -> Value:
-        """Compute what another mechanism makes of a variable."""
         requested = act.requested
         arguments = map(np.array, self._arguments(given.parents, values, previous))  # copies
         found = given.function.bind()(*arguments)
@@ -195,19 +200,19 @@ class Evaluator:
         return self._given(requested, name, value)
 
     def _natural(
-        self, variable: Variable, values: Values, previous: Values, moment: Moment | None
+        self, variable: Variable, values: Values, previous: Values, key: NoiseKey | None
     ) -> Value:
         match variable:
             case Exogenous():
                 if variable.name in values:
                     return values[variable.name]
-                if moment is None or variable.distribution is None:
+                if key is None or variable.distribution is None:
                     return variable.array(variable.default)
-                return moment.nature(variable.distribution, variable.name, variable.shape, values)
+                return key.nature(variable.distribution, variable.name, variable.shape, values)
             case Fixed():
                 return variable.array(variable.value)
             case Derived():
-                return self._derive(variable, values, previous, moment)
+                return self._derive(variable, values, previous, key)
             case Measured() if variable.mechanism is not None:
                 arguments = self._arguments(variable.all_parents, values, previous)
                 return np.asarray(self._bound(variable)(*arguments))
@@ -219,15 +224,13 @@ class Evaluator:
                 return values[variable.name]
 
     def _derive(
-        self, variable: Derived, values: Values, previous: Values, moment: Moment | None
+        self, variable: Derived, values: Values, previous: Values, key: NoiseKey | None
     ) -> Value:
         arguments, given = self._arguments(variable.all_parents, values, previous), {}
         if variable.noise is not None:
             given["noise"] = np.zeros(variable.shape)
-            if moment is not None:
-                given["noise"] = moment.nature(
-                    variable.noise, variable.name, variable.shape, values
-                )
+            if key is not None:
+                given["noise"] = key.nature(variable.noise, variable.name, variable.shape, values)
         function = self._bound(variable)
         try:
             value = np.asarray(function(*arguments, **given))
@@ -255,7 +258,7 @@ class Evaluator:
         ]
 
     def first(self, name: str) -> Value:
-        """Give the value that lagged children see before the first step."""
+        """Return the value that lagged children see before the first step."""
         variable = self._declared[name]
         match variable:
             case Derived():

@@ -1,4 +1,4 @@
-"""Models in and out: JSON, networkx, DOT."""
+"""Models in and out: JSON and DOT."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import networkx as nx
 from pydantic import TypeAdapter, ValidationError
 
 from scm_world.errors import DAMAGED, InterventionError, ModelError
-from scm_world.graph.exchange import dot
+from scm_world.graph.exchange.formats import to_dot as written
 from scm_world.graph.exchange.model import causal_graph
 from scm_world.graph.scm import SCM
-from scm_world.graph.views import summary
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
 from scm_world.variables.mechanisms import OWN_MECHANISMS
 
@@ -49,7 +47,12 @@ def _functions(
                 yield variable.name, mechanism
 
 
-def _check_portable(model: SCM) -> None:
+def to_dict(model: SCM) -> dict[str, Any]:
+    """Return a model as plain data.
+
+    Raises:
+        ModelError: A mechanism is a lambda or another function without a name of its own.
+    """
     problems = [
         f"{name!r} has the function {function.reference!r}, which cannot be found "
         "under this name; define it at the top level of a module"
@@ -58,29 +61,6 @@ def _check_portable(model: SCM) -> None:
     ]
     if problems:
         raise ModelError(problems)
-
-
-def _check_trusted(
-    variables: Iterable[Variable], held: Mapping[str, Intervention], trusted: tuple[str, ...]
-) -> None:
-    """Refuse functions from elsewhere before anything of theirs is imported."""
-    problems = [
-        f"{name!r} has the function {function.reference!r}, which lies outside the trusted "
-        f"packages {', '.join(trusted)}; pass trusted=(…) to read it"
-        for name, function in _functions(variables, held)
-        if not function.is_defined_in(trusted)
-    ]
-    if problems:
-        raise ModelError(problems)
-
-
-def to_dict(model: SCM) -> dict[str, Any]:
-    """Write a model as plain data.
-
-    Raises:
-        ModelError: A mechanism is a lambda or another function without a name of its own.
-    """
-    _check_portable(model)
     return {
         "format": FORMAT,
         "variables": _plain(_VARIABLES.dump_python(list(model.variables), mode="json")),
@@ -111,7 +91,15 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         ) from None
     except DAMAGED as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
-    _check_trusted(variables, held, (*OWN_MECHANISMS, *trusted))
+    allowed = (*OWN_MECHANISMS, *trusted)
+    problems = [
+        f"{name!r} has the function {function.reference!r}, which lies outside the trusted "
+        f"packages {', '.join(allowed)}; pass trusted=(…) to read it"
+        for name, function in _functions(variables, held)
+        if not function.is_defined_in(allowed)
+    ]
+    if problems:  # before anything of theirs is imported
+        raise ModelError(problems)
     model = SCM(variables)
     try:
         return model.hold(held)
@@ -133,33 +121,9 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     return from_dict(data, trusted=trusted)
 
 
-def to_networkx(model: SCM) -> nx.DiGraph:
-    """Write a model as a summary graph whose nodes carry their declarations, without loss."""
-    graph = summary(model)
-    plain = to_dict(model)
-    for data in plain["variables"]:
-        graph.nodes[data["name"]]["declaration"] = data
-    graph.graph.update(format=FORMAT, interventions=plain["interventions"])
-    return graph
-
-
-def from_networkx(graph: nx.DiGraph, *, trusted: Sequence[str] = ()) -> SCM:
-    """Read a model from a graph that ``to_networkx`` wrote.
-
-    Raises:
-        ModelError: A node has no declaration, or see ``from_dict``.
-    """
-    bare = [name for name, data in graph.nodes(data=True) if "declaration" not in data]
-    if bare:
-        raise ModelError([f"node {name!r} has no declaration" for name in bare])
-    variables = [data["declaration"] for _, data in graph.nodes(data=True)]
-    plain = {**graph.graph, "variables": variables}
-    return from_dict(plain, trusted=trusted)
-
-
 def to_dot(model: SCM) -> str:
     """Write the summary graph in the DOT language; lagged edges are dashed.
 
     ``scm_world.graph.exchange`` writes DOT that can be read back.
     """
-    return dot.to_dot(causal_graph(model), attributes=False)
+    return written(causal_graph(model), attributes=False)

@@ -23,8 +23,8 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph.acceptance import accepted, adds_edges, settable_causes
-from scm_world.graph.evaluate import Act, Evaluator, Moment, source_of
-from scm_world.graph.structure import Edge, Structure, checked
+from scm_world.graph.evaluate import AppliedIntervention, Evaluator, NoiseKey, source_of
+from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
     SOFT,
     Derived,
@@ -53,7 +53,7 @@ def flatten(
 
     Args:
         request: Dotted or nested.
-        twice: Where to put the errors about names that are given twice, nested and dotted; the
+        twice: A list for the errors about names that are given twice, nested and dotted; the
             first value of such a name is kept. They are raised if None.
 
     Raises:
@@ -126,12 +126,12 @@ class SCM:
 
     def __init__(self, variables: Iterable[Variable]) -> None:
         self._declared = checked(variables)
-        self._structure: Structure | None = Structure(self._declared)
+        self._structure: EdgeIndex | None = EdgeIndex(self._declared)
         self._order: tuple[str, ...] = self._structure.order
         self._evaluator = Evaluator(self._declared)
         self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
-        self._acts: dict[str, Act] = {}
+        self._acts: dict[str, AppliedIntervention] = {}
 
     # --- looking ------------------------------------------------------------------------------
 
@@ -145,7 +145,7 @@ class SCM:
         return name in self._declared
 
     def __getitem__(self, name: str) -> Variable:
-        """Give the variable as it is in this model: ``Fixed`` where ``do`` has set it.
+        """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it.
 
         Raises:
             UnknownVariable: No variable has this name.
@@ -177,7 +177,7 @@ class SCM:
         return Exogenous(name=name, default=default, distribution=source, **common, **spaces)
 
     def declared(self, name: str) -> Variable:
-        """Give the variable as it was declared, before any intervention.
+        """Return the variable as it was declared, before any intervention.
 
         Raises:
             UnknownVariable: No variable has this name.
@@ -192,13 +192,13 @@ class SCM:
         """All variables as declared."""
         return tuple(self._declared.values())
 
-    def act_on(self, name: str) -> Act | None:
-        """Give the intervention that holds on a variable, if there is one."""
+    def act_on(self, name: str) -> AppliedIntervention | None:
+        """Return the intervention on a variable, if there is one."""
         return self._acts.get(name)
 
     @property
     def is_temporal(self) -> bool:
-        """Whether it has lagged edges, so that something in it takes time."""
+        """Whether it has lagged edges."""
         return any(edge.lag for edge in self.edges)
 
     @property
@@ -207,10 +207,10 @@ class SCM:
         return dict(self._interventions)
 
     @property
-    def structure(self) -> Structure:
+    def structure(self) -> EdgeIndex:
         """The edges of this model; those into a cut variable are gone."""
         if self._structure is None:
-            self._structure = Structure({name: self[name] for name in self._declared})
+            self._structure = EdgeIndex({name: self[name] for name in self._declared})
         return self._structure
 
     @property
@@ -219,19 +219,19 @@ class SCM:
         return self.structure.edges
 
     def parents(self, name: str) -> tuple[str, ...]:
-        """Name the direct causes, of any lag."""
+        """Return the direct causes, of any lag."""
         return self.structure.parents(self.declared(name).name)
 
     def children(self, name: str) -> tuple[str, ...]:
-        """Name the direct effects, of any lag."""
+        """Return the direct effects, of any lag."""
         return self.structure.children(self.declared(name).name)
 
     def ancestors(self, name: str) -> frozenset[str]:
-        """Name the direct and indirect causes."""
+        """Return the direct and indirect causes."""
         return self.structure.ancestors(self.declared(name).name)
 
     def descendants(self, name: str) -> frozenset[str]:
-        """Name the direct and indirect effects."""
+        """Return the direct and indirect effects."""
         return self.structure.descendants(self.declared(name).name)
 
     def __eq__(self, other: object) -> bool:
@@ -250,17 +250,14 @@ class SCM:
     # --- intervening --------------------------------------------------------------------------
 
     def targets(self, name: str) -> tuple[str, ...]:
-        """Name the variables that an intervention acts on.
-
-        For coordinates it is the quantity itself, for a bundle it is all its parts.
-        """
+        """Return the variables that an intervention acts on: the quantity itself, or all parts."""
         variable = self.declared(name)
         if isinstance(variable, Derived) and variable.inverse is not None:
             return (variable.parents[0].name,)
         return variable.parts or (name,)
 
     def target(self, name: str) -> str:
-        """Name the variable that an intervention acts on; the first one of a bundle's parts."""
+        """Return the variable that an intervention acts on; the first one of a bundle."""
         return self.targets(name)[0]
 
     def do(self, request: Mapping[str, Any]) -> Self:
@@ -308,7 +305,7 @@ class SCM:
 
         Raises:
             CyclicModel: Draws from spaces that follow other variables, or mechanisms, close a
-                cycle.
+            cycle.
         """
         model = object.__new__(type(self))
         model._copy(self)
@@ -322,7 +319,7 @@ class SCM:
             if isinstance(intervention, Natural):
                 continue
             requested = self._declared[whole_of(intervention, name)]
-            model._acts[target] = Act(intervention, requested)
+            model._acts[target] = AppliedIntervention(intervention, requested)
             model._interventions[name] = intervention
         model._structure = None if acts else self._structure
         # Cutting edges keeps every causal order valid.
@@ -331,11 +328,7 @@ class SCM:
         return model
 
     def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
-        """Apply interventions that have been checked already, but for those that close a cycle.
-
-        Returns:
-            The model, and an error for each cycle.
-        """
+        """Apply checked interventions but those that close a cycle; return an error for each."""
         kept, problems = dict(acts), list[ClosesCycle]()
         while True:
             try:
@@ -348,7 +341,6 @@ class SCM:
                     problems += [ClosesCycle(*next(iter(closing.items())), cycle)]
 
     def _copy(self, other: SCM) -> None:
-        """Be what another model is."""
         self._declared, self._temporal = other._declared, other._temporal
         self._evaluator, self._order = other._evaluator, other._order
         self._interventions, self._acts = {**other._interventions}, {**other._acts}
@@ -381,24 +373,19 @@ class SCM:
         known: Values | None = None,
         *,
         previous: Values | None = None,
-        moment: Moment | None = None,
+        key: NoiseKey | None = None,
         only: Iterable[str] | None = None,
     ) -> dict[str, Value]:
-        """Compute every variable from the exogenous ones.
-
-        Values may carry leading batch axes, which broadcast.
+        """Compute every variable from the exogenous ones, shape ``(..., *shape)`` each.
 
         Args:
-            known: Values of exogenous and measured variables and of actions.
+            known: Values of exogenous and measured variables and of actions; batch axes may lead.
             previous: Values of one control step ago, for parents of lag 1. Where it is not
                 given, they are the declared ``start`` or default of the parent; ``begin`` gives
                 what they are under interventions.
-            moment: Where to draw noise. Without it exogenous variables take their default and
+            key: Where to draw noise. Without it exogenous variables take their default and
                 noise terms are zero.
             only: Compute these, in the order of the model, and take the rest from ``known``.
-
-        Returns:
-            All variables, shape ``(..., *shape)`` each.
 
         Raises:
             ModelError: A measured variable or an action has no value.
@@ -406,33 +393,25 @@ class SCM:
         values: dict[str, Value] = dict(known or {})
         evaluate = self._evaluator.evaluate
         for name in self._order if only is None else only:
-            values[name] = evaluate(name, self._acts.get(name), values, previous or {}, moment)
+            values[name] = evaluate(name, self._acts.get(name), values, previous or {}, key)
         return values
 
     def begin(
         self,
         known: Values | None = None,
         *,
-        moment: Moment | None = None,
+        key: NoiseKey | None = None,
         only: Iterable[str] | None = None,
     ) -> dict[str, Value]:
         """Compute the instant before the first step, which lagged children look back at.
 
         What has lagged causes or effects has its ``start`` or default there, unless an intervention
         replaces its mechanism. The rest follows from that. Nothing has been drawn yet but what
-        an intervention draws.
-
-        Args:
-            known: Values of measured variables and of actions.
-            moment: Whose noise interventions draw with.
-            only: Compute these, in the order of the model, and take the rest from ``known``.
-
-        Returns:
-            All variables, shape ``(..., *shape)`` each.
+        an intervention draws. Arguments and result are those of ``solve``.
         """
         values: dict[str, Value] = dict(known or {})
-        if moment is not None:
-            moment = replace(moment, step=BEFORE)
+        if key is not None:
+            key = replace(key, step=BEFORE)
         if self._temporal is None:
             self._temporal = frozenset(
                 end
@@ -444,20 +423,20 @@ class SCM:
         for name in self._order if only is None else only:
             act = self._acts.get(name)
             if act is not None and not isinstance(act.intervention, SOFT):
-                values[name] = self._evaluator.evaluate(name, act, values, {}, moment)
+                values[name] = self._evaluator.evaluate(name, act, values, {}, key)
             elif name in self._temporal and isinstance(self._declared[name], Derived | Measured):
                 values[name] = values.get(name, self._evaluator.first(name))
             else:
                 values[name] = self._evaluator.evaluate(name, act, values, {}, None)
         return values
 
-    def evaluate(self, name: str, values: Values, moment: Moment | None = None) -> Value:
+    def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
         """Compute one variable from the values of all its parents.
 
         Raises:
             ModelError: It is measured, and has no value.
         """
-        return self._evaluator.evaluate(name, self._acts.get(name), values, {}, moment)
+        return self._evaluator.evaluate(name, self._acts.get(name), values, {}, key)
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None
@@ -480,13 +459,13 @@ class SCM:
         if steps is None:
             if self.is_temporal:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])
-            solved = self.solve(moment=Moment(noise, first, 0, n))
+            solved = self.solve(key=NoiseKey(noise, first, 0, n))
             return {name: self._spread(name, value, n) for name, value in solved.items()}
         slices: list[dict[str, Value]] = []
-        start = self.begin(moment=Moment(noise, first, 0, n)) if steps else {}
+        start = self.begin(key=NoiseKey(noise, first, 0, n)) if steps else {}
         for step in range(steps):
             before = slices[-1] if slices else start
-            solved = self.solve(previous=before, moment=Moment(noise, first, step, n))
+            solved = self.solve(previous=before, key=NoiseKey(noise, first, step, n))
             slices.append({name: self._spread(name, v, n) for name, v in solved.items()})
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
 

@@ -1,4 +1,4 @@
-"""The skeleton of a causal model: who points at whom, checked once."""
+"""The edges of a causal model, checked once."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Any, final
 import networkx as nx
 
 from scm_world.errors import CyclicModel, ModelError, nearest
-from scm_world.variables import Derived, Parent, Space, Variable
+from scm_world.variables import Derived, Parent, Variable
 
 
 @final
 @dataclass(frozen=True)
 class Edge:
-    """A causal arrow.
+    """A causal edge.
 
     Attributes:
         cause: Name of the parent.
@@ -34,12 +34,12 @@ class Edge:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Cause, effect and lag: what discovery can find out."""
+        """Cause, effect and lag."""
         return (self.cause, self.effect, self.lag)
 
 
 @final
-class Structure:
+class EdgeIndex:
     """The edges among some variables, without what they mean.
 
     Args:
@@ -77,24 +77,24 @@ class Structure:
         return parents, children
 
     def parents(self, name: str) -> tuple[str, ...]:
-        """Name the direct causes, of any lag."""
+        """Return the direct causes, of any lag."""
         return tuple(self._adjacency[0][name])
 
     def children(self, name: str) -> tuple[str, ...]:
-        """Name the direct effects, of any lag."""
+        """Return the direct effects, of any lag."""
         return tuple(self._adjacency[1][name])
 
     def ancestors(self, name: str) -> frozenset[str]:
-        """Name the direct and indirect causes; a variable that drives itself is one of them."""
+        """Return the direct and indirect causes; a variable that drives itself is one of them."""
         return _reachable(name, self._adjacency[0])
 
     def descendants(self, name: str) -> frozenset[str]:
-        """Name the direct and indirect effects."""
+        """Return the direct and indirect effects."""
         return _reachable(name, self._adjacency[1])
 
     @cached_property
     def instant_children(self) -> dict[str, tuple[str, ...]]:
-        """For each variable, the ones that follow it within the same instant."""
+        """The variables that follow each variable within the same instant."""
         children: dict[str, list[str]] = {name: [] for name in self._names}
         for edge in self._instant:
             if edge.when != "set":
@@ -102,7 +102,7 @@ class Structure:
         return {name: tuple(found) for name, found in children.items()}
 
     def instant_descendants(self, names: Iterable[str]) -> list[str]:
-        """List what follows some variables within the same instant, causes before effects."""
+        """Return what follows some variables within the same instant, causes before effects."""
         found: set[str] = set()
         stack = list(names)
         while stack:
@@ -115,16 +115,13 @@ class Structure:
 
 def _instant(parents: Mapping[str, Sequence[Parent]]) -> tuple[Edge, ...]:
     """List the edges of lag 0. The many states of a model share their parents."""
-    of_lag_0 = {id(causes): [p for p in causes if p.lag == 0] for causes in _distinct(parents)}
+    distinct = {id(causes): causes for causes in parents.values()}
+    of_lag_0 = {key: [p for p in causes if p.lag == 0] for key, causes in distinct.items()}
     return tuple(
         Edge(parent.name, name, 0, parent.when)
         for name, causes in parents.items()
         for parent in of_lag_0[id(causes)]
     )
-
-
-def _distinct(parents: Mapping[str, Sequence[Parent]]) -> Iterable[Sequence[Parent]]:
-    return {id(causes): causes for causes in parents.values()}.values()
 
 
 def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
@@ -150,22 +147,11 @@ def _topological(names: Iterable[str], edges: Sequence[Edge]) -> tuple[str, ...]
 
 
 def _cycles(graph: nx.DiGraph) -> Iterable[list[str]]:
-    """List one cycle of every knot of variables that drive one another."""
+    """Yield one cycle of every strongly connected component."""
     for knot in nx.strongly_connected_components(graph):
         part = graph.subgraph(knot)
         if part.number_of_edges():
             yield [cause for cause, _ in nx.find_cycle(part)]
-
-
-def _space_parents(variable: Variable) -> Iterable[tuple[str, str]]:
-    spaces: dict[str, Space | None] = {
-        "bounds": variable.bounds,
-        "space A": variable.a,
-        "space B": variable.b,
-    }
-    for label, space in spaces.items():
-        for parent in () if space is None else space.parents():
-            yield label, parent
 
 
 def _parent_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
@@ -183,9 +169,11 @@ def _parent_problems(variable: Variable, known: Mapping[str, Variable]) -> Itera
 
 
 def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    for label, name in _space_parents(variable):
-        if name not in known:
-            yield f"{label} of {variable.name!r} depends on the unknown variable {name!r}"
+    spaces = {"bounds": variable.bounds, "space A": variable.a, "space B": variable.b}
+    for label, space in spaces.items():
+        for name in () if space is None else space.parents():
+            if name not in known:
+                yield f"{label} of {variable.name!r} depends on the unknown variable {name!r}"
     if isinstance(variable, Derived) and variable.noise is not None and variable.noise.parents():
         yield f"the noise of {variable.name!r} depends on a variable: let the mechanism scale it"
     if isinstance(variable, Derived) and variable.inverse is not None:

@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
-from scm_world.graph import SCM, Moment, flatten
+from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.variables import Noise
 from scm_world.world import Audit, World
 from scm_world.world.audit import Applied
@@ -311,16 +311,16 @@ class Equations:
 
     def _computed(self, name: str, values: Values, step: int, starts: bool = False) -> Value:
         """Compute one variable: by the declared model, and by that of groups that differ."""
-        moment = Moment(self.noise, self.episode, step, self._count)
+        key = NoiseKey(self.noise, self.episode, step, self._count)
         lead = () if self._count is None else (self._count,)
         shape = (*lead, *self.model.declared(name).shape)
 
         def by(model: SCM) -> Value:
             if starts:
-                found = model.begin(values, moment=moment, only=(name,))
+                found = model.begin(values, key=key, only=(name,))
             else:
                 before = self._before
-                found = model.solve(values, previous=before, moment=moment, only=(name,))
+                found = model.solve(values, previous=before, key=key, only=(name,))
             return np.broadcast_to(found[name], shape)
 
         if len(self._models) == 1:

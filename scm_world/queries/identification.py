@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
-from scm_world.graph.evaluate import Act, source_of
+from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.queries.estimates import CONFIDENCE, Effect, t_quantile
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.plans import Plan
@@ -81,7 +81,7 @@ def _followed(model: SCM, name: str, act: Any) -> frozenset[str]:
     if isinstance(act, Mechanism):
         return frozenset(parent.name for parent in act.parents)
     if isinstance(act, Draw):
-        return source_of(Act(act, model.declared(name))).parents()
+        return source_of(AppliedIntervention(act, model.declared(name))).parents()
     return frozenset()
 
 

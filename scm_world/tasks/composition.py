@@ -12,7 +12,7 @@ from numba import njit
 from scm_world._types import Floats, Value, Values
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.scalars import scalar
-from scm_world.graph import Moment
+from scm_world.graph import NoiseKey
 from scm_world.models import (
     ControlMode,
     Goal,
@@ -168,14 +168,14 @@ class Commands(ABC):
         """Tell whether it is needed, given the values of everything that physics does not move."""
 
     @abstractmethod
-    def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
+    def told(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Give the command of one control step.
 
         Args:
             action: All action variables, shape (n_actions,).
             values: Of everything that physics does not move.
             vector: The state.
-            moment: Where in the noise this control step draws.
+            key: Where in the noise this control step draws.
 
         Returns:
             Shape (n_commands,). It holds until the next call.

@@ -11,7 +11,7 @@ from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.graph import Moment
+from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
 from scm_world.tasks.base import Task, Timing
 from scm_world.tasks.composition import Clock, Commands, Composition
@@ -59,10 +59,10 @@ class ProcessNoise(Commands):
         """Tell that it is always needed."""
         return True
 
-    def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
+    def told(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Give the action and the noise of a control step, shape (n_commands,)."""
         drawn = [
-            np.ravel(moment.draw(source, name, shape, values, "process noise"))
+            np.ravel(key.draw(source, name, shape, values, "process noise"))
             for name, source, shape in self._drawn
         ]
         return np.concatenate([action, *drawn])

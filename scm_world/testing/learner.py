@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data import Dataset, Design, collect
-from scm_world.discovery.learners import Found, Learner, learn, learner
+from scm_world.discovery.learners import EstimatedGraph, Learner, learn, learner
 from scm_world.discovery.problems import DONE
 from scm_world.graph import SCM
 from scm_world.variables import Derived, Linear
@@ -78,7 +78,7 @@ class LearnerConformance:
         chosen = learner(self.learner) if isinstance(self.learner, str) else self.learner
         return table("interventional" if "interventional" in chosen.takes else "observational")
 
-    def found(self, data: Dataset) -> Found:
+    def found(self, data: Dataset) -> EstimatedGraph:
         """Let it learn."""
         return learn(self.learner, data, seed=3, **self.settings)
 
@@ -88,10 +88,10 @@ class LearnerConformance:
         assert edges == {("a", "c"), ("b", "c"), ("c", "d")}
 
     def test_it_is_deterministic(self) -> None:
-        """The same data and seed give the same graph and sureness, bit for bit."""
+        """The same data and seed give the same graph and edge_scores, bit for bit."""
         one, two = self.found(self.data), self.found(self.data)
         assert one.edges.tobytes() == two.edges.tobytes()
-        assert one.sureness.tobytes() == two.sureness.tobytes()
+        assert one.edge_scores.tobytes() == two.edge_scores.tobytes()
 
     def test_it_leaves_the_data_alone(self) -> None:
         """Data are shared between learners: none may write into them."""
@@ -138,6 +138,6 @@ class LearnerConformance:
         """What it is sure of is what it found: the mean over edges exceeds that over others."""
         found = self.found(self.data)
         edges = found.edges.any(axis=0)
-        sure = found.sureness.max(axis=0)
+        sure = found.edge_scores.max(axis=0)
         off = ~np.eye(len(found.names), dtype=bool)
         assert sure[edges & off].mean() > sure[~edges & off].mean()

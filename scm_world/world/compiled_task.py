@@ -14,7 +14,7 @@ from scm_world._arguments import whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import clip_kernel
-from scm_world.graph import SCM, Moment
+from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.tasks import Conventions, Task, Timing, conventions
 from scm_world.variables import Action, Derived, Exogenous, Intervention, Measured
@@ -370,7 +370,7 @@ class StepBase:
         return self.compiled.in_coordinates(name, *known) if len(known) == len(parts) else None
 
 
-def beginning(compiled: CompiledTask, key: Moment | None) -> tuple[dict[str, Value], State]:
+def beginning(compiled: CompiledTask, key: NoiseKey | None) -> tuple[dict[str, Value], State]:
     """Compute where an episode begins when nobody intervenes.
 
     Args:
@@ -380,7 +380,7 @@ def beginning(compiled: CompiledTask, key: Moment | None) -> tuple[dict[str, Val
     Returns:
         The values of everything that physics does not move, and the state of the rest.
     """
-    static = compiled.model.solve(only=compiled.static_names, moment=key)
+    static = compiled.model.solve(only=compiled.static_names, key=key)
     state = compiled.empty_state()
     for variable in compiled.model.variables:
         where = compiled.slices.get(variable.name)

@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Value
 from scm_world.errors import Infeasible, InterventionError
-from scm_world.graph import Moment
+from scm_world.graph import NoiseKey
 from scm_world.models import Difference, State, Structure
 from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard
@@ -106,7 +106,7 @@ def feasible_plan(
     present: Present,
     request: Mapping[str, Any],
     space: AnyRegion | None,
-    key: Moment,
+    key: NoiseKey,
     found: Iterable[InterventionError] = (),
 ) -> tuple[InterventionPlan, Difference]:
     """Plan an intervention that puts no two bodies in one place.
@@ -217,7 +217,7 @@ def refusal(
     plan: InterventionPlan,
     request: Mapping[str, Any],
     problems: list[Overlap],
-    key: Moment,
+    key: NoiseKey,
     tried: str = "",
 ) -> Infeasible:
     """Return the error that names the target to blame, and its nearest feasible value."""
@@ -248,7 +248,7 @@ def _nearest(
     base: StepBase,
     present: Present,
     request: Mapping[str, Any],
-    key: Moment,
+    key: NoiseKey,
     *,
     halvings: int = 20,
 ) -> dict[str, Any] | None:

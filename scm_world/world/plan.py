@@ -18,7 +18,7 @@ from scm_world.errors import (
     UnknownVariable,
     raise_all,
 )
-from scm_world.graph import SCM, Moment
+from scm_world.graph import SCM, NoiseKey
 from scm_world.models import State
 from scm_world.variables import Draw, Hard, Intervention, Natural, Null, divided
 from scm_world.variables.subsets import AnyRegion, as_region
@@ -78,7 +78,7 @@ def plan_intervention(
     base: StepBase,
     request: Mapping[str, Any],
     space: AnyRegion | None,
-    key: Moment,
+    key: NoiseKey,
     last: InterventionPlan | None = None,
     found: Iterable[InterventionError] = (),
 ) -> InterventionPlan:

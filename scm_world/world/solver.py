@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.errors import InterventionError, NotFinite, OutOfBounds, WrongShape
-from scm_world.graph import Moment
+from scm_world.graph import NoiseKey
 from scm_world.variables import (
     SOFT,
     Draw,
@@ -62,7 +62,7 @@ class Solver:
         base: StepBase,
         asked: tuple[str, ...],
         pending: PendingInterventions,
-        key: Moment,
+        key: NoiseKey,
         earlier: Solver | None = None,
     ) -> None:
         self.base, self.asked, self.pending = base, asked, pending
@@ -83,7 +83,7 @@ class Solver:
     def _is_state(self, target: str) -> bool:
         return self._task.model.declared(target).role == "state"
 
-    def again(self, key: Moment) -> Solver:
+    def again(self, key: NoiseKey) -> Solver:
         """Return a solver of the same request at another draw."""
         return Solver(self.base, self.asked, self.pending, key, self)
 

@@ -18,7 +18,7 @@ import numpy as np
 from scm_world._types import Values
 from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
-from scm_world.graph import SCM, Moment
+from scm_world.graph import SCM, NoiseKey
 from scm_world.models import Model, State
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.tasks.composition import Entity
@@ -93,12 +93,12 @@ class StructureCache:
         self._compiled.move_to_end(plan)
         return found
 
-    def natural(self, key: Moment | None) -> CompiledTask:
+    def natural(self, key: NoiseKey | None) -> CompiledTask:
         """Give the structure that an episode has when nobody intervenes."""
-        return self.compiled(self.plan(self.head.solve(moment=key)))
+        return self.compiled(self.plan(self.head.solve(key=key)))
 
     def after(
-        self, acts: dict[str, Intervention], held: SCM, static: Values, key: Moment
+        self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey
     ) -> CompiledTask | None:
         """Give the structure after an intervention; None where it has nothing to do with it.
 
@@ -121,7 +121,7 @@ class StructureCache:
             for v in self.head.variables
             if v.kind == "exogenous" and v.name not in targets  # type: ignore[attr-defined]
         }
-        values = model.solve(known, moment=key)
+        values = model.solve(known, key=key)
         if not all(_possible(variable, values) for variable in self.head.variables):
             return None  # the intervention will be refused, with the reason
         return self.compiled(self.plan(values))
@@ -204,7 +204,7 @@ def _with_causes(names: Iterable[str], declared: dict[str, Variable]) -> set[str
 
 
 def restructured(
-    structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: Moment
+    structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: NoiseKey
 ) -> StepBase:
     """Give a step base in the structure that a request asks for.
 
@@ -241,7 +241,7 @@ def restructured(
         for v in model.variables
         if isinstance(v, Exogenous) and v.name in base.static and v.name not in held
     }
-    solved = model.solve(known, moment=key, only=compiled.static_names)
+    solved = model.solve(known, key=key, only=compiled.static_names)
     return replace(
         base,
         compiled=compiled,

@@ -26,7 +26,7 @@ from scm_world.errors import (
     WrongShape,
     in_one_line,
 )
-from scm_world.graph import SCM, Moment, flatten
+from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.models import ControlMode, Difference, Scene, State
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
@@ -261,7 +261,7 @@ class World(WorldAttributes):
         Raises:
             Infeasible: It puts two bodies in one place.
         """
-        key = self.moment(0)
+        key = self.noise_key(0)
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
@@ -277,9 +277,9 @@ class World(WorldAttributes):
             self.backend.apply(change)
         self._adopt(compiled, compiled.model, static, 0)
 
-    def moment(self, index: int) -> Moment:
+    def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode."""
-        return Moment(self.noise, self.episode, index, origin=0)
+        return NoiseKey(self.noise, self.episode, index, origin=0)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -339,7 +339,7 @@ class World(WorldAttributes):
             return command
         given = self.compiled.split(command)
         known = {**self.evaluate(self._inputs), **given}
-        solved = self._held.solve(known, moment=self.moment(self._index), only=held)
+        solved = self._held.solve(known, key=self.noise_key(self._index), only=held)
         command = command.copy()
         for name in held:
             command[self.compiled.actions[name]] = np.ravel(solved[name])
@@ -351,7 +351,7 @@ class World(WorldAttributes):
         if commands is None or not self.translates:
             return action
         values = self._values
-        return commands.told(action, values.now, values.state.vector, self.moment(index))
+        return commands.told(action, values.now, values.state.vector, self.noise_key(index))
 
     @property
     def pace(self) -> tuple[ControlMode, int]:
@@ -389,7 +389,7 @@ class World(WorldAttributes):
         base = self._base or self._step_base()
         twice += self._wrong_actions(flat)
         region = self.variables_space if space is None else space
-        key = self.moment(base.index)
+        key = self.noise_key(base.index)
         plan, change = feasible_plan(
             self.structures, base, self._present(), flat, region, key, twice
         )

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from scm_world.discovery.benchmarks import BenchmarkResult, Run
-from scm_world.discovery.learners import Found
+from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
+from scm_world.discovery.learners import EstimatedGraph
+from scm_world.discovery.metrics import score
 from scm_world.discovery.problems import GroundTruth
-from scm_world.discovery.scores import score
 
 CHAIN = GroundTruth(
     name="chain",
@@ -44,21 +44,23 @@ WAYS = (
 )
 
 
-def found_of(truth: GroundTruth, learner: str, budget: int) -> Found:
+def found_of(truth: GroundTruth, learner: str, budget: int) -> EstimatedGraph:
     """Make a graph with each kind of mistake; more of the truth for a larger budget."""
     edges = list(truth.edges)
     if learner == "ours":
-        return Found.of_edges(truth.names, edges)
+        return EstimatedGraph.of_edges(truth.names, edges)
     if learner == "pc":
         cause, effect, _ = next(edge for edge in edges if edge[2] == 0)
-        return Found.of_edges(truth.names, [(cause, effect, 0), (effect, cause, 0), *edges[3:]])
+        return EstimatedGraph.of_edges(
+            truth.names, [(cause, effect, 0), (effect, cause, 0), *edges[3:]]
+        )
     cause, effect, lag = edges[0]
     turned = [(effect, cause, lag)] if budget < 1000 else [(cause, effect, lag)]
     extra = (truth.names[0], truth.names[-1], 0)
-    return Found.of_edges(truth.names, [*turned, extra, *edges[2:]])
+    return EstimatedGraph.of_edges(truth.names, [*turned, extra, *edges[2:]])
 
 
-def run(truth: GroundTruth, learner: str, data: str, budget: int, seed: int) -> Run:
+def run(truth: GroundTruth, learner: str, data: str, budget: int, seed: int) -> BenchmarkRun:
     """Make a run; the scores get better with the budget, and differ by seed."""
     about: dict[str, Any] = {
         "problem": truth.name,
@@ -67,7 +69,9 @@ def run(truth: GroundTruth, learner: str, data: str, budget: int, seed: int) -> 
         "budget": budget,
     }
     if learner == "gies" and seed == 2 and budget == 1000:
-        return Run(**about, seed=seed, status="timeout", message="more than 60 s", seconds=60.0)
+        return BenchmarkRun(
+            **about, seed=seed, status="timeout", message="more than 60 s", seconds=60.0
+        )
     found = found_of(truth, learner, budget)
     known = score(found.directed, truth.edges)
     numbers: dict[str, Any] = {
@@ -78,7 +82,7 @@ def run(truth: GroundTruth, learner: str, data: str, budget: int, seed: int) -> 
         "sid": None if learner == "pc" else np.int64(3),
         "fdp": 1.0 - known.precision,
     }
-    return Run(
+    return BenchmarkRun(
         **about,
         seed=seed,
         found=found,

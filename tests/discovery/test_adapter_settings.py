@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -10,30 +11,27 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data.dataset import Dataset
-from scm_world.discovery.learners import Found, learn, learners, registry
-from scm_world.discovery.learners.adapters import causal_learn, gies, tigramite
-from scm_world.discovery.learners.adapters.settings import Settings
-from scm_world.discovery.learners.others import OTHERS
+from scm_world.discovery.learners import EstimatedGraph, learn, learners, registry
+from scm_world.discovery.learners.known import OTHERS
 from scm_world.errors import MissingExtra, UnknownOption
 
-DECLARED: dict[str, Settings] = {
-    "pc": causal_learn.PC,
-    "ges": causal_learn.GES,
-    "boss": causal_learn.BOSS,
-    "grasp": causal_learn.GRASP,
-    "gies": gies.GIES,
-    "pcmci+": tigramite.PCMCI_PLUS,
+DEFAULTS = {
+    each.name: {
+        setting: what.default
+        for setting, what in signature(each.learn).parameters.items()
+        if setting not in ("data", "seed")
+    }
+    for each in OTHERS
 }
 DATA = Dataset.of(np.random.default_rng(0).normal(size=(50, 3)).cumsum(axis=1), list("xyz"))
 
 
-@pytest.mark.parametrize("name", DECLARED)
+@pytest.mark.parametrize("name", [*DEFAULTS, "do_order", "pooled"])
 def test_settings_are_checked(name: str) -> None:
-    """An unknown setting is told with those there are, before the data are looked at."""
-    run = next(each.learn for each in OTHERS if each.name == name)
+    """An unknown setting is refused with those there are, before the data are looked at."""
     with pytest.raises(UnknownOption, match=r"no setting of .* is named 'alhpa'") as caught:
-        run(DATA, alhpa=1)
-    assert caught.value.choices == tuple(DECLARED[name])
+        learn(name, DATA, alhpa=1)
+    assert set(DEFAULTS.get(name, ())) <= set(caught.value.choices)
 
 
 @pytest.mark.parametrize(
@@ -41,12 +39,12 @@ def test_settings_are_checked(name: str) -> None:
     [
         ("pc", {"alpha": 1.5}, "alpha of 'pc' cannot be 1.5; it can be: a number between 0 and 1"),
         ("pc", {"alpha": True}, "between 0 and 1"),
-        ("pc", {"depth": -1}, "a whole number from 0 on or None for no limit"),
+        ("pc", {"depth": -1}, "any whole number from 0 on"),
         ("pc", {"stable": 1}, "a yes or no"),
         ("ges", {"penalty": 0}, "a number above 0"),
-        ("grasp", {"depth": None}, "a whole number from 1 on"),
+        ("grasp", {"depth": None}, "any whole number from 1 on"),
         ("gies", {"phases": ["sideways"]}, "a list of forward, backward, turning"),
-        ("pcmci+", {"tau_max": 0}, "a whole number from 1 on"),
+        ("pcmci+", {"tau_max": 0}, "any whole number from 1 on"),
     ],
 )
 def test_values_of_settings_are_checked(name: str, settings: dict[str, Any], said: str) -> None:
@@ -62,7 +60,7 @@ def test_settings_are_used_and_noted() -> None:
     found = learn("gies", DATA, penalty=1000.0, phases=["forward"])
     assert not found.edges.any()
     assert found.settings == {"penalty": 1000.0, "phases": ["forward"], "iterate": True}
-    assert Found.from_dict(found.as_dict()).settings == found.settings
+    assert EstimatedGraph.from_dict(found.as_dict()).settings == found.settings
 
 
 @pytest.mark.parametrize("each", OTHERS, ids=lambda each: each.name)
@@ -89,9 +87,9 @@ def test_the_document_lists_them() -> None:
     """``docs/learners.md`` has a row for each, with all its settings and their defaults."""
     text = (Path(__file__).parents[2] / "docs" / "learners.md").read_text()
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
-    assert set(DECLARED) <= set(rows)
-    assert set(DECLARED) <= set(learners())
-    for name, declared in DECLARED.items():
-        for setting, what in declared.items():
-            default = list(what.default) if isinstance(what.default, tuple) else what.default
+    assert set(DEFAULTS) <= set(rows)
+    assert set(DEFAULTS) <= set(learners())
+    for name, settings in DEFAULTS.items():
+        for setting, value in settings.items():
+            default = list(value) if isinstance(value, tuple) else value
             assert f"`{setting}` {default}" in rows[name], (name, setting)

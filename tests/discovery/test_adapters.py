@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data.dataset import Dataset
-from scm_world.discovery.learners import Found, learn
-from scm_world.discovery.learners.adapters import causal_learn, gies, tigramite
-from scm_world.discovery.learners.adapters.gain import likelihood_gain
-from scm_world.discovery.learners.others import OTHERS
+from scm_world.discovery.learners import EstimatedGraph, learn, libraries
+from scm_world.discovery.learners.known import OTHERS
 from scm_world.errors import ModelError
 
 MODULES = {"causal-learn": "causallearn", "gies": "gies", "tigramite": "tigramite"}
@@ -72,13 +70,13 @@ def series(episodes: int = 15, steps: int = 40, seed: int = 0) -> Dataset:
     return Dataset.of(rows, ["k", "x", "y", "z", "w"], episode=episode, step=step)
 
 
-def edges(found: Found) -> set[tuple[str, str, int]]:
+def edges(found: EstimatedGraph) -> set[tuple[str, str, int]]:
     """Give all edges; those without direction both ways."""
     names = found.names
     return {(names[i], names[j], lag) for lag, i, j in np.argwhere(found.edges).tolist()}
 
 
-def told(found: Found, *words: str) -> bool:
+def told(found: EstimatedGraph, *words: str) -> bool:
     """Tell whether some note holds all these words."""
     return any(all(word in note for word in words) for note in found.notes)
 
@@ -100,7 +98,7 @@ def test_a_chain_has_no_direction_without_interventions(static: str) -> None:
     found = learn(static, chains(None, None, None))
     assert set(found.undirected) == {("x", "y"), ("y", "z")}
     assert found.directed == ()
-    np.testing.assert_array_equal(found.sureness, found.sureness.transpose(0, 2, 1))
+    np.testing.assert_array_equal(found.edge_scores, found.edge_scores.transpose(0, 2, 1))
 
 
 def test_interventions_direct_a_chain() -> None:
@@ -109,7 +107,7 @@ def test_interventions_direct_a_chain() -> None:
     data = chains(None, "x", "y", "z")
     found = learn("gies", data)
     assert found.directed == (("x", "y", 0), ("y", "z", 0))
-    parts, targets = gies.environments(data)
+    parts, targets = libraries.environments(data)
     graph, _ = package.fit_bic(parts, targets)
     np.testing.assert_array_equal(found.edges[0], graph != 0)
 
@@ -120,7 +118,7 @@ def test_surer_edges_explain_more() -> None:
     effect = 2.0 * draw[0] + 0.2 * draw[1] + draw[2]
     data = Dataset.of(np.stack([draw[0], draw[1], effect], axis=1), ["strong", "weak", "effect"])
     graph = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]], dtype=bool)
-    gain = likelihood_gain(data, graph)
+    gain = libraries.likelihood_gain(data, graph)
     assert gain[0, 2] > gain[1, 2] > 0.0
     assert (gain[~graph] == 0.0).all()
     for kept, left in ((0, 1), (1, 0)):  # the same by two regressions
@@ -145,14 +143,14 @@ def test_time_is_used() -> None:
         ("w", "z", 0),
     }
     at = found.names.index
-    assert found.sureness[1, at("x"), at("y")] > 10.0
-    assert found.sureness[0, at("z"), at("y")] == 0.0
+    assert found.edge_scores[1, at("x"), at("y")] > 10.0
+    assert found.edge_scores[0, at("z"), at("y")] == 0.0
 
 
 def test_rows_that_do_not_follow_one_another_are_cut() -> None:
     """A gap in time begins another run, and so does another episode."""
     data = Dataset.of(np.arange(5.0)[:, None], ["x"], episode=[0, 0, 0, 1, 1], step=[0, 1, 3, 0, 1])
-    assert [part[:, 0].tolist() for part in tigramite.runs(data)] == [[0, 1], [2], [3, 4]]
+    assert [part[:, 0].tolist() for part in libraries.runs(data)] == [[0, 1], [2], [3, 4]]
 
 
 def test_the_past_comes_first(static: str) -> None:
@@ -185,7 +183,7 @@ def test_pc_knows_the_past() -> None:
 )
 def test_end_marks(marks: tuple[int, int], expected: str) -> None:
     """-->, ---, <->, o->, o-o and no edge of causal-learn."""
-    found = causal_learn.edges_of([[0, marks[0]], [marks[1], 0]])
+    found = libraries.edges_of_marks([[0, marks[0]], [marks[1], 0]])
     assert found.tolist() == [[False, expected != ""], [expected == "-", False]]
 
 
@@ -196,7 +194,7 @@ def test_end_marks(marks: tuple[int, int], expected: str) -> None:
 def test_links(words: str, expected: str) -> None:
     """All links within the instant that tigramite knows."""
     there, back = words.split()
-    found = tigramite.edges_of([[[""], [there]], [[back], [""]]])
+    found = libraries.edges_of_links([[[""], [there]], [[back], [""]]])
     assert found.tolist() == [[[False, True], [expected == "-", False]]]
 
 
@@ -211,7 +209,7 @@ def test_the_same_seed_gives_the_same(name: str) -> None:
     before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002 # must not change
     found = [learn(name, data, seed=5) for _ in range(2)]
     assert found[0].edges.tobytes() == found[1].edges.tobytes()
-    assert found[0].sureness.tobytes() == found[1].sureness.tobytes()
+    assert found[0].edge_scores.tobytes() == found[1].edge_scores.tobytes()
     assert (random.getstate(), np.random.get_state()[1].tolist()) == before  # noqa: NPY002
 
 

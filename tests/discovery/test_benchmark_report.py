@@ -17,14 +17,14 @@ from scm_world.discovery.benchmark_report import (
     COLUMNS,
     STANDARDISED,
     VERDICTS,
-    Row,
     Spread,
+    SummaryRow,
     compare,
     report,
     summary,
 )
-from scm_world.discovery.benchmarks import Run
-from scm_world.discovery.learners import Found
+from scm_world.discovery.benchmarks import BenchmarkRun
+from scm_world.discovery.learners import EstimatedGraph
 from scm_world.discovery.problems import GroundTruth
 from scm_world.errors import ModelError
 from scm_world.output.canvas import PALETTE
@@ -45,12 +45,12 @@ def folder(result: BenchmarkResult, tmp_path_factory: pytest.TempPathFactory) ->
     return place
 
 
-def of(*runs: Run) -> BenchmarkResult:
+def of(*runs: BenchmarkRun) -> BenchmarkResult:
     """Make a result on the chain."""
     return BenchmarkResult({"chain": CHAIN}, runs)
 
 
-def row(result: BenchmarkResult, learner: str, budget: int) -> Row:
+def row(result: BenchmarkResult, learner: str, budget: int) -> SummaryRow:
     """Find a row of the chain."""
     rows = summary(result)["chain"]
     return next(r for r in rows if (r.run.learner, r.run.budget) == (learner, budget))
@@ -133,7 +133,7 @@ def test_the_markdown_marks_best_and_missing(folder: Path) -> None:
     assert "## &lt;script>alert(1)&lt;/script>" in text
 
 
-@pytest.mark.parametrize(("problems", "learners"), [(1, 1), (12, 12)])
+@pytest.mark.parametrize(("problems", "learners"), [(1, 1), (5, 12)])
 def test_the_budget_picture_shows_every_learner(
     problems: int, learners: int, tmp_path: Path
 ) -> None:
@@ -151,9 +151,11 @@ def test_the_budget_picture_shows_every_learner(
         assert (np.abs(picture - rgb).max(axis=-1) < 0.02).sum() > 20
 
 
-def shown(truth: GroundTruth, found: Found) -> str:
+def shown(truth: GroundTruth, found: EstimatedGraph) -> str:
     """Write the report of one run."""
-    run = Run(problem=truth.name, learner="mine", data="paired", budget=9, seed=0, found=found)
+    run = BenchmarkRun(
+        problem=truth.name, learner="mine", data="paired", budget=9, seed=0, found=found
+    )
     return report(BenchmarkResult({truth.name: truth}, (run,)))
 
 
@@ -162,11 +164,14 @@ def shown(truth: GroundTruth, found: Found) -> str:
 
 def verdicts(found: list[EdgeKey], truth: GroundTruth = CHAIN) -> dict[EdgeKey, str]:
     """Compare some edges with a truth."""
-    return {link[:3]: link.verdict for link in compare(truth, Found.of_edges(truth.names, found))}
+    return {
+        link[:3]: link.verdict
+        for link in compare(truth, EstimatedGraph.of_edges(truth.names, found))
+    }
 
 
 def test_every_kind_of_edge_has_its_verdict() -> None:
-    """Found, missed, too much, turned around, without direction, and not scored."""
+    """EstimatedGraph, missed, too much, turned around, without direction, and not scored."""
     edges: list[EdgeKey] = [
         ("a", "b", 0),
         ("c", "b", 0),
@@ -196,7 +201,7 @@ def test_time_is_never_turned_around() -> None:
 def test_an_extra_edge_without_direction_is_one_edge() -> None:
     """It stands in both fields of the matrix."""
     truth = GroundTruth(name="t", names=("x", "y"), edges=())
-    found = Found.of_edges(["x", "y"], [("x", "y", 0), ("y", "x", 0)])
+    found = EstimatedGraph.of_edges(["x", "y"], [("x", "y", 0), ("y", "x", 0)])
     (link,) = compare(truth, found)
     assert (link.verdict, link.directed, link.words) == ("extra", False, "x — y")
     assert shown(truth, found).count('<td title="x — y: extra"><b class="extra">+</b>') == 2
@@ -210,7 +215,7 @@ def test_verdicts_differ_without_color() -> None:
 def test_a_matrix_has_the_lags() -> None:
     """Beside the sign, in the row of the cause and the column of the effect."""
     truth = GroundTruth(name="t", names=("x", "y"), edges=(("x", "y", 0), ("x", "y", 2)))
-    found = Found.of_edges(["x", "y"], [("x", "y", 0), ("y", "y", 1)])
+    found = EstimatedGraph.of_edges(["x", "y"], [("x", "y", 0), ("y", "y", 1)])
     graph = shown(truth, found).partition('<table class="graph">')[2]
     first, second = graph.partition("<tbody>")[2].split("</tr>")[:2]
     assert '<b class="correct">●</b><b class="missing">−2</b>' in first
@@ -315,7 +320,7 @@ def test_nothing_finished_is_written_as_well(
 ) -> None:
     """Without a finished run, without a run and without a problem there is a report."""
     runs = [
-        Run(problem=truth.name, learner="pc", data="observational", budget=9, seed=0,
+        BenchmarkRun(problem=truth.name, learner="pc", data="observational", budget=9, seed=0,
             status="failed", message="<b>no</b>")
         for truth in truths[:count]
     ]  # fmt: skip

@@ -19,7 +19,7 @@ import pytest
 import user_learners
 
 from scm_world.discovery import BenchmarkResult, TaskView, benchmark
-from scm_world.discovery.benchmarks import Run, run_path
+from scm_world.discovery.benchmarks import BenchmarkRun, run_path
 from scm_world.discovery.problems import problem, random_model
 from scm_world.errors import (
     ActionError,
@@ -61,9 +61,9 @@ def files(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in (folder / "runs").rglob("*.json")}
 
 
-def by_learner(result: BenchmarkResult) -> dict[str, list[Run]]:
+def by_learner(result: BenchmarkResult) -> dict[str, list[BenchmarkRun]]:
     """Sort the runs by learner."""
-    found: dict[str, list[Run]] = {}
+    found: dict[str, list[BenchmarkRun]] = {}
     for run in result.runs:
         found.setdefault(run.learner.removeprefix("user_learners:"), []).append(run)
     return found

@@ -12,14 +12,17 @@ import pytest
 
 from scm_world.discovery.learners.bodies import (
     bodies_of,
+    episodes_of,
     learn_local,
-    lived,
+    learn_null,
     local_edges,
     local_steps,
+    null_edges,
+    null_effects,
     reached_over,
+    without,
 )
-from scm_world.discovery.learners.found import Found
-from scm_world.discovery.learners.nulls import learn_null, null_edges, null_effects, without
+from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.queries import At, Episode, World
 from scm_world.queries.local import LocalEpisode, LocalGraph
@@ -77,7 +80,7 @@ def local(*steps: list[tuple[str, str]]) -> LocalEpisode:
     return LocalEpisode(tuple(LocalGraph(t, tuple("abc"), tuple(e)) for t, e in enumerate(steps)))
 
 
-def pairs(found: Found) -> set[tuple[str, str]]:
+def pairs(found: EstimatedGraph) -> set[tuple[str, str]]:
     """Give the edges without their lag."""
     assert not found.undirected
     return {(cause, effect) for cause, effect, _ in found.directed}
@@ -92,7 +95,7 @@ def test_blocks_on_one_another_act_on_each_other_in_every_step(engine: str) -> N
     episode = world_of(engine).rollout(None, steps=5, do=STACKED)
     found = local_edges(episode)
     assert pairs(found) == {(ONE, TWO), (TWO, ONE)}
-    assert found.sureness.max() == 1.0
+    assert found.edge_scores.max() == 1.0
     assert found.experiments == 5
     assert found.names == (*FINGERS, ONE, TWO)
     assert pairs(local_edges(episode, truth=True)) == pairs(found)
@@ -115,7 +118,7 @@ def test_the_local_graphs_of_an_episode_are_exact() -> None:
     assert [graph.index for graph in graphs] == [0, 1, 2, 3]
     assert [bool(graph.edges) for graph in graphs] == [False, False, True, True]
     shares = local_edges(world_of("mujoco").rollout(None, steps=4, do=late))
-    assert shares.sureness.max() == 0.5
+    assert shares.edge_scores.max() == 0.5
 
 
 def test_chained_edges_are_the_paths_through_time() -> None:
@@ -156,7 +159,7 @@ def test_who_holds_another_one_up_is_missed(engine: str) -> None:
     assert pairs(found) == set(effects)
     at = found.names.index
     wanted = np.log10(1.0 + report.changes[ONE, TWO] / report.threshold)
-    assert found.sureness[1, at(ONE), at(TWO)] == wanted
+    assert found.edge_scores[1, at(ONE), at(TWO)] == wanted
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -216,11 +219,11 @@ def test_results_are_those_of_the_seed_and_survive_being_written() -> None:
     """Several episodes are taken together."""
     world, given = world_of("mujoco"), {"steps": 10, "budget": 80, "do": DRAWN}
     one, other = (learn_null(world, seed=2, **given) for _ in range(2))
-    np.testing.assert_array_equal(one.sureness, other.sureness)
-    again = Found.from_dict(one.as_dict())
+    np.testing.assert_array_equal(one.edge_scores, other.edge_scores)
+    again = EstimatedGraph.from_dict(one.as_dict())
     np.testing.assert_array_equal(again.edges, one.edges)
-    episodes = lived(world, seed=2, episodes=2, steps=10, do=DRAWN)
-    np.testing.assert_array_equal(null_edges(episodes).sureness, one.sureness)
+    episodes = episodes_of(world, seed=2, episodes=2, steps=10, do=DRAWN)
+    np.testing.assert_array_equal(null_edges(episodes).edge_scores, one.edge_scores)
 
 
 def test_what_has_no_bodies_is_refused() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from itertools import combinations, permutations
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.design import (
-    Design,
+    ExperimentPlan,
     adaptive_search,
     answer_from_dag,
     bisect,
@@ -26,8 +25,7 @@ from scm_world.discovery.design import (
     separating_system,
     verifying_set,
 )
-from scm_world.discovery.design.search import clique_separator
-from scm_world.discovery.design.separating import Kind
+from scm_world.discovery.design.plans import Kind, clique_separator
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.equivalence import chain_components, cpdag, essential_graph, random_dag
 
@@ -87,20 +85,16 @@ def test_no_fewer_experiments_separate(kind: Kind, n: int, size: int | None) -> 
         if size is not None and (rows.sum(axis=1) > size).any():
             continue
         targets = tuple(tuple(np.flatnonzero(row).tolist()) for row in rows)
-        assert not separates(Design(kind, n, targets, 0), kind)
+        assert not separates(ExperimentPlan(kind, n, targets, 0), kind)
 
 
-def test_designs_are_told_and_kept() -> None:
-    """A design names its targets, survives JSON, and refuses what it is not."""
+def test_plans_name_their_targets() -> None:
+    """A plan names its targets, and refuses what it cannot be."""
     design = separating_system(5, max_size=2)
-    assert Design.from_dict(json.loads(json.dumps(design.as_dict()))) == design
     assert design.named("abcde")[0] == tuple("abcde"[i] for i in design.targets[0])
-    assert design.matrix.shape == (design.used, 5)
     assert "on 5 variables, at least" in str(design)
     with pytest.raises(ModelError, match="5 variables was given 2 names"):
         design.named(["x", "y"])
-    with pytest.raises(ModelError, match="not a design"):
-        Design.from_dict({})
     with pytest.raises(UnknownOption, match="unordered"):
         separating_system(5, "unorderd")  # type: ignore[arg-type] # the point
     with pytest.raises(ModelError, match="max_size"):
@@ -110,7 +104,7 @@ def test_designs_are_told_and_kept() -> None:
 # --- verifying --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(30))
 def test_verifying_sets_are_the_smallest(seed: int) -> None:
     """A verifying set directs every edge, and no smaller set of variables does."""
     rng = np.random.default_rng(seed)
@@ -129,7 +123,7 @@ def test_verifying_known_families() -> None:
     assert verifying_set(np.eye(9, k=1, dtype=bool)).used == 1
     collider = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]], bool)
     assert verifying_set(collider).targets == ()
-    assert not is_verified_by(np.eye(2, k=1, dtype=bool), Design("none", 2, (), 0))
+    assert not is_verified_by(np.eye(2, k=1, dtype=bool), ExperimentPlan("none", 2, (), 0))
     with pytest.raises(ModelError, match="ring"):
         bounds.forest_cover(np.roll(np.eye(3, dtype=bool), 1, axis=1))
 
@@ -137,7 +131,7 @@ def test_verifying_known_families() -> None:
 # --- searching --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(20))
 def test_search_finds_the_graph(seed: int) -> None:
     """The graph is found, with at least nu and at most 3 nu log2(n) experiments, none twice."""
     rng = np.random.default_rng(seed)
@@ -174,7 +168,6 @@ def test_search_lives_with_bad_answers() -> None:
     wrong = adaptive_search(cpdag(path), collider)
     assert wrong.contradictions
     assert not (wrong.graph & ~cpdag(path)).any()
-    assert json.loads(json.dumps(wrong.as_dict()))["targets"] == list(wrong.targets)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -255,15 +248,6 @@ def test_several_culprits() -> None:
 
 def test_bounds() -> None:
     """The bounds take the values of the literature."""
-    assert [bounds.single_target(n) for n in (0, 1, 2, 20)] == [0, 0, 1, 19]
-    assert [bounds.multi_target(n) for n in (1, 2, 3, 4, 20, 64)] == [0, 1, 2, 3, 5, 7]
-    assert bounds.paired_single_target(20) == 20
-    assert [bounds.given_essential_graph(~np.eye(n, dtype=bool)) for n in (1, 2, 5, 8)] == [
-        0,
-        1,
-        3,
-        3,
-    ]
     assert [bounds.pooled(*case) for case in [(20, 4), (50, 4), (100, 2), (100, 4), (200, 4)]] == [
         13,
         18,
@@ -272,8 +256,5 @@ def test_bounds() -> None:
         26,
     ]
     assert bounds.verification(np.triu(np.ones((9, 9), bool), 1), max_size=3) == 2
-    ring = np.roll(np.eye(4, dtype=bool), 1, axis=1)
-    with pytest.raises(ModelError, match="no essential graph"):
-        bounds.given_essential_graph(ring | ring.T)
     with pytest.raises(ModelError, match="degree"):
         bounds.pooled(3, 4)

@@ -13,18 +13,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.learners import Found, Learner, learn, learner, learners, register
-from scm_world.discovery.learners.order import normal_scores, regression_tail
+from scm_world.discovery.learners import EstimatedGraph, Learner, learn, learner, learners, register
+from scm_world.discovery.learners.do_order import normal_scores, regression_tail
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 NAMES = ("x", "y", "z")
 TABLE = Dataset.of(np.arange(12.0).reshape(4, 3), NAMES)
 
 
-def chain() -> Found:
+def chain() -> EstimatedGraph:
     """Make a graph with an edge of each kind."""
     edges = [("x", "y", 0), ("y", "z", 0), ("z", "y", 0), ("x", "x", 1)]
-    return Found.of_edges(NAMES, edges, learner="mine", notes=("a note",), experiments=7, bound=3)
+    return EstimatedGraph.of_edges(
+        NAMES, edges, learner="mine", notes=("a note",), experiments=7, bound=3
+    )
 
 
 # --- graphs ---------------------------------------------------------------------------------------
@@ -39,7 +41,7 @@ def test_directions_are_told_apart() -> None:
 def test_a_graph_comes_back_from_json() -> None:
     """Everything that is said about it is written."""
     there = json.loads(json.dumps(chain().as_dict()))
-    again = Found.from_dict(there)
+    again = EstimatedGraph.from_dict(there)
     assert again.as_dict() == chain().as_dict()
     assert (again.directed, again.notes, again.bound) == (chain().directed, ("a note",), 3)
 
@@ -52,24 +54,24 @@ def test_a_graph_comes_back_from_json() -> None:
         {"edges": [[0, 1]]},
         {"lags": "many"},
         {"names": ["x"]},
-        {"sureness": [[3, 0, 1, 0.5]]},
+        {"edge_scores": [[3, 0, 1, 0.5]]},
     ],
 )
 def test_what_is_no_graph_is_not_read(change: dict[str, Any]) -> None:
     """Another format, or an edge that leads nowhere, is refused."""
     with pytest.raises(ModelError, match="not a graph that a learner found"):
-        Found.from_dict({**chain().as_dict(), **change})
+        EstimatedGraph.from_dict({**chain().as_dict(), **change})
     with pytest.raises(ModelError, match="not a graph"):
-        Found.from_dict({})
+        EstimatedGraph.from_dict({})
 
 
 @pytest.mark.parametrize(
-    "change", [{"edges": [[-1, 0, 1]]}, {"edges": [[0, -2, 1]]}, {"sureness": [[0, 0, -1, 0.5]]}]
+    "change", [{"edges": [[-1, 0, 1]]}, {"edges": [[0, -2, 1]]}, {"edge_scores": [[0, 0, -1, 0.5]]}]
 )
 def test_negative_places_are_not_read(change: dict[str, Any]) -> None:
     """An index from the end would be another edge than the one written."""
     with pytest.raises(ModelError, match="not a graph"):
-        Found.from_dict({**chain().as_dict(), **change})
+        EstimatedGraph.from_dict({**chain().as_dict(), **change})
 
 
 def test_the_part_on_some_variables_keeps_its_edges() -> None:
@@ -84,14 +86,14 @@ def test_the_part_on_some_variables_keeps_its_edges() -> None:
 def test_matrices_of_another_shape_are_refused() -> None:
     """The message has both shapes."""
     with pytest.raises(ModelError, match=r"shape \(1, 2, 2\), not \(3, 3\)"):
-        Found.of(NAMES, np.zeros((2, 2)))
+        EstimatedGraph.of(NAMES, np.zeros((2, 2)))
     with pytest.raises(ModelError, match="of 3 variables"):
-        Found(NAMES, np.zeros((1, 2, 2), bool), np.zeros((1, 2, 2)))
+        EstimatedGraph(NAMES, np.zeros((1, 2, 2), bool), np.zeros((1, 2, 2)))
 
 
 def test_chosen_lags_have_their_places() -> None:
     """A matrix may speak of one lag only."""
-    found = Found.of(["x", "y"], [[[0, 1], [0, 0]]], lags=[2])
+    found = EstimatedGraph.of(["x", "y"], [[[0, 1], [0, 0]]], lags=[2])
     assert found.directed == (("x", "y", 2),)
     assert found.edges.shape == (3, 2, 2)
 
@@ -136,12 +138,12 @@ def test_a_plain_matrix_is_a_graph() -> None:
     found = learn(mine, TABLE, seed=3, by=2)
     assert found.directed == (("x", "y", 0), ("y", "z", 0))
     assert (found.learner, found.settings, found.experiments) == ("mine", {"by": 2}, 4)
-    assert found.sureness[0, 0, 1] == 2.0
+    assert found.edge_scores[0, 0, 1] == 2.0
     with pytest.raises(ModelError, match="has shape"):
         learn(Learner("bad", lambda data, seed: np.zeros((2, 2))), TABLE)
     with pytest.raises(ModelError, match="learns from a Dataset, not from object"):
         learn(Learner("bad", lambda data, seed: np.zeros((3, 3))), object())
-    with pytest.raises(ModelError, match="has to give a Found"):
+    with pytest.raises(ModelError, match="has to give an EstimatedGraph"):
         learn(Learner("bad", lambda data, seed: np.zeros((2, 2)), ("paired",)), object())
 
 
@@ -197,7 +199,7 @@ def test_normal_scores_are_those_of_blom() -> None:
     ("matrix", "reason"),
     [
         (np.array([[0.0, np.nan], [0.0, 0.0]]), "not finite"),
-        (Found.of_edges(["a", "b"], [("a", "b", 0)]), "which is not in the data"),
+        (EstimatedGraph.of_edges(["a", "b"], [("a", "b", 0)]), "which is not in the data"),
     ],
     ids=["nan", "names"],
 )
@@ -210,4 +212,4 @@ def test_what_is_no_graph_of_the_data_is_refused(matrix: Any, reason: str) -> No
 def test_sureness_is_not_turned_around() -> None:
     """Log-probabilities are refused: their absolute value would rank them backwards."""
     with pytest.raises(ModelError, match="negative"):
-        Found.of(["x", "y"], [[0, 1], [0, 0]], sureness=[[0.0, -0.1], [0.0, 0.0]])
+        EstimatedGraph.of(["x", "y"], [[0, 1], [0, 0]], edge_scores=[[0.0, -0.1], [0.0, 0.0]])

@@ -3,7 +3,7 @@
 import pytest
 
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.learners import Found, Learner, learners
+from scm_world.discovery.learners import EstimatedGraph, Learner, learners
 from scm_world.testing.learner import LearnerConformance
 
 GIVEN = sorted(
@@ -30,9 +30,9 @@ def test_there_are_learners() -> None:
     assert {"do_order", "do_order_ranks", "gies", "pc"} <= set(GIVEN)
 
 
-def lazy(data: Dataset, *, seed: int = 0) -> Found:
+def lazy(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     """Find nothing."""
-    return Found.of_edges(data.names, [])
+    return EstimatedGraph.of_edges(data.names, [])
 
 
 def test_the_suite_can_fail() -> None:

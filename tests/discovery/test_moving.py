@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scm_world._types import Floats
-from scm_world.discovery.learners import Found, learn
+from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.learners.moving import sparse_pooled
 from scm_world.discovery.learners.simulators import SCMSimulator
 from scm_world.discovery.problems import random_model
@@ -18,7 +18,7 @@ from scm_world.graph import SCM
 from scm_world.variables import Box, Derived, Exogenous, Function, Linear, Measured, Parent
 from scm_world.variables.distributions import Normal
 
-FAMILIES = ("er2:20", "sf2:20", "tanh4:20")
+FAMILIES = ("er2:12", "sf2:12", "tanh4:12")
 Edges = set[tuple[str, str, int]]
 
 
@@ -27,7 +27,7 @@ def true_edges(scm: SCM) -> Edges:
     return {edge.key for edge in scm.edges}
 
 
-def wrong(found: Found, scm: SCM) -> int:
+def wrong(found: EstimatedGraph, scm: SCM) -> int:
     """Count missing and false edges."""
     return len(set(found.directed) ^ true_edges(scm))
 
@@ -78,13 +78,13 @@ def first_of(first: Any, vector: Any) -> Any:
 def test_one_variable_at_a_time_finds_the_graph(family: str, seed: int) -> None:
     """Four units are enough; what is spent is counted, and twice the budget changes nothing."""
     scm = random_model(family, seed)
-    found = learn("paired", SCMSimulator(scm, seed), budget=88)
+    found = learn("paired", SCMSimulator(scm, seed), budget=56)
     assert wrong(found, scm) == 0
-    assert 66 <= found.experiments <= 88
+    assert 42 <= found.experiments <= 56
     assert "floor 0," in found.notes[0]
     assert found.bound is not None
     assert found.bound <= found.experiments
-    assert wrong(learn("paired", SCMSimulator(scm, seed), budget=176), scm) == 0
+    assert wrong(learn("paired", SCMSimulator(scm, seed), budget=112), scm) == 0
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -99,7 +99,7 @@ def test_moving_all_at_once_finds_the_graph(family: str, seed: int) -> None:
     assert found.notes == ()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_hundred_variables_need_forty_experiments(seed: int) -> None:
     """Pooled, the graph of 100 variables is exact; by color six experiments confirm it."""
     scm = random_model("tanh4:100", seed)
@@ -115,11 +115,11 @@ def test_a_hundred_variables_need_forty_experiments(seed: int) -> None:
 
 
 def test_the_weights_are_found() -> None:
-    """The sureness of a pooled edge is its absolute weight."""
+    """The edge_scores of a pooled edge is its absolute weight."""
     scm = lines(x={}, y={"x": -2.0}, z={"x": 0.5, "y": 1.0})
     found = learn("pooled", SCMSimulator(scm), budget=20)
     expected = [[0.0, 2.0, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
-    np.testing.assert_allclose(found.sureness[0], expected, rtol=1e-6)
+    np.testing.assert_allclose(found.edge_scores[0], expected, rtol=1e-6)
 
 
 # --- a declared graph -----------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def test_the_weights_are_found() -> None:
 def test_a_dropped_edge_is_found(family: str) -> None:
     """Whichever edge is left out of the declaration, it cannot hide behind declared ones."""
     scm = random_model(family, 1)
-    for edge in sorted(true_edges(scm))[::3]:
+    for edge in sorted(true_edges(scm))[::4]:
         simulator = Counted(SCMSimulator(scm, 1))
         found = learn("coloring", simulator, declared=true_edges(scm) - {edge})
         assert wrong(found, scm) == 0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.discovery.learners import Found, learn
+from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.problems import (
     FAMILIES,
     Problem,
@@ -40,7 +40,7 @@ def first_of(v: Any, noise: Any = 0.0) -> Any:
     return v[..., 0] + noise
 
 
-def wrong(found: Found, made: Problem) -> tuple[set[Any], set[Any]]:
+def wrong(found: EstimatedGraph, made: Problem) -> tuple[set[Any], set[Any]]:
     """List false and missing edges."""
     edges, known = set(found.directed), set(made.truth.edges)
     return edges - known, known - edges

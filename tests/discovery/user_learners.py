@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.learners import Found
+from scm_world.discovery.learners import EstimatedGraph
 from scm_world.errors import ModelError
 
 MARK = "SCM_WORLD_TEST_MARK"
@@ -73,9 +73,9 @@ def leaves(data: Dataset, *, seed: int = 0) -> Any:
     raise SystemExit(4)
 
 
-def unwritable(data: Dataset, *, seed: int = 0) -> Found:
+def unwritable(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     """Find nothing, with a setting that no file can hold."""
-    return Found.of_edges(data.names, [], settings={"what": print})
+    return EstimatedGraph.of_edges(data.names, [], settings={"what": print})
 
 
 def infinite(data: Dataset, *, seed: int = 0) -> Any:

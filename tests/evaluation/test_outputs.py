@@ -28,10 +28,8 @@ from scm_world.evaluation.outputs import (
     save,
     write_report,
 )
-from scm_world.evaluation.outputs.comparisons import Pairs, best
 from scm_world.evaluation.outputs.figures import SURE
-from scm_world.evaluation.outputs.labels import lines_of, metric_words
-from scm_world.evaluation.outputs.style import looks_of
+from scm_world.evaluation.outputs.labels import Pairs, best, lines_of, looks_of, metric_words
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval
 

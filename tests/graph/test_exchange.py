@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scm_world.errors import MissingExtra, ModelError, UnknownOption, UnreadableFile
-from scm_world.graph import SCM, Edge, two_slice
+from scm_world.graph import SCM, Edge, unrolled
 from scm_world.graph import exchange as ex
 from scm_world.graph.exchange import CausalGraph, Node, causal_graph, read_graph, write_graph
 from scm_world.graph.exchange.html import CHAR, PAD, lay_out
@@ -249,7 +249,7 @@ def test_names_in_slices_can_be_inverted(name: str, ago: int, held: bool) -> Non
 
 
 def test_two_slices_are_those_of_the_model() -> None:
-    """The nodes and edges are those of ``scm_world.graph.two_slice``."""
+    """The nodes and edges are those of ``scm_world.graph.unrolled``."""
     model = SCM(
         [
             Exogenous(name="gain"),
@@ -261,7 +261,7 @@ def test_two_slices_are_those_of_the_model() -> None:
     def plain_name(node: tuple[str, int]) -> str:
         return str(ex.Slice(node[0], -node[1], node[0] == "gain" and node[1] < 0))
 
-    expected = nx.relabel_nodes(two_slice(model), {n: plain_name(n) for n in two_slice(model)})
+    expected = nx.relabel_nodes(unrolled(model, 2), {n: plain_name(n) for n in unrolled(model, 2)})
     found = ex.to_dowhy(model)
     assert set(found.nodes) == set(expected.nodes)
     assert set(found.edges) == set(expected.edges)

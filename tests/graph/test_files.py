@@ -7,7 +7,6 @@ import math
 import sys
 from typing import Any
 
-import networkx as nx
 import numpy as np
 import pytest
 
@@ -16,11 +15,9 @@ from scm_world.graph import (
     SCM,
     from_dict,
     from_json,
-    from_networkx,
     to_dict,
     to_dot,
     to_json,
-    to_networkx,
 )
 from scm_world.tasks import TASKS
 from scm_world.variables import (
@@ -154,7 +151,7 @@ def test_a_lambda_cannot_be_written() -> None:
             Derived(name="c", parents=("a",), mechanism=Function(local)),
         ]
     )
-    for write in (to_json, to_dict, to_networkx):
+    for write in (to_json, to_dict):
         with pytest.raises(ModelError, match="define it at the top level of a module") as caught:
             write(lost)
         assert len(caught.value.problems) == 2
@@ -183,22 +180,6 @@ def test_what_is_no_model_is_refused(text: str) -> None:
     """Broken files give one kind of error."""
     with pytest.raises(ModelError):
         from_json(text)
-
-
-@pytest.mark.parametrize("held", [{}, HELD], ids=["declared", "intervened"])
-def test_networkx_loses_nothing(held: dict[str, Any]) -> None:
-    """The summary graph carries the declarations, and is read back equal."""
-    first = model().do(held)
-    graph = to_networkx(first)
-    assert isinstance(graph, nx.DiGraph)
-    assert from_networkx(graph, trusted=(HERE,)) == first
-    assert set(graph.edges) == {(e.cause, e.effect) for e in first.edges}
-
-
-def test_a_graph_of_other_origin_is_no_model() -> None:
-    """Nodes without declarations cannot become variables."""
-    with pytest.raises(ModelError, match="node 'x' has no declaration"):
-        from_networkx(nx.DiGraph([("x", "y")]))
 
 
 def test_dot_shows_kinds_units_lags_and_conditions() -> None:

@@ -48,7 +48,7 @@ def test_solve_needs_what_the_model_does_not_compute() -> None:
 
 def test_a_draw_needs_a_moment() -> None:
     """Without one there is no noise to draw from."""
-    with pytest.raises(ModelError, match="moment"):
+    with pytest.raises(ModelError, match="noise key"):
         small().do({"weight": Draw(Normal())}).solve()
 
 

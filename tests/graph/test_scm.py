@@ -22,7 +22,7 @@ from scm_world.errors import (
     WrongShape,
     WrongType,
 )
-from scm_world.graph import SCM, Edge, Moment, flatten
+from scm_world.graph import SCM, Edge, NoiseKey, flatten
 from scm_world.variables import (
     Affine,
     Box,
@@ -196,7 +196,7 @@ def test_coordinates_set_the_quantity_itself() -> None:
 def test_soft_interventions_in_coordinates_happen_there(act: Any, expected: float | None) -> None:
     """Twice 1.5 is 3, which is 2 in the other coordinates."""
     model = small().do({"friction_plus": act})
-    value = model.solve(moment=Moment(Noise(0)), known={"friction": np.asarray(0.5)})["friction"]
+    value = model.solve(key=NoiseKey(Noise(0)), known={"friction": np.asarray(0.5)})["friction"]
     if expected is None:
         assert 0.2 <= value <= 0.4
     else:

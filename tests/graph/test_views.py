@@ -6,7 +6,7 @@ import networkx as nx
 import pytest
 
 from scm_world.errors import UnknownVariable
-from scm_world.graph import SCM, contemporaneous, d_separated, summary, two_slice, unrolled
+from scm_world.graph import SCM, d_separated, unrolled
 from scm_world.variables import Derived, Exogenous, Linear, Measured, Normal, Parent
 
 
@@ -95,18 +95,9 @@ def conditional() -> SCM:
     )
 
 
-def test_the_summary_has_one_edge_per_pair() -> None:
-    """It says with which lags, and under which conditions."""
-    view = summary(conditional())
-    assert view.edges["size", "pose"] == {"lags": (0, 1), "when": "contact or set"}
-    assert view.edges["pose", "pose"] == {"lags": (1,), "when": None}
-    assert view.nodes["size"] == {"kind": "exogenous", "unit": "m", "role": "parameter"}
-    assert view.nodes["pose"]["role"] == "state"
-
-
 def test_two_slices_are_a_directed_acyclic_graph() -> None:
     """Edges within an instant appear twice, lagged ones once; parameters persist."""
-    view = two_slice(conditional())
+    view = unrolled(conditional(), 2)
     assert nx.is_directed_acyclic_graph(view)
     assert set(view.edges) == {
         (("size", -1), ("half", -1)),
@@ -123,15 +114,14 @@ def test_two_slices_are_a_directed_acyclic_graph() -> None:
 
 
 def test_the_graph_of_an_instant_has_no_lagged_edges() -> None:
-    """Only what acts at once is drawn, and it has no cycle."""
-    view = contemporaneous(conditional())
-    assert nx.is_directed_acyclic_graph(view)
-    assert set(view.edges) == {("size", "half"), ("size", "pose"), ("pose", "far")}
-
-
-def test_views_of_a_mutilated_model_are_mutilated() -> None:
-    """What do has cut is not drawn."""
-    assert ("size", "half") not in summary(conditional().do({"half": 0.1})).edges
+    """Only what acts at once is in it; edges that do has cut are not."""
+    assert {(c, e) for (c, _), (e, _) in unrolled(conditional(), 1).edges} == {
+        ("size", "half"),
+        ("size", "pose"),
+        ("pose", "far"),
+    }
+    cut = unrolled(conditional().do({"half": 0.1}), 1)
+    assert (("size", 0), ("half", 0)) not in cut.edges
 
 
 def test_a_common_past_connects_the_previous_slice() -> None:

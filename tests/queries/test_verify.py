@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from scm_world.cli import app
 from scm_world.cli.tasks import build
 from scm_world.cli.verification import SMALL
-from scm_world.discovery.coverage import draw_verification
+from scm_world.discovery.plots import draw_verification
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.agreement import Agreement, Sign
 from scm_world.queries.verification import Verification

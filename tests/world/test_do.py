@@ -224,7 +224,7 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
     for name in settable(shared(backend, task)):
         world = begin(backend, task)
         request = {name: other(world, name)}
-        key = world.moment(world.index)
+        key = world.noise_key(world.index)
         plan = plan_intervention(world.structures, world._step_base(), request, None, key)
         told = world._present().difference(plan)
         then = plan.compiled.describe(plan.static, plan.state)

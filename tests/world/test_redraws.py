@@ -54,7 +54,7 @@ def test_another_attempt_is_the_same_with_and_without_the_one_before(
     last: InterventionPlan | None = None
     seen = set()
     for attempt in range(6):
-        key = replace(world.moment(base.index), attempt=attempt, kept=kept)
+        key = replace(world.noise_key(base.index), attempt=attempt, kept=kept)
         fresh = plan_intervention(world.structures, base, request_, None, key)
         again = plan_intervention(world.structures, base, request_, None, key, last)
         assert fresh.compiled is again.compiled

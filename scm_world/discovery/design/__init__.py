@@ -1,33 +1,28 @@
 """Which experiments to do, and how few can do."""
 
 from scm_world.discovery.design import bounds
-from scm_world.discovery.design.moving import (
+from scm_world.discovery.design.plans import (
+    AdaptiveSearch,
+    ExperimentPlan,
+    adaptive_search,
+    answer_from_dag,
     bisect,
     coloring,
     culprit,
     culprits,
+    is_verified_by,
     pooled,
     pooled_experiments,
-)
-from scm_world.discovery.design.plan import Design
-from scm_world.discovery.design.search import (
-    Answer,
-    Search,
-    adaptive_search,
-    answer_from_dag,
-    answer_from_model,
-    is_verified_by,
+    separates,
+    separating_system,
     verifying_set,
 )
-from scm_world.discovery.design.separating import separates, separating_system
 
 __all__ = [
-    "Answer",
-    "Design",
-    "Search",
+    "AdaptiveSearch",
+    "ExperimentPlan",
     "adaptive_search",
     "answer_from_dag",
-    "answer_from_model",
     "bisect",
     "bounds",
     "coloring",

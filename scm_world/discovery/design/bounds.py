@@ -8,97 +8,22 @@ from __future__ import annotations
 import math
 from itertools import count
 
-import networkx as nx
 import numpy as np
 
 from scm_world.errors import ModelError
 from scm_world.graph.equivalence import Bools, covered_edges
 
 
-def single_target(n: int) -> int:
-    """Find any acyclic graph by setting one variable at a time, in the worst case.
-
-    Source:
-        Eberhardt, Glymour and Scheines, *N-1 experiments suffice to determine the causal relations
-        among N variables*, 2006.
-
-    Example:
-        >>> single_target(20)
-        19
-    """
-    return max(n - 1, 0)
-
-
-def multi_target(n: int) -> int:
-    """Find any acyclic graph by setting several variables at once, in the worst case.
-
-    Source:
-        Eberhardt, Glymour and Scheines, *On the number of experiments sufficient and in the worst
-        case necessary to identify all causal relations among N variables*, UAI 2005, for n > 2.
-
-    Example:
-        >>> multi_target(20)
-        5
-    """
-    return n.bit_length() if n > 2 else single_target(n)
-
-
-def paired_single_target(n: int) -> int:
-    """Find any graph of one step by setting one variable at a time with the same noise.
-
-    Edges lead from one instant to the next, so there may be cycles and every column is a cause of
-    its own.
-
-    Example:
-        >>> paired_single_target(20)
-        20
-    """
-    return n
-
-
-def given_essential_graph(graph: Bools) -> int:
-    """Direct an essential graph by setting several variables at once, in the worst case.
-
-    Args:
-        graph: Edges with and without direction, shape (p, p).
-
-    Raises:
-        ModelError: Its undirected part is not chordal, so it is no essential graph.
-
-    Source:
-        Eberhardt, *Almost optimal intervention sets for causal discovery*, UAI 2008, as a
-        conjecture; Hauser and Bühlmann, *Two optimal strategies for active learning of causal
-        models from interventional data*, IJAR 2014: ceil(log2 of the clique number).
-
-    Example:
-        >>> given_essential_graph(~np.eye(5, dtype=bool))
-        3
-    """
-    free = nx.from_numpy_array((graph & graph.T).astype(int))
-    if not nx.is_chordal(free):
-        raise ModelError(["the undirected edges have a ring without a chord: no essential graph"])
-    largest = max((len(clique) for clique in nx.chordal_graph_cliques(free)), default=1)
-    return math.ceil(math.log2(largest))
-
-
 def unordered_separating(n: int, max_size: int | None = None) -> int:
-    """Set exactly one of any two variables in some experiment.
+    """Set exactly one of any two variables in some experiment, of at most ``max_size`` each.
 
     Each variable needs its own set of experiments. The n smallest such sets must not take more
-    places than there are: ``max_size`` per experiment.
-
-    Args:
-        n: Number of variables.
-        max_size: Most variables that one experiment sets; any number if None.
+    places than there are.
 
     Source:
         Katona, *On separating systems of a finite set*, Journal of Combinatorial Theory 1966;
         Shanmugam, Kocaoglu, Dimakis and Vishwanath, *Learning causal graphs with small
         interventions*, NeurIPS 2015.
-
-    Example:
-        >>> unordered_separating(20), unordered_separating(20, max_size=3)
-        (5, 10)
     """
     size = _size(n, max_size)
     return next(m for m in count() if 2**m >= n and _least_places(n, m) <= m * size)
@@ -119,26 +44,23 @@ def ordered_separating(n: int, max_size: int | None = None) -> int:
     This is needed without faithfulness, with unobserved causes or with cycles. No set of
     experiments of a variable may contain that of another: ``C(m, m // 2) >= n``.
 
-    Args:
-        n: Number of variables.
-        max_size: Most variables that one experiment sets; any number if None.
-
     Source:
         Spencer, *Minimal completely separating systems*, Journal of Combinatorial Theory 1970;
         Hyttinen, Eberhardt and Hoyer, *Experiment selection for causal discovery*, JMLR 2013. With
         ``max_size``: the inequality of Lubell, Yamamoto and Meshalkin, in which 1 / C(m, w) is
         convex in the size w, at the largest mean size that has room.
-
-    Example:
-        >>> [ordered_separating(n) for n in (14, 20, 38, 50, 64, 100, 128, 200)]
-        [6, 6, 8, 8, 8, 9, 10, 10]
-        >>> ordered_separating(20, max_size=4)
-        9
     """
     size = _size(n, max_size)
     if n < 2:
         return 0
     return next(m for m in count(2) if _has_room(n, m, size))
+
+
+def _size(n: int, max_size: int | None) -> int:
+    if n < 0 or (max_size is not None and max_size < 1):
+        given = f"n={n}, max_size={max_size}"
+        raise ModelError([f"n has to be 0 or more, max_size 1 or more; got {given}"])
+    return n if max_size is None else min(max_size, n)
 
 
 def _has_room(n: int, m: int, size: int) -> bool:
@@ -149,19 +71,8 @@ def _has_room(n: int, m: int, size: int) -> bool:
     return n * share <= 1.0 + 1e-9
 
 
-def _size(n: int, max_size: int | None) -> int:
-    if n < 0 or (max_size is not None and max_size < 1):
-        given = f"n={n}, max_size={max_size}"
-        raise ModelError([f"n has to be 0 or more, max_size 1 or more; got {given}"])
-    return n if max_size is None else min(max_size, n)
-
-
 def verification(dag: Bools, max_size: int = 1) -> int:
-    """Confirm a claimed graph, given its essential graph.
-
-    Args:
-        dag: The claim, acyclic, shape (p, p).
-        max_size: Most variables that one experiment sets.
+    """Confirm a claimed graph, shape (p, p), given its essential graph.
 
     Returns:
         The size of the least vertex cover of the covered edges, called nu, over ``max_size``.
@@ -169,27 +80,17 @@ def verification(dag: Bools, max_size: int = 1) -> int:
     Source:
         Choo, Shiragur and Bhattacharyya, *Verification and search algorithms for causal DAGs*,
         NeurIPS 2022, arXiv 2206.15374, theorems 11 and 12.
-
-    Example:
-        >>> chain = np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)
-        >>> verification(chain)
-        1
     """
     return math.ceil(len(forest_cover(covered_edges(dag))) / max_size)
 
 
 def forest_cover(edges: Bools) -> tuple[int, ...]:
-    """Find the fewest nodes that touch every edge of a forest.
+    """Return the fewest nodes that touch every edge of a forest.
 
     The only neighbor of a leaf can always be taken: it touches what the leaf does, and more.
 
     Raises:
         ModelError: The edges have a ring.
-
-    Example:
-        >>> star = np.array([[0, 1, 1], [0, 0, 0], [0, 0, 0]], bool)
-        >>> forest_cover(star)
-        (0,)
     """
     left = edges | edges.T
     cover = []
@@ -214,10 +115,6 @@ def pooled(n: int, degree: int) -> int:
     Source:
         Du and Hwang, *Combinatorial group testing and its applications*, 2000, chapter 1: each
         answer halves the possible sets at best.
-
-    Example:
-        >>> pooled(20, 4), pooled(100, 4)
-        (13, 22)
     """
     if not 0 <= degree <= n:
         raise ModelError([f"degree has to be 0 to n; got n={n}, degree={degree}"])
@@ -227,8 +124,7 @@ def pooled(n: int, degree: int) -> int:
 def coloring(parents: Bools) -> int:
     """Move all causes such that no effect has two of its declared causes moved at once.
 
-    Args:
-        parents: Causes by effects, shape (p, q).
+    ``parents`` are causes by effects, shape (p, q).
 
     Source:
         Curtis, Powell and Reid, *On the estimation of sparse Jacobian matrices*, IMA Journal of
@@ -239,17 +135,3 @@ def coloring(parents: Bools) -> int:
         2
     """
     return int(parents.sum(axis=0).max(initial=0))
-
-
-__all__ = [
-    "coloring",
-    "forest_cover",
-    "given_essential_graph",
-    "multi_target",
-    "ordered_separating",
-    "paired_single_target",
-    "pooled",
-    "single_target",
-    "unordered_separating",
-    "verification",
-]

@@ -13,21 +13,20 @@ from scm_world._types import Floats
 from scm_world.errors import ModelError
 from scm_world.queries.experiments.effects import EdgeKey
 
-FORMAT = "scm_world/found/1"
+FORMAT = "scm_world/found/2"
 Bools = NDArray[np.bool_]
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Found:
-    """A graph over variables, possibly with earlier instants and with undirected edges.
+class EstimatedGraph:
+    """An estimated graph over variables, possibly with earlier instants and undirected edges.
 
     Attributes:
         names: Of the p variables.
         edges: Shape (lags + 1, p, p): ``edges[lag, i, j]`` says that i acts on j that many control
             steps later. Both ``edges[0, i, j]`` and ``edges[0, j, i]``: the edge has no direction.
-        sureness: Same shape: the larger, the surer the learner is of the edge; only the order of
-            the numbers means something. 0 or 1 where it does not say.
+        edge_scores: Score of each edge, same shape: only the order of the numbers means something.
         learner: Name of the learner.
         settings: Of the learner.
         experiments: How many episodes or control steps it used: rows of data, or experiments.
@@ -39,7 +38,7 @@ class Found:
 
     names: tuple[str, ...]
     edges: Bools
-    sureness: Floats
+    edge_scores: Floats
     learner: str = ""
     settings: dict[str, Any] = field(default_factory=dict)
     experiments: int = 0
@@ -51,9 +50,9 @@ class Found:
     def __post_init__(self) -> None:
         """Check the shapes."""
         p = len(self.names)
-        if self.edges.shape != self.sureness.shape or self.edges.shape[1:] != (p, p):
-            shapes = f"{self.edges.shape} and {self.sureness.shape}"
-            raise ModelError([f"edges and sureness have shapes {shapes}, of {p} variables"])
+        if self.edges.shape != self.edge_scores.shape or self.edges.shape[1:] != (p, p):
+            shapes = f"{self.edges.shape} and {self.edge_scores.shape}"
+            raise ModelError([f"edges and edge_scores have shapes {shapes}, of {p} variables"])
 
     @classmethod
     def of(
@@ -61,25 +60,25 @@ class Found:
         names: Sequence[str],
         matrix: Any,
         *,
-        sureness: Any = None,
+        edge_scores: Any = None,
         lags: Iterable[int] | None = None,
         **others: Any,
-    ) -> Found:
+    ) -> EstimatedGraph:
         """Make one from matrices.
 
         Args:
             names: Of the p variables.
             matrix: Shape (p, p) for lag 0, or (lags + 1, p, p); not zero at [i, j] where i acts on
                 j. An edge in both directions within an instant has none.
-            sureness: Same shape, not negative; the absolute values of the matrix if None.
-            lags: Which lags a matrix of shape (k, p, p) speaks of; 0 to k - 1 if None.
+            edge_scores: Same shape, not negative; the absolute values of the matrix if None.
+            lags: Which lags a matrix of shape (k, p, p) is about; 0 to k - 1 if None.
             others: Further attributes.
 
         Raises:
             ModelError: The shapes do not fit together, or a number is not finite, or negative.
 
         Example:
-            >>> found = Found.of(["x", "y", "z"], [[0, 1, 0], [0, 0, 1], [0, 1, 0]])
+            >>> found = EstimatedGraph.of(["x", "y", "z"], [[0, 1, 0], [0, 0, 1], [0, 1, 0]])
             >>> found.directed, found.undirected
             ((('x', 'y', 0),), (('y', 'z'),))
         """
@@ -88,11 +87,15 @@ class Found:
         if given.ndim != 3 or given.shape[1:] != (len(names), len(names)):
             what = f"a graph of {len(names)} variables has shape {given.shape}"
             raise ModelError([what + f", not ({len(names)}, {len(names)})"])
-        weight = np.abs(given) if sureness is None else np.array(sureness).reshape(given.shape)
+        weight = (
+            np.abs(given) if edge_scores is None else np.array(edge_scores).reshape(given.shape)
+        )
         if not np.isfinite(given).all() or not np.isfinite(weight).all():
             raise ModelError(["a graph has numbers that are not finite; put 0 where is no edge"])
         if (weight < 0).any():
-            raise ModelError(["sureness is negative; of a log-probability give the negative one"])
+            raise ModelError(
+                ["an edge score is negative; of a log-probability give the negative one"]
+            )
         if lags is not None:
             at = list(lags)
             wide = np.zeros((max(at) + 1, *given.shape[1:]))
@@ -104,8 +107,10 @@ class Found:
         return cls(tuple(names), edges, weight.astype(np.float64), **others)
 
     @classmethod
-    def of_edges(cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: Any) -> Found:
-        """Make one from a list of directed edges."""
+    def of_edges(
+        cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: Any
+    ) -> EstimatedGraph:
+        """Make one from directed edges."""
         keys = list(edges)
         at = {name: i for i, name in enumerate(names)}
         matrix = np.zeros((1 + max((lag for *_, lag in keys), default=0), len(at), len(at)))
@@ -128,34 +133,34 @@ class Found:
         both = np.triu(self.edges[0] & self.edges[0].T)
         return tuple((self.names[i], self.names[j]) for i, j in np.argwhere(both).tolist())
 
-    def told(self, **others: Any) -> Found:
-        """Say more about it."""
+    def told(self, **others: Any) -> EstimatedGraph:
+        """Return it with other attributes."""
         return replace(self, **others)
 
-    def restricted(self, names: Sequence[str]) -> Found:
-        """Take the part on some variables, in their order; variables it lacks have no edges."""
+    def restricted(self, names: Sequence[str]) -> EstimatedGraph:
+        """Return the part on some variables; those that it lacks have no edges."""
         at = {name: i for i, name in enumerate(self.names)}
         kept = [name for name in names if name in at]
         new = [names.index(name) for name in kept]
         old = [at[name] for name in kept]
         shape = (len(self.edges), len(names), len(names))
-        edges, sureness = np.zeros(shape, bool), np.zeros(shape)
+        edges, edge_scores = np.zeros(shape, bool), np.zeros(shape)
         for lag in range(shape[0]):
             edges[lag][np.ix_(new, new)] = self.edges[lag][np.ix_(old, old)]
-            sureness[lag][np.ix_(new, new)] = self.sureness[lag][np.ix_(old, old)]
-        return replace(self, names=tuple(names), edges=edges, sureness=sureness)
+            edge_scores[lag][np.ix_(new, new)] = self.edge_scores[lag][np.ix_(old, old)]
+        return replace(self, names=tuple(names), edges=edges, edge_scores=edge_scores)
 
     # --- files --------------------------------------------------------------------------------
 
     def as_dict(self) -> dict[str, Any]:
-        """Write it as plain data."""
-        sure = np.argwhere(self.sureness > 0.0).tolist()
+        """Return it as plain data."""
+        sure = np.argwhere(self.edge_scores > 0.0).tolist()
         return {
             "format": FORMAT,
             "names": list(self.names),
             "lags": len(self.edges) - 1,
             "edges": np.argwhere(self.edges).tolist(),
-            "sureness": [[lag, i, j, float(self.sureness[lag, i, j])] for lag, i, j in sure],
+            "edge_scores": [[lag, i, j, float(self.edge_scores[lag, i, j])] for lag, i, j in sure],
             "learner": self.learner,
             "settings": self.settings,
             "experiments": self.experiments,
@@ -166,7 +171,7 @@ class Found:
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Found:
+    def from_dict(cls, data: Mapping[str, Any]) -> EstimatedGraph:
         """Read what ``as_dict`` wrote.
 
         Raises:
@@ -177,18 +182,18 @@ class Found:
                 raise ValueError(f"expected the format {FORMAT!r}, got {data['format']!r}")
             names = tuple(map(str, data["names"]))
             edges = np.zeros((int(data["lags"]) + 1, len(names), len(names)), bool)
-            sureness = np.zeros(edges.shape)
-            places = [*data["edges"], *(place[:3] for place in data["sureness"])]
+            edge_scores = np.zeros(edges.shape)
+            places = [*data["edges"], *(place[:3] for place in data["edge_scores"])]
             if any(number < 0 for place in places for number in place):
                 raise ValueError("an edge has a negative number")
             for lag, i, j in data["edges"]:
                 edges[lag, i, j] = True
-            for lag, i, j, size in data["sureness"]:
-                sureness[lag, i, j] = size
+            for lag, i, j, size in data["edge_scores"]:
+                edge_scores[lag, i, j] = size
             return cls(
                 names,
                 edges,
-                sureness,
+                edge_scores,
                 learner=str(data["learner"]),
                 settings=dict(data["settings"]),
                 experiments=int(data["experiments"]),

@@ -9,19 +9,18 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Bools
-from scm_world.discovery.design import bounds, coloring, culprits, pooled
-from scm_world.discovery.learners.found import Found
+from scm_world.discovery.design import coloring, culprits, pooled
+from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.simulators import SMALL, MultiTargetSimulator, PairedSimulator
 from scm_world.errors import ModelError
 from scm_world.queries.experiments.effects import EdgeKey
 
 TOLERANCE = 1e-4  # of the answers: what a linear account may leave, since moves are small
-CONFIRMED = 6  # experiments in a row that have to come out as foretold; 3 err in 1 of 200 runs
+CONFIRMED = 6  # experiments in a row that have to come out as predicted; 3 err in 1 of 200 runs
 ROUNDING = 1e-9  # of the size of the answers, in the size of the moves
 
 
-def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> Found:
+def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> EstimatedGraph:
     """Find a graph by moving one variable at a time, in paired experiments.
 
     Args:
@@ -30,8 +29,7 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
         budget: How many experiments there are.
 
     Returns:
-        A graph over the variables; ``sureness`` is the largest effect of each edge over the
-        threshold, in powers of ten.
+        A graph; ``edge_scores`` are the largest effects over the threshold, in powers of ten.
     """
     del seed
     whole_number("budget", budget, least=1)
@@ -43,12 +41,12 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
     for (cause, effect, lag), largest in effects.largest.items():
         size[lag, at[cause], at[effect]] = largest
     ratio = size / effects.threshold
-    return Found.of(
+    return EstimatedGraph.of(
         names,
         ratio > 1.0,
-        sureness=np.log10(1.0 + ratio),
+        edge_scores=np.log10(1.0 + ratio),
         experiments=effects.rollouts,
-        bound=bounds.paired_single_target(len(names)),
+        bound=len(names),  # each is a cause of its own; edges between instants may form cycles
         notes=(f"floor {effects.floor:g}, threshold {effects.threshold:g}",),
     )
 
@@ -58,21 +56,21 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
 
 def sparse_pooled(
     simulator: MultiTargetSimulator, *, seed: int = 0, budget: int = 200, unit: int = 0
-) -> Found:
+) -> EstimatedGraph:
     """Find a graph with few causes each by moving all variables at once, at random.
 
-    Every experiment moves each variable a little up or down. What answers is a weighted sum of
-    the moves of its causes; few causes are found from few sums. Experiments are added until some
-    in a row come out as foretold.
+    Every experiment moves each variable a little up or down. An answer is a weighted sum of the
+    moves of its causes; few causes are found from few sums. Experiments are added until some in a
+    row come out as predicted.
 
     Args:
         simulator: Does the experiments.
         seed: Of the moves.
         budget: How many experiments there are at most.
-        unit: Which unit lives again and again.
+        unit: Which unit is run again and again.
 
     Returns:
-        A graph; ``sureness`` is the absolute weight. Answers that the budget did not explain have
+        A graph; ``edge_scores`` are absolute weights. Answers that the budget did not explain have
         no causes, and a note says so.
 
     Source:
@@ -92,25 +90,32 @@ def sparse_pooled(
     for count in range(1, most + 1):
         moves = dict(zip(simulator.causes, SMALL * signs[count - 1], strict=True))
         answers = np.vstack([answers, simulator.answers(moves) / SMALL])
-        open_ |= np.abs(signs[count - 1] @ weights - answers[-1]) > _allowed(answers)
+        allowed = TOLERANCE * np.abs(answers).max(axis=0) + ROUNDING
+        open_ |= np.abs(signs[count - 1] @ weights - answers[-1]) > allowed
         settled = 0 if open_.any() else settled + 1
-        _explain(signs[:count], answers, weights, open_)
+        for j in np.flatnonzero(open_).tolist():
+            found = _pursued(signs[:count], answers[:, j])
+            if found is not None:
+                weights[:, j], open_[j] = found, False
         if settled >= CONFIRMED:
             break
-    return _pooled_found(simulator, weights, open_)
-
-
-def _allowed(answers: Floats) -> Floats:
-    """Say by how much each answer may differ from what was foretold."""
-    return np.asarray(TOLERANCE * np.abs(answers).max(axis=0) + ROUNDING)
-
-
-def _explain(signs: Floats, answers: Floats, weights: Floats, open_: Bools) -> None:
-    """Explain what is not explained yet, in place."""
-    for j in np.flatnonzero(open_).tolist():
-        found = _pursued(signs, answers[:, j])
-        if found is not None:
-            weights[:, j], open_[j] = found, False
+    names = simulator.names
+    cause = [names.index(name) for name in simulator.causes]
+    effect = [names.index(name) for name in simulator.watched]
+    matrix = np.zeros((simulator.lag + 1, len(names), len(names)))
+    matrix[simulator.lag][np.ix_(cause, effect)] = weights
+    degree = max(1, int((weights != 0).sum(axis=0).max(initial=0)))
+    left = [name for name, is_open in zip(simulator.watched, open_, strict=True) if is_open]
+    notes = simulator.notes
+    if left:
+        notes += (f"not explained within the budget: {', '.join(left)}",)
+    return EstimatedGraph.of(
+        names,
+        matrix,
+        experiments=simulator.used,
+        bound=2 * degree,  # numbers that fix so few weights and their places, in principle
+        notes=notes,
+    )
 
 
 def _pursued(signs: Floats, answer: Floats) -> Floats | None:
@@ -134,26 +139,6 @@ def _pursued(signs: Floats, answer: Floats) -> Floats | None:
     return None
 
 
-def _pooled_found(simulator: MultiTargetSimulator, weights: Floats, open_: Bools) -> Found:
-    names = simulator.names
-    cause = [names.index(name) for name in simulator.causes]
-    effect = [names.index(name) for name in simulator.watched]
-    matrix = np.zeros((simulator.lag + 1, len(names), len(names)))
-    matrix[simulator.lag][np.ix_(cause, effect)] = weights
-    degree = max(1, int((weights != 0).sum(axis=0).max(initial=0)))
-    left = [name for name, is_open in zip(simulator.watched, open_, strict=True) if is_open]
-    notes = simulator.notes
-    if left:
-        notes += (f"not explained within the budget: {', '.join(left)}",)
-    return Found.of(
-        names,
-        matrix,
-        experiments=simulator.used,
-        bound=2 * degree,  # numbers that fix so few weights and their places, in principle
-        notes=notes,
-    )
-
-
 # --- verification -------------------------------------------------------------------------------
 
 
@@ -165,22 +150,22 @@ def verified(
     budget: int = 1000,
     units: int = 4,
     thorough: bool = True,
-) -> Found:
+) -> EstimatedGraph:
     """Check a declared graph by moving all causes of one color at once.
 
     No effect has two declared causes of one color. So an effect that answers has the one declared
-    cause in the color, or one that is not declared, which is looked for by halves. A cause that is
-    not declared may hide behind a declared one, in the colors of every order. So in the end all
+    cause in the color, or one that is not declared, which bisection finds. A cause that is not
+    declared may hide behind a declared one, in the colors of every order. So in the end all
     variables are moved together but those that the most effects are declared to have, until no
-    pair is left that was never looked at.
+    pair is left unseen.
 
     Args:
         simulator: Does the experiments.
         declared: Edges: cause, effect, lag; those of the simulator's lag are checked.
         seed: Of the orders and of the moves.
-        budget: How many experiments there are at most, but for finding culprits.
+        budget: How many experiments there are at most, but for bisections.
         units: In how many units.
-        thorough: Whether pairs that hid behind declared causes are looked at, too.
+        thorough: Whether pairs that hide behind declared causes are tested, too.
 
     Returns:
         The edges that showed. An edge counts as seen where its effect answered to the color.
@@ -197,13 +182,15 @@ def verified(
             break
         simulator.prepare(unit)
         order = [simulator.causes[i] for i in rng.permutation(len(simulator.causes))]
-        classes = _classes(order, simulator.watched, account.known)
+        parents = np.array([[(c, e) in account.known for e in simulator.watched] for c in order])
+        classes = coloring(parents).named(order)
         colors.append(len(classes))
         for together in classes:
             account.check(_moves(together, rng))
     while thorough and simulator.used < budget and (others := account.revealing()):
         account.check(_moves(others, rng))
-    made = Found.of_edges(names, [(c, e, lag) for c, e in sorted(account.found)])
+    showed = sorted(account.seen | account.intruders)
+    made = EstimatedGraph.of_edges(names, [(c, e, lag) for c, e in showed])
     degree = max((sum(e == effect for _, e in wanted) for effect in names), default=0)
     never = len(wanted - account.seen)
     notes = [
@@ -220,16 +207,8 @@ def _moves(together: Iterable[str], rng: np.random.Generator) -> dict[str, float
     return {n: float(rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 0.1)) for n in together}
 
 
-def _classes(
-    order: list[str], watched: tuple[str, ...], edges: set[tuple[str, str]]
-) -> list[tuple[str, ...]]:
-    """Color the causes in an order."""
-    parents = np.array([[(c, e) in edges for e in watched] for c in order])
-    return list(coloring(parents).named(order))
-
-
 class _Account:
-    """Which edges showed, and at which pairs nobody has looked yet.
+    """Which edges showed, and which pairs were not tested yet.
 
     Attributes:
         seen: Declared edges that showed.
@@ -251,13 +230,8 @@ class _Account:
         """Edges that are declared, or showed."""
         return self._wanted | self.intruders
 
-    @property
-    def found(self) -> set[tuple[str, str]]:
-        """Edges that showed."""
-        return self.seen | self.intruders
-
     def check(self, moves: Mapping[str, float]) -> None:
-        """Move some causes, and account for what answers."""
+        """Move some causes, and record the answers."""
         simulator = self._simulator
         here = np.array([name in moves for name in simulator.causes])
         alone = ~self._parents[here].any(axis=0)
@@ -277,7 +251,7 @@ class _Account:
                 self._parents[simulator.causes.index(cause), j] = True
 
     def revealing(self) -> tuple[str, ...]:
-        """Choose causes that, moved together, show many pairs that nobody has looked at."""
+        """Choose causes that, moved together, test many new pairs."""
         hidden = ~self.looked
         still, most = np.zeros(len(hidden), bool), 0
         for j in np.argsort(-hidden.sum(axis=0), kind="stable").tolist():

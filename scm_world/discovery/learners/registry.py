@@ -5,16 +5,15 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Literal, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world.discovery.data.dataset import Dataset, Level
-from scm_world.discovery.learners.found import Found
+from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 Source = Literal["observational", "interventional", "paired"]
@@ -28,9 +27,9 @@ class Learner:
 
     Attributes:
         name: To call it by.
-        learn: ``learn(data, seed=0, **settings)`` gives a ``Found``, or a matrix of shape (p, p)
-            over the columns of the data: not zero at [i, j] where i acts on j; both ways for an
-            edge without direction. ``data`` is a ``Dataset``, or a ``PairedSimulator`` for
+        learn: ``learn(data, seed=0, **settings)`` gives an ``EstimatedGraph``, or a matrix of shape
+            (p, p) over the columns of the data: not zero at [i, j] where i acts on j; both ways for
+            an edge without direction. ``data`` is a ``Dataset``, or a ``PairedSimulator`` for
             ``"paired"``.
         takes: The kinds of data it can use: ``"observational"``, ``"interventional"`` (known
             targets), ``"paired"`` (it does its own experiments, with the same noise).
@@ -56,19 +55,16 @@ class Learner:
 
     @property
     def version(self) -> str | None:
-        """Of the package that it needs; None if that is not installed, or if it needs none."""
+        """Version of its package; None if that is not installed, or if it needs none."""
         return _version(self.package) if self.package else None
 
     @property
     def is_installed(self) -> bool:
-        """Whether what it needs is there."""
+        """Whether its package is installed."""
         return not self.package or self.version is not None
 
 
 _KNOWN: dict[str, Learner] = {}
-
-HOMES = ("ours", "others")
-"""Modules of this package that register learners when they are imported."""
 
 
 def register(learner: Learner) -> Learner:
@@ -85,31 +81,24 @@ def register(learner: Learner) -> Learner:
 
 
 def learners() -> Mapping[str, Learner]:
-    """Give all learners that are known, by name."""
-    for home in HOMES:
-        import_module(f"{__package__}.{home}")
+    """Return all learners that are known, by name."""
+    import_module(f"{__package__}.known")
     return dict(_KNOWN)
 
 
 def learner(name: str) -> Learner:
-    """Find a learner.
+    """Find a learner by its name, or by ``"module:attribute"`` of a ``Learner`` or a function.
 
-    Args:
-        name: One that is known, or ``"module:attribute"``: a ``Learner``, or a function that is
-            taken for one that uses observational and interventional data.
+    A function is taken for one that uses observational and interventional data.
 
     Raises:
         UnknownOption: There is none.
     """
-    if ":" in name:
-        return _imported(name)
-    known = learners()
-    if name not in known:
-        raise UnknownOption("learner", name, (*known, "module:attribute"))
-    return known[name]
-
-
-def _imported(name: str) -> Learner:
+    if ":" not in name:
+        known = learners()
+        if name not in known:
+            raise UnknownOption("learner", name, (*known, "module:attribute"))
+        return known[name]
     module, _, attribute = name.partition(":")
     try:
         found = getattr(import_module(module), attribute)
@@ -125,7 +114,7 @@ def _imported(name: str) -> Learner:
 
 def learn(
     given: Learner | str, data: Any, *, seed: int = 0, level: Level = "variable", **settings: Any
-) -> Found:
+) -> EstimatedGraph:
     """Let a learner find a graph.
 
     Args:
@@ -139,23 +128,24 @@ def learn(
         settings: Of the learner.
 
     Raises:
-        UnknownOption: There is no such learner.
+        UnknownOption: There is no such learner or setting.
         MissingExtra: What it needs is not installed.
-        ModelError: It gave something that is no graph of these columns.
+        ModelError: It cannot use such data, or gave something that is no graph of these columns.
     """
     chosen = learner(given) if isinstance(given, str) else given
-    if not chosen.is_installed:
-        raise MissingExtra(chosen.package, chosen.extra)
-    _refuse_other(chosen, data)
+    known = _settings_of(chosen)
+    _check(chosen, known, settings, data)
     table = data
     if isinstance(data, Dataset) and data.is_temporal and not chosen.temporal:
         table = data.lagged()
-    if "blocks" in _settings_of(chosen):  # what is told apart has to be tested apart
+    if "blocks" in known:  # what is told apart has to be tested apart
         settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
     result = chosen.learn(table, seed=seed, **settings)
     seconds = time.perf_counter() - started
-    found = result if isinstance(result, Found) else _of_columns(chosen, table, result)
+    if not isinstance(result, EstimatedGraph) and not isinstance(table, Dataset):
+        raise ModelError([f"the learner {chosen.name!r} has to give an EstimatedGraph"])
+    found = result if isinstance(result, EstimatedGraph) else EstimatedGraph.of(table.names, result)
     if isinstance(table, Dataset):
         found = _folded(found, table, level)
     version = {chosen.package: chosen.version or ""} if chosen.package else {}
@@ -168,36 +158,35 @@ def learn(
     )
 
 
-def _refuse_other(chosen: Learner, data: Any) -> None:
-    """Refuse what a learner cannot use.
-
-    Raises:
-        ModelError: It needs data, or something to experiment on, of another kind.
-    """
+def _check(chosen: Learner, known: tuple[str, ...], settings: Iterable[str], data: Any) -> None:
+    """Refuse settings that do not exist, a missing library, and data of another kind."""
+    for name in settings:
+        if known and name not in known:
+            raise UnknownOption(f"setting of {chosen.name!r}", name, known)
+    if not chosen.is_installed:
+        raise MissingExtra(chosen.package, chosen.extra)
+    what = type(data).__name__
     if isinstance(data, Dataset):
         if chosen.takes == ("paired",):
             raise ModelError([f"{chosen.name} does its own experiments: it cannot use a Dataset"])
     elif "paired" not in chosen.takes:
-        raise ModelError([f"{chosen.name} learns from a Dataset, not from {type(data).__name__}"])
+        raise ModelError([f"{chosen.name} learns from a Dataset, not from {what}"])
     elif chosen.on == "models" and not hasattr(data, "answers"):
-        what = type(data).__name__
         raise ModelError([f"{chosen.name} moves several numbers at once, on models; not on {what}"])
 
 
 def _settings_of(chosen: Learner) -> tuple[str, ...]:
+    """Return the names of its settings; none if it takes any."""
     try:
-        return tuple(inspect.signature(chosen.learn).parameters)
+        parameters = inspect.signature(chosen.learn).parameters.values()
     except (TypeError, ValueError):  # a function that is not of Python
         return ()
+    if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
+        return ()
+    return tuple(parameter.name for parameter in parameters)[1:]
 
 
-def _of_columns(chosen: Learner, table: Any, matrix: Any) -> Found:
-    if not isinstance(table, Dataset):
-        raise ModelError([f"the learner {chosen.name!r} has to give a Found"])
-    return Found.of(table.names, matrix)
-
-
-def _folded(found: Found, table: Dataset, level: Level) -> Found:
+def _folded(found: EstimatedGraph, table: Dataset, level: Level) -> EstimatedGraph:
     """Take the columns of a variable together, and earlier columns as lags."""
     columns = {column.name: column for column in table.columns}
     unknown = [name for name in found.names if name not in columns]
@@ -212,27 +201,22 @@ def _folded(found: Found, table: Dataset, level: Level) -> Found:
     at = np.array([names.index(name) for name in base])
     lags = max(int(lag_of.max(initial=0)), len(found.edges) - 1)
     edges = np.zeros((lags + 1, len(names), len(names)), bool)
-    sureness = np.zeros(edges.shape)
+    edge_scores = np.zeros(edges.shape)
     now = np.flatnonzero(lag_of == 0)
-    found = _forward(found, lag_of)
+    # Edges within the rows that would lead into the past are turned.
+    back = lag_of[:, None] < lag_of[None, :]
+    given, sure = found.edges.copy(), found.edge_scores.copy()
+    given[0] |= (given[0] & back).T
+    sure[0] = np.maximum(sure[0], np.where(back, sure[0], 0.0).T)
     for lag, row in ((k, i) for k in range(len(found.edges)) for i in range(len(at))):
         total = lag + int(lag_of[row])
         if total > lags:
             continue
-        np.logical_or.at(edges[total, at[row]], at[now], found.edges[lag, row, now])
-        np.maximum.at(sureness[total, at[row]], at[now], found.sureness[lag, row, now])
+        np.logical_or.at(edges[total, at[row]], at[now], given[lag, row, now])
+        np.maximum.at(edge_scores[total, at[row]], at[now], sure[lag, row, now])
     np.fill_diagonal(edges[0], False)
-    np.fill_diagonal(sureness[0], 0.0)
-    return found.told(names=names, edges=edges, sureness=sureness)
-
-
-def _forward(found: Found, lag_of: NDArray[np.int64]) -> Found:
-    """Turn edges within the rows that would lead into the past."""
-    back = lag_of[:, None] < lag_of[None, :]
-    edges, sureness = found.edges.copy(), found.sureness.copy()
-    edges[0] |= (edges[0] & back).T
-    sureness[0] = np.maximum(sureness[0], np.where(back, sureness[0], 0.0).T)
-    return found.told(edges=edges, sureness=sureness)
+    np.fill_diagonal(edge_scores[0], 0.0)
+    return found.told(names=names, edges=edges, edge_scores=edge_scores)
 
 
 def _version(package: str) -> str | None:

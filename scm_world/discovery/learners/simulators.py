@@ -16,7 +16,7 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.discovery.data.recorded import first_label
 from scm_world.errors import InterventionError, ModelError
-from scm_world.graph import SCM, Moment
+from scm_world.graph import SCM, NoiseKey
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.models import paired_effects
 from scm_world.queries.experiments.paired import Paired
@@ -36,15 +36,9 @@ OTHER = 1_000_000
 
 
 class PairedSimulator(Protocol):
-    """Paired experiments on a system.
+    """Paired experiments on a system; ``names`` are all variables of its graph."""
 
-    Attributes:
-        names: Of all variables of the graph that is looked for.
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All variables of the graph that is looked for."""
+    names: tuple[str, ...]
 
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time, in one unit after another, with all others held.
@@ -56,27 +50,21 @@ class PairedSimulator(Protocol):
 
 
 class MultiTargetSimulator(PairedSimulator, Protocol):
-    """A paired simulator that can move several variables at once."""
+    """A paired simulator that can move several variables at once.
 
-    @property
-    def lag(self) -> int:
-        """How many control steps later the answers are read."""
+    Attributes:
+        lag: How many control steps later the answers are read.
+        causes: What can be moved; each is one number.
+        watched: What answers; each is one number.
+        notes: What it does not show.
+        used: How many experiments there were.
+    """
 
-    @property
-    def causes(self) -> tuple[str, ...]:
-        """What can be moved; each is one number."""
-
-    @property
-    def watched(self) -> tuple[str, ...]:
-        """What answers; each is one number."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What one should know of what it does not show."""
-
-    @property
-    def used(self) -> int:
-        """How many experiments there were."""
+    lag: int
+    causes: tuple[str, ...]
+    watched: tuple[str, ...]
+    notes: tuple[str, ...]
+    used: int
 
     def prepare(self, unit: int) -> None:
         """Run a unit as it is: one experiment."""
@@ -96,8 +84,7 @@ class MultiTargetSimulator(PairedSimulator, Protocol):
 class SCMSimulator:
     """Paired experiments in a causal model without physics, whose variables are numbers.
 
-    All others are held while some are moved: what each mechanism makes of that is the answer. So
-    answers are those of direct effects.
+    All others are held while some are moved: answers are those of direct effects.
 
     Args:
         model: All its variables can be set.
@@ -134,14 +121,14 @@ class SCMSimulator:
         still = [v.name for v in self._model.variables if v.shape or v.dtype != "real"]
         _refuse(still, "is not one real number, so it cannot be moved a little")
         noise = Noise(self._seed)
-        self._before = self._model.solve(moment=Moment(noise, unit, 0))
-        self._moment = Moment(noise, unit, 1)
-        self._now = self._model.solve(previous=self._before, moment=self._moment)
+        self._before = self._model.solve(key=NoiseKey(noise, unit, 0))
+        self._key = NoiseKey(noise, unit, 1)
+        self._now = self._model.solve(previous=self._before, key=self._key)
         self._base = self._mechanisms(self._now, self._before)
         self.used += 1
 
     def answers(self, moves: Mapping[str, float]) -> Floats:
-        """Say what every mechanism makes of a change of its causes."""
+        """Return the changes of all mechanisms; see ``MultiTargetSimulator``."""
         source = self._before if self.lag else self._now
         moved = {
             **source,
@@ -160,9 +147,9 @@ class SCMSimulator:
         return np.asarray(np.where(np.isfinite(high - low), high - low, 1.0))
 
     def _mechanisms(self, now: Values, before: Values) -> Floats:
-        """Compute what each mechanism says; 0 where there is none, whatever the value is."""
+        """Compute each mechanism; 0 where there is none, whatever the value is."""
         found = (
-            self._model.solve(now, previous=before, moment=self._moment, only=(name,))[name]
+            self._model.solve(now, previous=before, key=self._key, only=(name,))[name]
             if self._model[name].all_parents
             else 0.0
             for name in self.watched
@@ -179,12 +166,10 @@ def _refuse(names: list[str], why: str) -> None:
 class StepSimulator:
     """Paired experiments on one control step of a world, in one state after another.
 
-    They find the whole graph, with what acts within an instant: see ``discover``.
-
     Args:
         world: It is reset; its task and options stay.
         seed: Of states and values.
-        progress: Told after each state how many experiments there were, and the budget.
+        progress: Called after each state with how many experiments there were, and the budget.
     """
 
     def __init__(self, world: World, seed: int = 0, *, progress: Progress | None = None) -> None:
@@ -218,7 +203,7 @@ class EpisodeSimulator:
         outcomes: What episodes end with.
         settings: Who acts, what varies by itself, how long, and the seed: the first one for the
             first unit, and so on, in turn.
-        progress: Told after each unit how many experiments there were, and the budget.
+        progress: Called after each unit with how many experiments there were, and the budget.
     """
 
     def __init__(
@@ -253,7 +238,6 @@ class EpisodeSimulator:
         return found
 
     def _unit(self, unit: int, found: Effects) -> None:
-        """Do all experiments on one unit."""
         begin, end = self._begun(unit, {}, found), self._ended(unit, {}, found)
         for what, again in zip(end, self._ended(unit, {}, found), strict=True):
             found.floor = max(found.floor, float(np.max(np.abs(again - what), initial=0.0)))
@@ -273,7 +257,7 @@ class EpisodeSimulator:
         end: Sequence[Value],
         found: Effects,
     ) -> None:
-        """Give a cause another value, and see what follows.
+        """Give a cause another value, and record what follows.
 
         What the unit drew is set to what it drew, so that nothing is drawn anew where the other
         value makes a draw infeasible.
@@ -296,7 +280,6 @@ class EpisodeSimulator:
         return self._settings[unit % len(self._settings)]
 
     def _begun(self, unit: int, do: Mapping[str, Any], found: Effects) -> dict[str, Value]:
-        """Begin an episode, and look at what it begins with."""
         found.rollouts += 1
         short = replace(self._setting_of(unit), steps=1)
         episode = short.episode(self._twins, self._world, do, unit, self._read)
@@ -307,7 +290,6 @@ class EpisodeSimulator:
         return {self._target[name]: begin[self._target[name]] for name in names}
 
     def _ended(self, unit: int, do: Mapping[str, Any], found: Effects) -> list[Value]:
-        """Run an episode, and return what it ends with."""
         found.rollouts += 1
         names = tuple(outcome.name for outcome in self._outcomes)
         episode = self._setting_of(unit).episode(self._twins, self._world, do, unit, names)

@@ -5,8 +5,8 @@ from scm_world.evaluation.outputs.figures import (
     causes_figure,
     gap_figure,
     profile_figure,
+    radar_figure,
 )
-from scm_world.evaluation.outputs.radar import radar_figure
 from scm_world.evaluation.outputs.report import write_report
 from scm_world.evaluation.outputs.videos import record_videos
 from scm_world.output.canvas import save

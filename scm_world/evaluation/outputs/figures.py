@@ -1,4 +1,4 @@
-"""Figures of evaluations: bars, profiles, gaps between engines, causes.
+"""Figures of evaluations: bars, radars, profiles, gaps between engines, causes.
 
 Each function returns a matplotlib figure; ``save`` writes it, with the same bytes for the same
 evaluation. matplotlib is loaded when one is drawn.
@@ -12,24 +12,29 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
-from scm_world.evaluation.outputs.comparisons import (
+import numpy as np
+
+from scm_world.errors import UnknownOption
+from scm_world.evaluation.outputs.labels import (
     Comparison,
     Gaps,
+    Line,
+    Look,
+    Scores,
+    beside,
     causes_of,
     comparisons_of,
+    counted,
+    framed,
     gaps_of,
     is_flat,
-    scores_of,
-)
-from scm_world.evaluation.outputs.labels import (
-    Line,
-    counted,
     is_fraction,
     lines_of,
+    looks_of,
     metric_words,
     protocol_words,
+    scores_of,
 )
-from scm_world.evaluation.outputs.style import beside, framed, looks_of
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Cause, Causes, Interval
 from scm_world.output.canvas import INK, PALETTE, blank, styled
@@ -37,6 +42,7 @@ from scm_world.output.canvas import INK, PALETTE, blank, styled
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.projections.polar import PolarAxes
 
 ALPHA = 0.05
 """Effects with a corrected p-value up to this are marked."""
@@ -56,11 +62,7 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     """Draw the mean score in each protocol, a bar for each agent and engine.
 
     Whiskers are 95 % intervals; a bar has none if the data say nothing about it. Where an agent
-    did not act in a protocol there is a dash.
-
-    Args:
-        evaluation: Any.
-        metric: One of ``METRICS``.
+    did not act in a protocol there is a dash. ``metric`` is one of ``METRICS``.
 
     Raises:
         UnknownOption: There is no such metric.
@@ -111,10 +113,7 @@ def gap_figure(
 ) -> Figure:
     """Draw the gap between engines in each protocol, with paired 95 % intervals.
 
-    Args:
-        evaluation: On two engines or more; each pair of them gets a panel.
-        metric: One of ``METRICS``.
-        gaps: If they are known already.
+    Each pair of engines gets a panel. ``gaps`` are given if they are known already.
 
     Raises:
         UnknownOption: There is one engine only, no such metric, or an agent did not play the same
@@ -207,12 +206,7 @@ def profile_figure(
 
     For each engine one panel of profiles with their 95 % bands, and with several agents one of
     pairs. Where every agent has several training runs a score is that of a run in a protocol, else
-    that of an episode; the picture says which.
-
-    Args:
-        evaluation: In which all agents have played the same protocols.
-        metric: One of ``METRICS``.
-        found: Comparisons by engine, if they are known already.
+    that of an episode; the figure says which. ``found`` are comparisons that are known already.
 
     Raises:
         UnknownOption: There is no such metric, or agents have not played the same protocols, or one
@@ -255,7 +249,6 @@ def _profiles(ax: Axes, found: Comparison, styles: Mapping[str, Mapping[str, Any
 
 
 def _improvement(ax: Axes, found: Comparison) -> None:
-    """Draw a row for each pair of agents."""
     ax.axvline(0.5, color=INK, lw=0.9, zorder=1.5)
     ax.set_xlim(0.0, 1.0)
     ax.set_xlabel("probability that the first one scores higher")
@@ -286,14 +279,8 @@ def causes_figure(
     A bar is the share of the score's variance that a variable explains, with its 95 % interval. It
     is blue with a star if the effect is significant (Holm p at most 0.05 within the protocol). To
     its right stands how much higher the score is in the upper third of the drawn values than in the
-    lower third: ▲ if it rises, ▼ if it falls.
-
-    Args:
-        evaluation: Any.
-        agent: Who acted; need not be named if there is only one.
-        engine: Where; need not be named if there is only one.
-        metric: One of ``METRICS``.
-        found: Effects by protocol, if they are known already.
+    lower third: ▲ if it rises, ▼ if it falls. Agent and engine need not be named if there is only
+    one; ``found`` are effects by protocol that are known already.
 
     Raises:
         UnknownOption: There is no such agent, engine or metric, or it has to be named.
@@ -337,7 +324,6 @@ def causes_figure(
 
 
 def _causes(ax: Axes, causes: Sequence[Cause], rows: int, protocol: str) -> None:
-    """Draw a row for each variable."""
     ax.set_xlim(0.0, 1.0)
     ax.set_yticks(range(len(causes)), [textwrap.fill(cause.variable, 34) for cause in causes])
     ax.set_ylim(rows - 0.5, -0.5)
@@ -364,3 +350,100 @@ def _rest(found: Causes, shown: Sequence[Cause]) -> str:
         more = f", and {len(found.left_out) - 1} more" if len(found.left_out) > 1 else ""
         said.append(f"left out: {name} ({reason}){more}")
     return "; ".join(said)
+
+
+SHARED = 6  # lines in one radar; with more of them each agent has a radar of its own
+ON_RIM = 16  # protocols whose descriptions stand around a radar; those of more are listed below it
+
+
+@styled
+def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
+    """Draw the mean scores as polygons, with bands of their 95 % intervals.
+
+    Up to six lines share a radar. With more of them every agent has a radar of its own; none is
+    left out. A line is open where its agent did not act in a protocol.
+
+    Raises:
+        UnknownOption: There are fewer than three protocols, or there is no such metric.
+    """
+    from matplotlib.lines import Line2D
+
+    metric = evaluation.metric(metric)
+    words, looks = protocol_words(evaluation), looks_of(lines_of(evaluation))
+    if len(words) < 3:
+        allowed = ("three protocols or more; bars_figure draws fewer",)
+        raise UnknownOption("protocols of a radar", ", ".join(words), allowed)
+    scores = scores_of(evaluation, metric)
+    groups = {"": list(looks)}
+    if len(looks) > SHARED:
+        groups = {a: [line for line in looks if line.agent == a] for a in evaluation.agents}
+    seen = [end for one in scores.values() for end in one.ends]
+    low, high = min(seen), max(seen)
+    room = 0.05 * ((high - low) or 1.0)
+    fraction = is_fraction(metric)
+    limits = (min(0.0, low), max(1.0, high)) if fraction else (low - room, high + room)
+    note = f"Means of {counted(evaluation)}; bands are 95 % intervals."
+    labels = {p: (textwrap.wrap(p, 16), textwrap.wrap(doc, 20)) for p, doc in words.items()}
+    if len(groups) > 1 or len(words) > ON_RIM:
+        note += " " + "; ".join(f"{name}: {doc}" for name, doc in words.items() if doc)
+        labels = {p: (name, []) for p, (name, _) in labels.items()}
+    tall = max(0.18 * len(name) + 0.15 * len(doc) for name, doc in labels.values())
+    wide = 0.1 * max(len(line) for name, doc in labels.values() for line in (*name, *doc))
+    # Neighbors near the top, of which both lie to the right, lie their height below one another.
+    radius = max(2.4 if len(groups) == 1 else 1.25, tall * len(words) ** 2 / 59.0)
+    across = math.ceil(math.sqrt(len(groups)))
+    down = math.ceil(len(groups) / across)
+    beyond = tall + 0.25
+    step = (2.0 * radius + 2.0 * wide + 0.5, 2.0 * radius + 2.0 * beyond + 0.3)
+    width, height = (across - 1) * step[0] + 2.0 * radius, (down - 1) * step[1] + 2.0 * radius
+    figure = blank(width, height)
+    for number, (name, lines) in enumerate(groups.items()):
+        left, top = number % across * step[0], height - number // across * step[1]
+        place = (left / width, (top - 2 * radius) / height, 2 * radius / width, 2 * radius / height)
+        ax: Any = figure.add_axes(place, projection="polar")
+        _radar(ax, lines, scores, labels, looks, limits)
+        if name:
+            ax.set_title(textwrap.fill(name, 30), weight="bold", pad=72 * (beyond - 0.05))
+    handles = [Line2D([], [], label=look.label, **look.line) for look in looks.values()]
+    title = f"{evaluation.task}: {metric_words(metric)}"
+    return framed(figure, title, note, handles, beyond + (0.3 if len(groups) > 1 else 0.0))
+
+
+def _radar(
+    ax: PolarAxes,
+    lines: Sequence[Line],
+    scores: Scores,
+    labels: Mapping[str, tuple[list[str], list[str]]],
+    looks: Mapping[Line, Look],
+    limits: tuple[float, float],
+) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    angles = np.linspace(0.0, 2.0 * np.pi, len(labels), endpoint=False)
+    ax.set_theta_zero_location("N")
+    ax.set_theta_direction(-1)
+    ax.set_xticks(angles, [])
+    ax.set_ylim(*limits)
+    ax.set_rlabel_position(180.0 / len(angles))
+    every = MaxNLocator(5).tick_values(*limits)
+    ax.set_yticks([tick for tick in every if limits[0] < tick <= limits[1]])
+    ax.tick_params(axis="y", labelsize=7)
+    for line in lines:
+        ring = [scores.get((line, protocol)) for protocol in (*labels, next(iter(labels)))]
+        known = [one or Interval(math.nan, math.nan, math.nan, 0.0, 0) for one in ring]
+        turns, gid = [*angles, 2.0 * np.pi], f"{line.agent}|{line.engine}"
+        style = looks[line].line
+        ax.plot(turns, [one.value for one in known], gid=gid, clip_on=False, zorder=3, **style)
+        low, high = ([f(one.ends) for one in known] for f in (min, max))
+        band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {gid}"}
+        ax.fill_between(turns, low, high, **band)
+    for angle, (name, doc) in zip(angles, labels.values(), strict=True):
+        right, up = math.sin(angle), math.cos(angle)
+        align = "center" if abs(right) < 0.05 else "left" if right > 0.0 else "right"
+        below, above = 11.0 * len(doc), 13.0 * len(name)  # [points]
+        middle = 7.0 * up + 0.5 * up * (below + above) + 0.5 * (below - above)
+        for text, va, size, weight in ((name, "bottom", 10, "bold"), (doc, "top", 8, "normal")):
+            ax.annotate(
+                "\n".join(text), (angle, limits[1]), xytext=(7.0 * right, middle), va=va, ha=align,
+                textcoords="offset points", size=size, weight=weight, annotation_clip=False,
+            )  # fmt: skip

@@ -1,15 +1,33 @@
-"""What figures and tables of evaluations are labelled with."""
+"""What figures and tables of evaluations compare, and how it is labelled and drawn."""
 
 from __future__ import annotations
 
+import math
+import textwrap
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
 
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.statistics import (
+    Causes,
+    Interval,
+    Profile,
+    performance_profile,
+    probability_of_improvement,
+)
+from scm_world.output.canvas import PALETTE
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WORDS: Mapping[str, str] = {
     "last_fractional_success": "fractional success at the end",
@@ -38,15 +56,7 @@ def lines_of(evaluation: Evaluation) -> list[Line]:
 
 
 def metric_words(metric: str) -> str:
-    """Return in words what a metric is.
-
-    Raises:
-        UnknownOption: There is no such metric.
-
-    Example:
-        >>> metric_words("success")
-        'success rate'
-    """
+    """Return in words what a metric is, or raise ``UnknownOption``."""
     if metric not in METRICS:
         raise UnknownOption("metric", metric, METRICS)
     return WORDS[metric]
@@ -58,13 +68,7 @@ def is_fraction(metric: str) -> bool:
 
 
 def counted(evaluation: Evaluation) -> str:
-    """Return how many runs and episodes stand behind a number.
-
-    Example:
-        >>> from scm_world.evaluation.pipeline import evaluate
-        >>> counted(evaluate("still", "P0", n=2, backend="fake", env={"max_episode_length": 3}))
-        '2 episodes of each protocol'
-    """
+    """Return how many runs and episodes a number is of."""
     keys = ("agent", "engine", "protocol", "run")
     rows = zip(*(evaluation.columns[key].tolist() for key in keys), strict=True)
     each = Counter(rows).values()
@@ -91,3 +95,218 @@ def _varies(protocol: Mapping[str, Any]) -> str:
         text = ", ".join(varies) + (f" from {space}" if isinstance(space, str) else "")
     step = protocol.get("step") or 0
     return f"{text} after {step} steps".strip() if step else text
+
+
+HATCHES = ("", "////", "....", "xxxx", "----", "oooo")
+MARKERS = "osD^vPX*<>ph"
+DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
+PALER = (0.0, 0.6, 0.85, 0.4)  # how much white is mixed into the color, by engine
+
+
+@final
+@dataclass(frozen=True)
+class Look:
+    """How a line looks: agents differ in color, hatch and marker, engines in dashes and paleness.
+
+    Attributes:
+        label: In legends.
+        line: Arguments of a line.
+        bar: Arguments of a bar.
+    """
+
+    label: str
+    line: Mapping[str, Any]
+    bar: Mapping[str, Any]
+
+
+def looks_of(lines: Sequence[Line]) -> dict[Line, Look]:
+    """Choose how all lines of a figure look."""
+    agents = list(dict.fromkeys(line.agent for line in lines))
+    engines = list(dict.fromkeys(line.engine for line in lines))
+    found = {}
+    for line in lines:
+        a, e = agents.index(line.agent), engines.index(line.engine)
+        color, group = PALETTE[a % len(PALETTE)], a // len(PALETTE)
+        white, rgb = PALER[e % len(PALER)], [int(color[i : i + 2], 16) for i in (1, 3, 5)]
+        face = "#" + "".join(f"{round(part + (255 - part) * white):02x}" for part in rgb)
+        name = line.agent if len(engines) == 1 else f"{line.agent} on {line.engine}"
+        found[line] = Look(
+            textwrap.fill(name, 60),
+            {
+                "color": color,
+                "marker": MARKERS[a % len(MARKERS)],
+                "linestyle": DASHES[e % len(DASHES)],
+                "markersize": 5.0,
+                "linewidth": 1.5,
+            },
+            {
+                "facecolor": face,
+                "edgecolor": "white" if group and not white else color,
+                "hatch": HATCHES[group % len(HATCHES)],
+                "linewidth": 0.9,
+            },
+        )
+    return found
+
+
+def framed(
+    figure: Figure, title: str, note: str, handles: Sequence[Artist], beyond: float = 0.0
+) -> Figure:
+    """Put title and note above what is drawn, and the legend below it.
+
+    They lie beyond the edges of the figure; it is written with whatever is drawn on it.
+    ``beyond`` is how far labels reach beyond the figure [inches].
+    """
+    width, height = figure.get_size_inches()
+    above = textwrap.wrap(note, max(60, int(width * 13)))
+    top = 1.0 + (beyond + 0.1) / height
+    figure.text(0.0, top, "\n".join(above), va="bottom", size=9, linespacing=1.3)
+    head = textwrap.fill(title, max(40, int(width * 8)))
+    above_note = top + (len(above) * 0.163 + 0.08) / height
+    figure.text(0.0, above_note, head, va="bottom", size=12, weight="bold")
+    if handles:
+        longest = max(len(part) for one in handles for part in str(one.get_label()).split("\n"))
+        rows = math.ceil(len(handles) / max(1, int(width / (0.8 + 0.08 * longest))))
+        columns = math.ceil(len(handles) / rows)
+        place: Any = {"bbox_to_anchor": (0.5, -beyond / height), "loc": "upper center"}
+        figure.legend(handles=handles, ncol=columns, fontsize=9, handlelength=2.6, **place)
+    return figure
+
+
+def beside(ax: Axes, x: float, y: float, text: str, **looks: Any) -> None:
+    """Write a text to the right of a point."""
+    place: dict[str, Any] = {"xytext": (5, 0), "textcoords": "offset points", "va": "center"}
+    ax.annotate(text, (x, y), annotation_clip=False, **place, **looks)
+
+
+Scores = Mapping[tuple[Line, str], Interval]
+"""By line and protocol; a line has no entry for a protocol in which it did not act."""
+Gaps = Mapping[tuple[str, str, str, str], Interval]
+"""By one engine, the other, agent and protocol."""
+Pairs = Mapping[tuple[str, str, str, str], Interval | str]
+"""Paired differences by engine, protocol, one agent and another, or why there is none."""
+
+
+def scores_of(evaluation: Evaluation, metric: str) -> Scores:
+    """Estimate all mean scores."""
+    return {
+        (line, protocol): mine.score(protocol, metric)
+        for line in lines_of(evaluation)
+        for mine in [evaluation.only(agent=line.agent, engine=line.engine)]
+        for protocol in mine.protocols
+    }
+
+
+def differences_of(evaluation: Evaluation, metric: str) -> Pairs:
+    """Estimate all paired differences between agents."""
+    found: dict[tuple[str, str, str, str], Interval | str] = {}
+    for engine in evaluation.engines:
+        for protocol in evaluation.only(engine=engine).protocols:
+            both = evaluation.only(engine=engine, protocol=protocol)
+            for one, other in combinations(both.agents, 2):
+                key = (engine, protocol, one, other)
+                try:
+                    found[key] = both.difference(one, other, protocol, metric)
+                except UnknownOption:
+                    found[key] = "they played other episodes"
+    return found
+
+
+def best(pairs: Pairs) -> set[tuple[Line, str]]:
+    """Return who is better than every other agent in a protocol: all intervals exclude 0."""
+    every: set[tuple[Line, str]] = set()
+    beaten: set[tuple[Line, str]] = set()
+    for (engine, protocol, one, other), found in pairs.items():
+        first, second = (Line(one, engine), protocol), (Line(other, engine), protocol)
+        every |= {first, second}
+        if isinstance(found, str) or found.low <= 0.0:
+            beaten.add(first)
+        if isinstance(found, str) or found.high >= 0.0:
+            beaten.add(second)
+    return every - beaten
+
+
+def gaps_of(evaluation: Evaluation, metric: str) -> Gaps:
+    """Estimate all gaps between engines, of the agents that acted on both in a protocol.
+
+    Raises:
+        UnknownOption: There is one engine only, or an agent did not play the same episodes on both.
+    """
+    if len(evaluation.engines) < 2:
+        allowed = ("an evaluation on two engines or more, such as backend='mujoco,bullet'",)
+        raise UnknownOption("engines of a gap", ", ".join(evaluation.engines), allowed)
+    return {
+        (one, other, agent, protocol): here.gap(one, other, protocol, metric)
+        for agent in evaluation.agents
+        for protocol in evaluation.only(agent=agent).protocols
+        for here in [evaluation.only(agent=agent, protocol=protocol)]
+        for one, other in combinations(evaluation.engines, 2)
+        if {one, other} <= set(here.engines)
+    }
+
+
+def causes_of(evaluation: Evaluation, line: Line, metric: str) -> dict[str, Causes]:
+    """Estimate the effects in every protocol in which an agent acted on an engine.
+
+    Raises:
+        UnknownOption: There is no such agent or engine.
+    """
+    mine = evaluation.only(agent=line.agent, engine=line.engine)
+    return {protocol: mine.causes(protocol, metric) for protocol in mine.protocols}
+
+
+def is_flat(found: Causes) -> bool:
+    """Whether the score was the same in every episode."""
+    return bool(found.causes) and all(
+        cause.share.high == 0.0 and cause.p == 1.0 for cause in found.causes
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Comparison:
+    """Agents on an engine compared as rliable defines it.
+
+    Attributes:
+        over: ``"runs"`` if each agent has several of them, else ``"episodes"``.
+        profiles: By agent.
+        better: Probability that the first of a pair scores higher, by pair of agents.
+    """
+
+    over: str
+    profiles: Mapping[str, Profile]
+    better: Mapping[tuple[str, str], Interval]
+
+
+def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, Comparison]:
+    """Compare the agents on each engine over all protocols.
+
+    Raises:
+        UnknownOption: Agents have not played the same protocols, or one episode only.
+    """
+    return {
+        engine: _compared(evaluation.only(engine=engine), metric) for engine in evaluation.engines
+    }
+
+
+def _compared(here: Evaluation, metric: str) -> Comparison:
+    for agent in here.agents:
+        if missing := set(here.protocols) - set(here.only(agent=agent).protocols):
+            played = (f"agents that have all played {', '.join(sorted(missing))}",)
+            raise UnknownOption("agent of a comparison", agent, played)
+    scores = {agent: here.scores(metric, agent=agent) for agent in here.agents}
+    over = "runs" if all(len(one) > 1 for one in scores.values()) else "episodes"
+    units = [one.mean(axis=2) if over == "runs" else one for one in scores.values()]
+    low, high = min(one.min() for one in units), max(one.max() for one in units)
+    room = 0.02 * ((high - low) or 1.0)
+    if is_fraction(metric):
+        low, high, room = 0.0, 1.0, 0.0
+    at = np.linspace(low - room, high + room, 101)
+    return Comparison(
+        over,
+        {agent: performance_profile(one, at, over=over) for agent, one in scores.items()},
+        {
+            (one, other): probability_of_improvement(scores[one], scores[other], over=over)
+            for one, other in combinations(scores, 2)
+        },
+    )

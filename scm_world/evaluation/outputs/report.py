@@ -9,29 +9,27 @@ from urllib.parse import quote
 
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.files import summarized
-from scm_world.evaluation.outputs.comparisons import (
-    best,
-    causes_of,
-    comparisons_of,
-    differences_of,
-    gaps_of,
-    is_flat,
-)
 from scm_world.evaluation.outputs.figures import (
     ALPHA,
     bars_figure,
     causes_figure,
     gap_figure,
     profile_figure,
+    radar_figure,
 )
 from scm_world.evaluation.outputs.labels import (
     Line,
+    best,
+    causes_of,
+    comparisons_of,
     counted,
+    differences_of,
+    gaps_of,
+    is_flat,
     lines_of,
     metric_words,
     protocol_words,
 )
-from scm_world.evaluation.outputs.radar import radar_figure
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Causes, Interval
 from scm_world.output.canvas import small_png
@@ -61,7 +59,7 @@ def write_report(
     videos: Sequence[Location | str] = (),
     metric: str | None = None,
 ) -> None:
-    """Write the report: scores, figures, differences, causes, and how to check all of it.
+    """Write the report as one HTML file: scores, figures, differences, causes, how to check them.
 
     What cannot be computed, such as a gap with one engine, is left out or says why. The same
     evaluation gives the same bytes.

@@ -50,19 +50,19 @@ def record_videos(
 
     They are chosen over all runs and protocols; among equal scores the return decides, and then
     which was played first. An episode that was chosen twice is recorded once. The videos run in
-    real time, with at most 25 frames per second; what was drawn stands below the picture.
+    real time, with at most 25 frames per second; the drawn values are below the picture.
 
     Args:
         given: What was evaluated; ``checking.shard_runner_of`` makes it from an evaluation.
-        evaluation: What came out.
-        folder: Where the videos are put, under names such as ``worst-P6-episode17.mp4``; run and
-            seed stand in them if there are several, agent and engine as well.
+        evaluation: Its results.
+        folder: Where the videos are put, under names such as ``worst-P6-episode17.mp4``, with run,
+            seed, agent and engine if there are several.
         agent: Who acts; need not be named if there is only one.
         engine: Where; need not be named if there is only one.
         metric: By which episodes are chosen; one of ``METRICS``.
         which: Of best, median and worst.
         camera: Where from; if None, that of pictures for people.
-        progress: Told how many control steps are played.
+        progress: Called with how many control steps are played.
 
     Returns:
         The files, in the order of ``which``. Each is whole or absent.
@@ -112,10 +112,7 @@ def choose(
     metric: str | None = None,
     which: Sequence[str] = WHICH,
 ) -> dict[str, int]:
-    """Choose episodes of an agent on an engine.
-
-    Returns:
-        Places among the rows of the evaluation, each once.
+    """Return places of episodes among the rows of the evaluation, each once; see ``record_videos``.
 
     Raises:
         UnknownOption: There is no such agent, engine, metric or choice.
@@ -147,11 +144,7 @@ def _film(
     texts: tuple[Sequence[str], str],
     tell: Callable[[int], None],
 ) -> None:
-    """Play an episode again and write its frames.
-
-    Raises:
-        SnapshotMismatch: Something else happened, or it is none of the shard_runner.
-    """
+    """Play an episode again and write its frames, or raise ``SnapshotMismatch``."""
     from scm_world.backends.renderer import render, scene_camera
 
     row = {name: evaluation.columns[name][place].item() for name in (*KEYS, "hash")}
@@ -187,15 +180,10 @@ def _film(
 def captioned(
     frame: NDArray[np.uint8], texts: tuple[Sequence[str], str], time: str
 ) -> NDArray[np.uint8]:
-    """Return a frame with a bar of texts below it.
+    """Return a frame with a bar of texts below it, of even height and width.
 
-    Args:
-        frame: Shape (height, width, 3).
-        texts: Lines, and a longer text below them, of which seven lines are shown.
-        time: In the upper right corner of the bar.
-
-    Returns:
-        Shape (height + bar, width, 3), both even, as videos want it.
+    ``texts`` are lines, and a longer text below them, of which seven lines are shown; ``time`` is
+    in the upper right corner of the bar.
     """
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
@@ -218,7 +206,6 @@ def captioned(
 
 
 def _name(evaluation: Evaluation, place: int, word: str) -> str:
-    """Name a video; what is the same in all episodes is not in it."""
     row = {key: evaluation.columns[key][place].item() for key in KEYS}
     several = {key: len(set(evaluation.columns[key].tolist())) > 1 for key in KEYS}
     parts = [word]
@@ -231,7 +218,6 @@ def _name(evaluation: Evaluation, place: int, word: str) -> str:
 
 
 def _texts(evaluation: Evaluation, place: int, word: str, metric: str) -> tuple[list[str], str]:
-    """Return what is played and how it went, and the values that were drawn."""
     columns = evaluation.columns
     row = {key: columns[key][place].item() for key in KEYS}
     words = protocol_words(evaluation)[row["protocol"]]

@@ -1,4 +1,4 @@
-"""The statistics of evaluations: functions of arrays, with intervals, and nothing else.
+"""The statistics of evaluations: functions of arrays, with intervals.
 
 Every draw comes from a seed, so the same numbers give the same intervals.
 """
@@ -10,7 +10,7 @@ from scm_world.evaluation.statistics.aggregates import (
     performance_profile,
     probability_of_improvement,
 )
-from scm_world.evaluation.statistics.causes import Cause, Causes, Column, find_causes
+from scm_world.evaluation.statistics.causes import Cause, Causes, ColumnEffect, find_causes
 from scm_world.evaluation.statistics.intervals import (
     LEVEL,
     Interval,
@@ -25,7 +25,7 @@ __all__ = [
     "METRICS",
     "Cause",
     "Causes",
-    "Column",
+    "ColumnEffect",
     "Interval",
     "Profile",
     "aggregate",

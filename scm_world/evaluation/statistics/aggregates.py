@@ -92,13 +92,13 @@ def aggregate(
 @final
 @dataclass(frozen=True)
 class Profile:
-    """Share of scores above each threshold, with a band.
+    """Share of scores above each threshold, with a band; all arrays have shape ``(t,)``.
 
     Attributes:
-        thresholds: Shape ``(t,)``.
-        share: Of all runs (or episodes) and protocols whose score is higher, shape ``(t,)``.
-        low: Lower edge of the band, point by point, shape ``(t,)``.
-        high: Upper edge, shape ``(t,)``.
+        thresholds: In the unit of the scores.
+        share: Of all runs (or episodes) and protocols whose score is higher.
+        low: Lower edge of the band, point by point.
+        high: Upper edge.
         level: Confidence at each threshold.
         n: How many scores there are.
     """
@@ -120,22 +120,12 @@ def performance_profile(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Profile:
-    """Estimate the share of scores above each threshold.
+    """Estimate the share of scores above each threshold, shape ``(t,)``.
 
-    Args:
-        scores: Shape ``(runs, protocols)``, or ``(runs, protocols, episodes)``.
-        thresholds: Shape ``(t,)``; by default 101 from 0 to 1.
-        over: What has a score and is resampled, as for ``aggregate``.
-        level: As for ``aggregate``.
-        resamples: As for ``aggregate``.
-        seed: As for ``aggregate``.
+    Thresholds are 101 from 0 to 1 by default; the other arguments are those of ``aggregate``.
 
     Raises:
         UnknownOption: As for ``aggregate``, or thresholds that are no numbers.
-
-    Example:
-        >>> performance_profile([[0.1, 0.6], [0.4, 0.9]], [0.0, 0.5, 1.0]).share.tolist()
-        [1.0, 0.5, 0.0]
     """
     groups = _groups("scores", scores, over)
     normal_quantile(level)
@@ -163,21 +153,11 @@ def probability_of_improvement(
 
     Per protocol it is the share of pairs in which x is higher, a tie counting half: the
     statistic of Mann and Whitney over the number of pairs. The protocols are then averaged.
-
-    Args:
-        x: Scores, shape ``(runs, protocols)`` or ``(runs, protocols, episodes)``.
-        y: Scores of another policy in the same protocols; it may have another number of runs.
-        over: What is compared and resampled, as for ``aggregate``.
-        level: As for ``aggregate``.
-        resamples: As for ``aggregate``; x and y are resampled apart.
-        seed: As for ``aggregate``.
+    x and y are scores in the same protocols, shaped as for ``aggregate`` like the other arguments;
+    they may have different numbers of runs, and are resampled apart.
 
     Raises:
         UnknownOption: As for ``aggregate``, or x and y have different numbers of protocols.
-
-    Example:
-        >>> probability_of_improvement([[0.9], [0.7]], [[0.7], [0.2]]).value
-        0.875
     """
     ours, theirs = _groups("x", x, over), _groups("y", y, over)
     normal_quantile(level)
@@ -198,10 +178,7 @@ def probability_of_improvement(
 
 
 def _groups(name: str, scores: ArrayLike, over: str) -> Floats:
-    """Arrange scores as groups of exchangeable units, shape ``(groups, protocols, units)``.
-
-    There is one group of runs, or a group of episodes for each run.
-    """
+    """Return scores as groups of runs or of episodes, shape ``(groups, protocols, units)``."""
     if over not in OVER:
         raise UnknownOption("over", over, OVER)
     array = numbers(name, scores, ndim=(2, 3))

@@ -43,7 +43,7 @@ PIECES = 5
 
 @final
 @dataclass(frozen=True)
-class Column:
+class ColumnEffect:
     """The effect of one component of a variable on the score.
 
     Attributes:
@@ -52,10 +52,8 @@ class Column:
         contrast: Mean score in the upper third of the drawn values minus that in the lower third;
             of a column with few values, of the highest minus the lowest ones.
         lower: Largest value of the lower third, in the unit of the variable.
-        upper: Smallest value of the upper third. The contrast is that of values at or beyond these
-            two bounds; its interval takes them as given.
-        share: Share of the score's variance that this column alone explains. Its value and its ends
-            are in [0, 1].
+        upper: Smallest value of the upper third. The interval of the contrast takes both as given.
+        share: Share of the score's variance that this column alone explains, in [0, 1].
         p: Probability of such a share if the column had no effect, by permutation.
         n: Episodes that varied it.
     """
@@ -70,7 +68,7 @@ class Column:
 
     @property
     def direction(self) -> str:
-        """Whether the score goes ``"up"`` or ``"down"`` with the value, or that is ``"unclear"``.
+        """``"up"`` or ``"down"``, as the score goes with the value, or ``"unclear"``.
 
         It is also unclear if the score first rises and then falls, whatever the share.
         """
@@ -86,8 +84,8 @@ class Cause:
 
     Attributes:
         variable: Its name.
-        share: Share of the score's variance that its columns explain together, each by itself: what
-            only a combination of two of them does is not in it.
+        share: Share of the score's variance that its columns explain together, each by itself,
+            without what only a combination of two of them does.
         p: Probability of such a share if the variable had no effect, by permutation.
         p_holm: The same, corrected for the number of variables.
         n: Episodes that varied it.
@@ -99,10 +97,10 @@ class Cause:
     p: float
     p_holm: float
     n: int
-    columns: tuple[Column, ...]
+    columns: tuple[ColumnEffect, ...]
 
     @property
-    def column(self) -> Column:
+    def column(self) -> ColumnEffect:
         """The component that explains most."""
         return max(self.columns, key=lambda column: column.share.value)
 
@@ -114,22 +112,18 @@ class Causes:
 
     Attributes:
         causes: In the order in which the variables were given.
-        left_out: Columns or variables about which the data say nothing, and why.
+        left_out: Why the data say nothing about a column or variable, by its name.
     """
 
     causes: tuple[Cause, ...]
     left_out: Mapping[str, str]
 
     def ranked(self) -> tuple[Cause, ...]:
-        """Order the variables, the one that explains most of the score first."""
+        """Return the variables, the one that explains most of the score first."""
         return tuple(sorted(self.causes, key=lambda cause: (-cause.share.value, cause.p)))
 
     def found(self, alpha: float = 0.05) -> tuple[Cause, ...]:
-        """Name the variables that do have an effect, strongest first.
-
-        Args:
-            alpha: Probability of naming any that has none.
-        """
+        """Return the variables that do have an effect at level ``alpha``, strongest first."""
         return tuple(cause for cause in self.ranked() if cause.p_holm <= alpha)
 
     def __str__(self) -> str:
@@ -181,14 +175,6 @@ def find_causes(
     Raises:
         UnknownOption: No scores; values of another shape, or not real numbers; or a level,
             resamples or permutations that are none.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> drawn = {"tool_block.mass": rng.random(200), "floor_friction": rng.random(200)}
-        >>> print(find_causes(drawn, (drawn["tool_block.mass"] < 0.6).astype(float)))
-        variable         share of variance  p (Holm)  upper - lower third   of column
-        tool_block.mass  0.93 [0.90, 0.95]  0.002     -1.00 [-1.00, -0.92]  tool_block.mass
-        floor_friction   0.00 [0.00, 0.04]  0.765     0.03 [-0.14, 0.19]    floor_friction
     """
     given = numbers("scores", scores)
     normal_quantile(level)
@@ -212,7 +198,7 @@ def find_causes(
             lower, upper = _thirds(one)
             contrast = unpaired_interval(scored[one >= upper], scored[one <= lower], **how)
             share, p = _share([one], scored, level, permutations, seed)
-            columns.append(Column(name, contrast, lower, upper, share, p, scored.size))
+            columns.append(ColumnEffect(name, contrast, lower, upper, share, p, scored.size))
         if len(columns) == 1:
             only = columns[0]
             found.append(Cause(variable, only.share, only.p, only.p, only.n, (only,)))
@@ -230,7 +216,7 @@ def find_causes(
 
 
 def _table(variable: str, values: ArrayLike, n: int) -> tuple[list[str], Floats]:
-    """Arrange a variable's values as columns with names, shape ``(n, columns)``."""
+    """Return a variable's values as columns with names, shape ``(n, columns)``."""
     wanted = f"real numbers or NaN of shape ({n},) or ({n}, columns): a row for each score"
     array: Value = np.asarray(values)
     if array.dtype.kind not in "biuf" or array.ndim not in (1, 2) or len(array) != n:
@@ -244,7 +230,7 @@ def _table(variable: str, values: ArrayLike, n: int) -> tuple[list[str], Floats]
 
 
 def _useless(column: Floats) -> str:
-    """Return why nothing can be learnt from a column, or nothing if something can."""
+    """Return why nothing can be learnt from a column, or nothing."""
     values = column[~np.isnan(column)]
     if values.size < FEWEST:
         return f"only {values.size} episodes varied it; {FEWEST} are needed"
@@ -265,17 +251,13 @@ def _thirds(values: Floats) -> tuple[float, float]:
 def _share(
     columns: Sequence[Floats], scores: Floats, level: float, permutations: int, seed: int
 ) -> tuple[Interval, float]:
-    """Estimate how much of the scores' variance columns explain together.
+    """Estimate how much of the scores' variance columns explain together, and the p-value.
 
     Each column is parted into the cube root of n pieces, but no more than five, nor more than a
     twentieth of n for all columns together. More pieces add noise; fewer hide more. Five hide
     nothing of a line and next to nothing of a parabola, but some 7 % of what a step explains, and
-    10 % of a band: the share of a cause with sharp limits is too low by as much.
-
-    Returns:
-        The share, in [0, 1] like its ends, and the p-value of none of the columns mattering: 0
-        with p = 1 where the scores are all the same. The variance of the estimate is that of the
-        influence function, which vanishes where the share does, and what is left there.
+    10 % of a band: the share of a cause with sharp limits is too low by as much. The variance of
+    the estimate is that of the influence function, and what is left where that vanishes.
 
     Source:
         Ezekiel, *Methods of correlation analysis*, 1930, for the correction; Williamson et al.,
@@ -310,22 +292,14 @@ def _share(
 
 
 def _pieces(values: Floats, count: int) -> Floats:
-    """Span the functions of a column that are straight in each of its pieces.
+    """Span the functions of a column, shape ``(n,)``, that are straight in each of its pieces.
 
-    Args:
-        values: Shape ``(n,)``, not all the same.
-        count: How many pieces, with about as many values in each. Values so few that twenty fall
-            on each, or no more than there are pieces, are the pieces themselves; an order or a
-            distance between them then means nothing.
+    There are ``count`` pieces with about as many values in each. Values so few that twenty fall
+    on each, or no more than there are pieces, are the pieces themselves; an order or a
+    distance between them then means nothing.
 
     Returns:
         An indicator of each piece and, within it, the value from its middle; shape ``(n, k)``.
-
-    Example:
-        >>> _pieces(np.array([0.0, 1.0, 1.0]), 2).tolist()
-        [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]
-        >>> _pieces(np.array([0.0, 2.0, 4.0]), 1).tolist()
-        [[1.0, -1.0], [1.0, 0.0], [1.0, 1.0]]
     """
     levels, places = np.unique(values, return_inverse=True)
     if len(levels) <= max(count, len(values) // 20):
@@ -339,19 +313,11 @@ def _pieces(values: Floats, count: int) -> Floats:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Correct p-values for how many questions were asked.
-
-    Returns:
-        In the same order. The chance that any true null hypothesis is below a bound is at most
-        that bound.
+    """Correct p-values for how many questions were asked; they stay in their order.
 
     Source:
         Holm, *A simple sequentially rejective multiple test procedure*, Scandinavian Journal of
         Statistics 6, 1979.
-
-    Example:
-        >>> holm([0.01, 0.04, 0.03])
-        [0.03, 0.06, 0.06]
     """
     values = np.asarray(p, dtype=np.float64)
     order = np.argsort(values, kind="stable")

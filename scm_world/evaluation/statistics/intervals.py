@@ -95,8 +95,7 @@ def mean_interval(
 
     Returns:
         The mean. Its ends are unknown if no stratum has two numbers, unless these are proportions.
-        A stratum of a single number adds nothing to the width. Strata whose rates differ narrow a
-        Wilson interval: see ``_effective_size``.
+        Strata whose rates differ narrow a Wilson interval: see ``_effective_size``.
 
     Raises:
         UnknownOption: No values; values, strata, level or resamples that are none; or a
@@ -136,14 +135,7 @@ def difference_interval(
 ) -> Interval:
     """Estimate how much higher ``a`` is than ``b`` in the same episodes (paired).
 
-    Args:
-        a: Scores of one policy, shape ``(n,)``.
-        b: Scores of another in the same episodes, shape ``(n,)``.
-        strata: To which stratum each episode belongs, shape ``(n,)``.
-        level: As for ``mean_interval``.
-        resamples: As for ``mean_interval``.
-        seed: As for ``mean_interval``.
-        proportion: As for ``mean_interval``.
+    Both have shape ``(n,)``; the other arguments are those of ``mean_interval``.
 
     Returns:
         The mean of ``a - b``, with a bootstrap of the differences. Where every score is 0 or 1 the
@@ -157,11 +149,6 @@ def difference_interval(
         Bonett and Price, *Adjusted Wald confidence interval for a difference of binomial
         proportions based on paired data*, Journal of Educational and Behavioral Statistics 37,
         2012.
-
-    Example:
-        >>> a = np.random.default_rng(0).random(100)
-        >>> print(difference_interval(a + 0.1, a), difference_interval([0.0] * 98, [0.0] * 98))
-        0.1000 [0.1000, 0.1000] 0.00 [-0.03, 0.03]
     """
     first, second = numbers("a", a), numbers("b", b)
     if first.shape != second.shape:
@@ -184,10 +171,7 @@ def difference_interval(
 def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
     """Estimate how much higher ``a`` is than ``b`` in independent episodes.
 
-    Args:
-        a: Scores, shape ``(m,)``.
-        b: Other scores, shape ``(n,)``.
-        how: ``level``, ``resamples``, ``seed`` and ``proportion`` of ``mean_interval``.
+    Their shapes are ``(m,)`` and ``(n,)``; ``how`` are other arguments of ``mean_interval``.
 
     Returns:
         The difference of the means. Its ends are recovered from those of the two means.
@@ -199,10 +183,6 @@ def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
         Zou and Donner, *Construction of confidence limits about effect measures*, Statistics in
         Medicine 27, 2008; for proportions it is method 10 of Newcombe, *Interval estimation for
         the difference between independent proportions*, Statistics in Medicine 17, 1998.
-
-    Example:
-        >>> print(unpaired_interval([1.0] * 56 + [0.0] * 14, [1.0] * 48 + [0.0] * 32))
-        0.20 [0.05, 0.33]
     """
     one, other = mean_interval(a, **how), mean_interval(b, **how)
     value = one.value - other.value
@@ -224,7 +204,7 @@ def bootstrap(
     resamples: int,
     seed: int,
 ) -> tuple[Any, Any]:
-    """Compute the percentile interval of a stratified bootstrap.
+    """Compute both ends of the percentile interval of a stratified bootstrap.
 
     Args:
         strata: Numbers that are resampled within each of them, two or more, each of shape ``(n,)``.
@@ -233,9 +213,6 @@ def bootstrap(
         level: Confidence.
         resamples: How many.
         seed: Of the draws.
-
-    Returns:
-        Lower and upper ends, each of shape ``(...)``.
     """
     from scipy.stats import bootstrap as of_scipy
 
@@ -248,16 +225,10 @@ def bootstrap(
 
 
 def numbers(name: str, values: ArrayLike, *, ndim: tuple[int, ...] = (1,)) -> Floats:
-    """Take an array of finite numbers with one of these numbers of axes.
+    """Return an array of finite numbers with one of these numbers of axes.
 
     Raises:
         UnknownOption: It has other axes, is empty, or something in it is no finite number.
-
-    Example:
-        >>> numbers("values", [])
-        Traceback (most recent call last):
-            ...
-        scm_world.errors.UnknownOption: values cannot be 'an array of shape (0,)'; it can be: ...
     """
     wanted = f"one finite number or more, in an array of {' or '.join(map(str, ndim))} axes"
     try:

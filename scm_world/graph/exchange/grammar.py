@@ -45,11 +45,7 @@ def _tokens(text: str) -> Iterator[Token]:
 
 @final
 class _Parser:
-    """Statements, one after the other.
-
-    Args:
-        text: All of it.
-    """
+    """A recursive descent over statements."""
 
     def __init__(self, text: str) -> None:
         self._tokens = list(_tokens(text))
@@ -58,42 +54,35 @@ class _Parser:
         self.edges: list[tuple[str, str, Attributes]] = []
 
     def next(self) -> Token:
-        """Give the present token and go on."""
         token = self._tokens[self._at]
         self._at = min(self._at + 1, len(self._tokens) - 1)
         return token
 
     def has(self, *texts: str, ahead: int = 0) -> bool:
-        """Tell whether one of some words or marks comes now; quoted text is none."""
         at = min(self._at + ahead, len(self._tokens) - 1)
         kind, text = self._tokens[at]
         return kind in ("bare", "mark") and text.lower() in texts
 
     def take(self, *texts: str) -> bool:
-        """Go on if one of some words or marks comes now."""
         found = self.has(*texts)
         self._at += found
         return found
 
     def expect(self, text: str) -> None:
-        """Go on, or refuse what comes instead."""
         if not self.take(text):
             raise ValueError(f"expected {text!r}, got {self._tokens[self._at][1]!r}")
 
     def end(self) -> None:
-        """Refuse what comes after the end."""
         if self._tokens[self._at][0] != "end":
             raise ValueError(f"expected one graph, got {self._tokens[self._at][1]!r} after it")
 
     def name(self) -> str:
-        """Read a name, quoted or not."""
         kind, text = self.next()
         if kind not in ("bare", "quoted"):
             raise ValueError(f"expected a name, got {text!r}")
         return text
 
     def statements(self) -> list[str]:
-        """Read up to the closing brace, and name all nodes in between."""
         found: list[str] = []
         while not self.take("}"):
             if self.take(";", ","):
@@ -109,7 +98,6 @@ class _Parser:
         return found
 
     def group(self) -> list[str]:
-        """Read one node, or several in braces."""
         if self.take("subgraph") and not self.has("{"):
             self.name()
         if self.take("{"):
@@ -119,7 +107,6 @@ class _Parser:
         return [name]
 
     def chain(self) -> list[str]:
-        """Read nodes with arrows between them."""
         groups, arrows = [self.group()], []
         while self._tokens[self._at][0] == "arrow":
             arrows.append(self.next()[1])
@@ -136,7 +123,6 @@ class _Parser:
         return [name for group in groups for name in group]
 
     def attributes(self) -> Attributes:
-        """Read lists of ``key=value`` in brackets, if there are any."""
         found: Attributes = {}
         while self.take("["):
             while not self.take("]"):
@@ -147,11 +133,7 @@ class _Parser:
 
 
 def parse(text: str, word: str) -> tuple[NodeParts, EdgeParts]:
-    """Read one graph.
-
-    Args:
-        text: All of it.
-        word: What it begins with, ``"digraph"`` or ``"dag"``.
+    """Read one graph that begins with ``word``, ``"digraph"`` or ``"dag"``.
 
     Returns:
         Names with attributes; causes and effects with attributes.

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import load
 from scm_world.errors import UnknownOption
-from scm_world.graph.exchange.model import CausalGraph, Node, causal_graph
-from scm_world.graph.exchange.networks import bare, from_digraph
-from scm_world.graph.exchange.registry import reading
-from scm_world.graph.exchange.slices import View, read_as, seen_as
+from scm_world.graph.exchange.formats import from_digraph, reading
+from scm_world.graph.exchange.model import CausalGraph, Node, View, causal_graph, read_as, seen_as
 from scm_world.graph.scm import SCM
 from scm_world.graph.structure import Edge
 
@@ -77,11 +75,7 @@ def to_tigramite(source: CausalGraph | SCM) -> TigramiteGraph:
 
 
 def from_tigramite(graph: NDArray[np.str_], var_names: Sequence[str]) -> CausalGraph:
-    """Read a graph of tigramite.
-
-    Args:
-        graph: Strings, shape (n, n, max lag + 1).
-        var_names: The n names.
+    """Read a graph of tigramite: strings, shape (n, n, max lag + 1), and n names.
 
     Raises:
         UnreadableFile: The shape is another one, or an edge is not directed.
@@ -160,7 +154,10 @@ def to_pgmpy(source: CausalGraph | SCM, *, view: View = "two_slice") -> Any:
         UnknownOption: There is no such view.
     """
     graph = _acyclic(source, view, "pgmpy")
-    made = load("pgmpy.base", "pgmpy").DAG()
+    return _bare(graph, load("pgmpy.base", "pgmpy").DAG())
+
+
+def _bare(graph: CausalGraph, made: nx.DiGraph) -> nx.DiGraph:
     made.add_nodes_from(graph.names)
     made.add_edges_from((edge.cause, edge.effect) for edge in graph.edges)
     return made
@@ -176,22 +173,13 @@ def from_pgmpy(graph: nx.DiGraph, *, view: View = "two_slice") -> CausalGraph:
 
 
 def to_dowhy(source: CausalGraph | SCM, *, view: View = "two_slice") -> nx.DiGraph:
-    """Write a graph as DoWhy takes it; nothing needs to be installed.
-
-    Returns:
-        A networkx graph for ``dowhy.CausalModel(graph=…)`` and the models of ``dowhy.gcm``. For the
-        GML text that ``CausalModel`` also takes: ``write_graph(…, format="gml", view=…)``.
+    """Return the graph that ``dowhy.CausalModel(graph=…)`` and ``dowhy.gcm`` take.
 
     Raises:
         ModelError: The view has a cycle.
         UnknownOption: There is no such view.
-
-    Example:
-        >>> graph = CausalGraph((Node("x"), Node("y")), (Edge("x", "y", 1),))
-        >>> list(to_dowhy(graph).edges), list(to_dowhy(graph, view="summary").edges)
-        ([('x@-1', 'y')], [('x', 'y')])
     """
-    return bare(_acyclic(source, view, "DoWhy"))
+    return _bare(_acyclic(source, view, "DoWhy"), nx.DiGraph())
 
 
 from_dowhy = from_pgmpy

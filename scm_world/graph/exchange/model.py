@@ -1,19 +1,65 @@
-"""A causal graph as plain text: what every format writes, and what every reader gives back."""
+"""Causal graphs as plain text: what every format writes, and what every reader returns."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, final
+from typing import Any, Literal, final, get_args
 
 import networkx as nx
 
-from scm_world.errors import ModelError
-from scm_world.graph.exchange.spaces import space_lines
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.scm import SCM
 from scm_world.graph.structure import Edge
-from scm_world.variables import Variable
+from scm_world.variables import Affine, Box, Either, Space, Switch, Variable
+from scm_world.variables.spaces import Bound, Bounds
+
+
+def space_lines(space: Space | None, *, digits: int = 4) -> list[str]:
+    """Return a space in words, with the names of the variables that it follows.
+
+    There is one line, or one per component where they differ; numbers have so many digits.
+    """
+    match space:
+        case None:
+            return []
+        case Box(low=low, high=high):
+            return _box_lines(_ends(low, digits), _ends(high, digits))
+        case Either(first=first, second=second):
+            parts = (", ".join(space_lines(part, digits=digits)) for part in (first, second))
+            return [" or ".join(parts)]
+    return [space.describe((), {})]
+
+
+def _box_lines(lows: list[str], highs: list[str]) -> list[str]:
+    size = max(len(lows), len(highs))
+    lows, highs = (ends * size if len(ends) == 1 else ends for ends in (lows, highs))
+    ends = zip(lows, highs, strict=True)
+    pairs = [low if low == high else f"{low} to {high}" for low, high in ends]
+    if len(set(pairs)) == 1:
+        return pairs[:1]
+    finger = pairs[:3]
+    return finger if pairs == finger * (size // 3) else pairs
+
+
+def _ends(end: Bounds, digits: int) -> list[str]:
+    parts = end if isinstance(end, tuple) else (end,)
+    return [_end(part, digits) for part in parts]
+
+
+def _end(end: Bound, digits: int) -> str:
+    match end:
+        case Affine(parent=parent, index=index, scale=scale, offset=offset):
+            which = "" if index is None else f"[{index}]"
+            factor = "" if scale == 1.0 else f"{scale:g} "
+            summand = "" if offset == 0.0 else f"{offset:g} + "
+            return f"{summand}{factor}{parent}{which}"
+        case Switch(parent=parent, below=below, above=above, at=at):
+            return f"({below:g} if {parent} < {at:g} else {above:g})"
+    return f"{float(end):.{digits}g}"
+
 
 DIGITS = 6  # of a number in the text of a space
 
@@ -98,7 +144,7 @@ class CausalGraph:
         return into
 
     def parents(self, name: str) -> tuple[Edge, ...]:
-        """Give the edges into a node."""
+        """Return the edges into a node."""
         return tuple(self._into.get(name, ()))
 
     @property
@@ -111,11 +157,7 @@ class CausalGraph:
         )
 
     def check_acyclic(self, format_: str, *, lag: int | None = None) -> None:
-        """Refuse a graph that some format cannot hold, looking at edges of one lag or of all.
-
-        Raises:
-            ModelError: Its edges form a cycle.
-        """
+        """Refuse a graph with a cycle of edges of one lag, or of all, for some format."""
         graph = nx.DiGraph((e.cause, e.effect) for e in self.edges if lag in (None, e.lag))
         if not nx.is_directed_acyclic_graph(graph):
             cycle = [cause for cause, _ in nx.find_cycle(graph)]
@@ -155,7 +197,7 @@ def _edge_problems(nodes: Iterable[Node], edges: Iterable[Edge]) -> Iterable[str
 
 
 def causal_graph(source: SCM | CausalGraph) -> CausalGraph:
-    """Write a model as a plain graph; interventions on it are seen as cut edges.
+    """Return a model as a plain graph, in which interventions cut edges.
 
     Example:
         >>> from scm_world.variables import Derived, Exogenous, Linear
@@ -192,7 +234,7 @@ def _node(variable: Variable) -> Node:
 
 
 def edge_attributes(edge: Edge) -> dict[str, Any]:
-    """Give the lag, and the condition if there is one."""
+    """Return the lag, and the condition if there is one."""
     return {"lag": edge.lag} | ({} if edge.when is None else {"when": edge.when})
 
 
@@ -200,7 +242,7 @@ def from_parts(
     nodes: Iterable[tuple[Any, Mapping[str, Any]]],
     edges: Iterable[tuple[Any, Any, Mapping[str, Any]]],
 ) -> CausalGraph:
-    """Make a graph of names and attributes; those that mean nothing here are left out.
+    """Make a graph of names and attributes; unknown ones are left out.
 
     Raises:
         ValueError: A lag is no whole number, or see ``CausalGraph``.
@@ -223,3 +265,129 @@ def _edge(cause: str, effect: str, data: Mapping[str, Any]) -> Edge:
     if not number.is_integer():
         raise ValueError(f"the lag {lag!r} of {cause!r} → {effect!r} is no whole number")
     return Edge(cause, effect, int(number), str(when) if when else None)
+
+
+View = Literal["lagged", "summary", "two_slice"]
+VIEWS: tuple[View, ...] = get_args(View)
+
+_WRITTEN = re.compile(r"((?:[^@]|@@)*)(?:@(=?)-([1-9]\d*))?")
+
+
+@final
+@dataclass(frozen=True)
+class Slice:
+    """A variable at an instant, and how it is written: ``name``, ``x@-1``, ``mass@=-1``.
+
+    Attributes:
+        name: Of the variable; a ``@`` in it is doubled.
+        ago: How many control steps ago.
+        held: Whether it is a parameter, which has the same value now.
+    """
+
+    name: str
+    ago: int = 0
+    held: bool = False
+
+    def __str__(self) -> str:
+        mark = f"@{'=' if self.held else ''}-{self.ago}" if self.ago else ""
+        return self.name.replace("@", "@@") + mark
+
+    @classmethod
+    def read(cls, text: str) -> Slice:
+        """Read what ``str`` wrote, or raise ``ValueError`` for a lone ``@``."""
+        found = _WRITTEN.fullmatch(text)
+        if found is None:
+            raise ValueError(f"{text!r} is no name in a slice: expected 'name' or 'name@-1'")
+        name, held, ago = found.groups()
+        return cls(name.replace("@@", "@"), int(ago or 0), bool(held))
+
+
+def seen_as(graph: CausalGraph, view: View) -> CausalGraph:
+    """Return a view of a graph with lags.
+
+    Args:
+        graph: With lags.
+        view: ``"lagged"``: as it is. ``"summary"``: one edge per pair; lags are lost.
+            ``"two_slice"``: each variable now and, if there are lags, at earlier steps;
+            ``name`` is now, ``name@-1`` one step ago, ``name@=-1`` the same of a parameter, which
+            an edge connects to itself. Edges within the past are copies of those that end now.
+
+    Raises:
+        UnknownOption: There is no such view.
+    """
+    if view not in VIEWS:
+        raise UnknownOption("view", view, VIEWS)
+    views = {"summary": _summary, "two_slice": _sliced}
+    return views[view](graph) if view in views else graph
+
+
+def _summary(graph: CausalGraph) -> CausalGraph:
+    pairs: dict[tuple[str, str], set[str | None]] = {}
+    for edge in graph.edges:
+        pairs.setdefault((edge.cause, edge.effect), set()).add(edge.when)
+    edges = []
+    for (cause, effect), conditions in pairs.items():
+        known = sorted(when for when in conditions if when is not None)
+        always = len(known) < len(conditions)
+        edges.append(Edge(cause, effect, when=None if always else " or ".join(known)))
+    return CausalGraph(graph.nodes, tuple(edges))
+
+
+def _sliced(graph: CausalGraph) -> CausalGraph:
+    past, held = graph.max_lag, graph.held
+
+    def at(name: str, ago: int) -> str:
+        return str(Slice(name, ago, ago > 0 and name in held))
+
+    nodes = [replace(n, name=at(n.name, ago)) for ago in range(past + 1) for n in graph.nodes]
+    edges = [
+        Edge(at(edge.cause, ago + edge.lag), at(edge.effect, ago), when=edge.when)
+        for edge in graph.edges
+        for ago in range(past - edge.lag + 1)
+    ]
+    stay = [Edge(at(n, ago + 1), at(n, ago)) for n in sorted(held) for ago in range(past)]
+    return CausalGraph(tuple(nodes), (*edges, *stay))
+
+
+def read_as(graph: CausalGraph, view: View) -> CausalGraph:
+    """Undo ``seen_as``; lags that a summary lost stay lost.
+
+    Raises:
+        ValueError: The slices do not fit together.
+        UnknownOption: There is no such view.
+    """
+    if view not in VIEWS:
+        raise UnknownOption("view", view, VIEWS)
+    return _folded(graph) if view == "two_slice" else graph
+
+
+def _folded(graph: CausalGraph) -> CausalGraph:
+    slices = {name: Slice.read(name) for name in graph.names}
+    nodes: dict[str, Node] = {}
+    for node in sorted(graph.nodes, key=lambda node: slices[node.name].ago):
+        where = slices[node.name]
+        known = nodes.setdefault(where.name, replace(node, name=where.name))
+        if where.held and not known.role:
+            nodes[where.name] = replace(known, role="parameter")
+    found = [(slices[e.effect].ago, _shifted(e, slices)) for e in _causes(graph, slices)]
+    edges = {edge for ago, edge in found if ago == 0}
+    for ago, edge in found:
+        if edge not in edges:
+            raise ValueError(f"{edge.cause!r} → {edge.effect!r} is there {ago} steps ago, not now")
+    return CausalGraph(tuple(nodes.values()), tuple(edges))
+
+
+def _causes(graph: CausalGraph, slices: dict[str, Slice]) -> Iterator[Edge]:
+    """Leave out that parameters keep their values."""
+    for edge in graph.edges:
+        cause = slices[edge.cause]
+        if not (cause.held and cause.name == slices[edge.effect].name):
+            yield edge
+
+
+def _shifted(edge: Edge, slices: dict[str, Slice]) -> Edge:
+    cause, effect = slices[edge.cause], slices[edge.effect]
+    lag = cause.ago - effect.ago
+    if lag < 0:
+        raise ValueError(f"{edge.cause!r} → {edge.effect!r} leads into the past")
+    return Edge(cause.name, effect.name, lag, edge.when)

@@ -7,7 +7,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Value, Values
-from scm_world.graph import SCM, Moment
+from scm_world.graph import SCM, NoiseKey
 from scm_world.queries.equations import Layout
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.variables import Box, Categories, Integers, Noise, Variable
@@ -39,10 +39,10 @@ class PairedEquations:
     def run(self, number: int, probe: Any = None) -> None:
         """Do all experiments with one unit."""
         model, effects, noise = self._model, self.effects, self._noise
-        first = model.solve(self._actions, moment=Moment(noise, number, 0))
-        at = Moment(noise, number, 1)
-        unit = model.solve(self._actions, previous=first, moment=at)
-        again = model.solve(self._actions, previous=first, moment=at)
+        first = model.solve(self._actions, key=NoiseKey(noise, number, 0))
+        at = NoiseKey(noise, number, 1)
+        unit = model.solve(self._actions, previous=first, key=at)
+        again = model.solve(self._actions, previous=first, key=at)
         effects.rollouts += 2
         effects.floor = max(effects.floor, *(gap(unit[n], again[n]) for n in unit))
         for cause in model:
@@ -74,7 +74,7 @@ def _compare(
     known: Values,
     previous: Values,
     unit: Values,
-    at: Moment,
+    at: NoiseKey,
     effects: Effects,
     *,
     lag: int,
@@ -82,7 +82,7 @@ def _compare(
     for name in model:
         if lag == 0 and name == cause:
             continue
-        value = model.solve(known, previous=previous, moment=at, only=(name,))[name]
+        value = model.solve(known, previous=previous, key=at, only=(name,))[name]
         effects.see(cause, name, lag, value, unit[name])
 
 

@@ -35,7 +35,7 @@ class Series:
         *,
         done: int = 0,
     ) -> None:
-        self._paired, self._planned, self._progress = paired, planned, progress
+        self._paired, self.planned, self._progress = paired, planned, progress
         self.effects, self.done = paired.effects, done
 
     def run(
@@ -57,7 +57,7 @@ class Series:
                 self.done, self.effects = number + 1, self._paired.effects.copy()
                 last = enough is not None and enough(self.effects, self.done)
                 if self._progress is not None:
-                    self._progress(self.done, self.done if last else self._planned)
+                    self._progress(self.done, self.done if last else self.planned)
                 if last:
                     return
         except KeyboardInterrupt:

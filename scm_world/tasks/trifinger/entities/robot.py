@@ -11,7 +11,7 @@ from numba import njit
 
 from scm_world._types import Floats, Value, Values
 from scm_world.geometry.scalars import scalar
-from scm_world.graph import Moment
+from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
 from scm_world.tasks.composition import Commands, Entity, State
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -196,11 +196,11 @@ class RobotCommands(Commands):
         """Tell whether fingertips are commanded, or the actuators have noise."""
         return self._by_tips or bool(values[ACTUATOR_NOISE] > 0.0)
 
-    def told(self, action: Floats, values: Values, vector: Floats, moment: Moment) -> Floats:
+    def told(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Add the noise, then find the joint positions of fingertips, shape (9,)."""
         noise = float(values[ACTUATOR_NOISE])
         if noise > 0.0:
-            drawn = moment.draw(Normal(), STREAM, (N_JOINTS,), {})
+            drawn = key.draw(Normal(), STREAM, (N_JOINTS,), {})
             action = action + noise * self._half * drawn
         if self._by_tips:
             height = float(values["robot_height"])

@@ -8,7 +8,6 @@ from itertools import islice
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._types import Integers
 from scm_world.errors import MissingExtra
@@ -32,16 +31,11 @@ MEMBERS = 1_000
 """Most members of a chain component that ``sid_bounds`` goes through."""
 
 
-def shd(found: Bools, true: Bools, pairs: Bools | None = None) -> int:
+def shd(found: Bools, true: Bools) -> int:
     """Count the pairs of nodes that are joined differently: the structural Hamming distance.
 
     A missing, an additional and a turned edge count 1 each, and so does an edge without direction
-    where the true one has a direction or does not exist.
-
-    Args:
-        found: Shape (p, p).
-        true: Shape (p, p).
-        pairs: Symmetric, shape (p, p); pairs where it is False are left out.
+    where the true one has a direction or does not exist. Shapes are (p, p).
 
     Source:
         Tsamardinos, Brown and Aliferis, *The max-min hill-climbing Bayesian network structure
@@ -52,21 +46,14 @@ def shd(found: Bools, true: Bools, pairs: Bools | None = None) -> int:
         1
     """
     differ = found != true
-    if pairs is not None:
-        differ = differ & pairs
     return int(np.triu(differ | differ.T, 1).sum())
 
 
 def shd_of_classes(found: Bools, true: Bools) -> int | None:
     """Compute the distance between the essential graphs; None if the found graph has none.
 
-    A found graph without direction somewhere stands for the class of the acyclic graphs that it
-    can become without another v-structure.
-
-    Example:
-        >>> chain = np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)
-        >>> shd_of_classes(chain.T, chain)
-        0
+    A graph without direction somewhere stands for the class of the acyclic graphs that it can
+    become without another v-structure.
     """
     member = extension(found)
     return None if member is None else shd(cpdag(member), cpdag(true))
@@ -76,10 +63,7 @@ def sid(found: Bools, true: Bools) -> int:
     """Count the pairs (i, j) whose effect p(j | do(i)) comes out wrong: the intervention distance.
 
     Adjusting for the parents that i has in the found graph must give the effect in the true one.
-
-    Args:
-        found: Acyclic, shape (p, p).
-        true: Acyclic, shape (p, p).
+    Both are acyclic, shape (p, p).
 
     Raises:
         ModelError: One of them has a cycle or an edge without direction.
@@ -100,7 +84,7 @@ def sid(found: Bools, true: Bools) -> int:
 
 
 def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:
-    """Give the least and the greatest SID of the acyclic graphs that the found one can become.
+    """Return the least and the greatest SID of the acyclic graphs that the found one can become.
 
     Args:
         found: Edges with and without direction, shape (p, p).
@@ -108,18 +92,13 @@ def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:
 
     Returns:
         Both are exact. None if it can become none, or if there are more than ``MEMBERS`` ways to
-        direct what hangs together.
+        direct a chain component.
 
     Raises:
         ModelError: The true graph has a cycle.
 
     Source:
         Peters and Bühlmann 2015, section 2.4.3: chain components can be directed independently.
-
-    Example:
-        >>> true = np.array([[0, 1], [0, 0]], bool)
-        >>> sid_bounds(true | true.T, true)
-        (0, 2)
     """
     topological_order(true)
     if extension(found) is None:
@@ -137,7 +116,7 @@ def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:
 
 
 def is_chain_graph(graph: Bools) -> bool:
-    """Tell whether no edge with a direction joins nodes that undirected edges connect."""
+    """Return whether no directed edge joins nodes that undirected edges connect."""
     together = reaches(graph & graph.T)
     return not (graph & ~graph.T & together).any()
 
@@ -166,7 +145,7 @@ def _sums(true: Bools, part: Integers, members: Bools) -> Integers:
 
 
 def wrong_effects(true: Bools, causes: Integers, adjusted: Bools) -> Bools:
-    """Tell which effects come out wrong if one adjusts for these nodes.
+    """Return which effects come out wrong if one adjusts for these nodes, shape (r, p).
 
     What is adjusted for is taken for a parent of the cause, so no effect on it is expected.
 
@@ -174,9 +153,6 @@ def wrong_effects(true: Bools, causes: Integers, adjusted: Bools) -> Bools:
         true: Acyclic, shape (p, p).
         causes: Of r questions, shape (r,).
         adjusted: The nodes adjusted for, shape (r, p); not the cause.
-
-    Returns:
-        Shape (r, p): whether the effect on each node is wrong.
 
     Source:
         Shpitser, VanderWeele and Robins, *On the validity of covariate adjustment for estimating
@@ -195,7 +171,7 @@ def wrong_effects(true: Bools, causes: Integers, adjusted: Bools) -> Bools:
 
 
 def _reached_otherwise(true: Bools, causes: Integers, adjusted: Bools, opens: Bools) -> Bools:
-    """Tell what is reached from the causes by an open path that does not go along all arrows.
+    """Return what is reached by an open path that does not go along all arrows.
 
     The walks that go along all arrows so far, those that do not and last went along one, and those
     that last went against one grow by one edge at a time.
@@ -242,29 +218,12 @@ def aid(found: Bools, true: Bools, kind: Adjustment) -> int | None:
     if not is_chain_graph(closed):
         return None
     distance = getattr(import_module("gadjid"), f"{kind}_aid")
-    _, wrong = distance(_coded(true), _coded(closed), edge_direction="from row to column")
+    # 1 for an edge with a direction, 2 for one without
+    coded = [graph.astype(np.int8) + (graph & graph.T).astype(np.int8) for graph in (true, closed)]
+    _, wrong = distance(*coded, edge_direction="from row to column")
     return int(wrong)
 
 
 def has_gadjid() -> bool:
-    """Tell whether the package that computes adjustment identification distances is there."""
+    """Return whether the package that computes adjustment identification distances is there."""
     return importlib.util.find_spec("gadjid") is not None
-
-
-def _coded(graph: Bools) -> NDArray[np.int8]:
-    """Write 1 for an edge with a direction, 2 for one without."""
-    return graph.astype(np.int8) + (graph & graph.T).astype(np.int8)
-
-
-__all__ = [
-    "MEMBERS",
-    "Adjustment",
-    "aid",
-    "has_gadjid",
-    "is_chain_graph",
-    "shd",
-    "shd_of_classes",
-    "sid",
-    "sid_bounds",
-    "wrong_effects",
-]

@@ -1,0 +1,53 @@
+"""The learners that have a name: ours, and those of other libraries."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from scm_world.discovery.learners import libraries
+from scm_world.discovery.learners.bodies import learn_local, learn_null
+from scm_world.discovery.learners.do_order import do_order
+from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
+from scm_world.discovery.learners.registry import Learner, register
+
+OURS = (
+    Learner("paired", paired, ("paired",), doc="one variable at a time, same noise: exact"),
+    Learner(
+        "pooled", sparse_pooled, ("paired",), "models", doc="all numbers at once: few causes each"
+    ),
+    Learner(
+        "coloring", verified, ("paired",), "models", claims=True,
+        doc="checks a graph, color by color",
+    ),
+    Learner(
+        "do_order", do_order, ("interventional",), doc="order by invariance, edges by regression"
+    ),
+    Learner(
+        "do_order_ranks", partial(do_order, features=2, ranks=True, spread=True),
+        ("interventional",), doc="do_order for curves, outliers, and causes of spread",
+    ),
+    Learner("local", learn_local, ("paired",), "worlds", doc="bodies: who acted on whom, and when"),
+    Learner("null", learn_null, ("paired",), "worlds", doc="bodies: one is taken away at a time"),
+)  # fmt: skip
+_causal_learn = partial(
+    Learner, takes=("observational",), extra="causal-learn", package="causal-learn"
+)
+OTHERS = (
+    _causal_learn("pc", libraries.pc, doc="tests of partial correlation"),
+    _causal_learn("ges", libraries.ges, doc="greedy search over equivalence classes by BIC"),
+    _causal_learn("boss", libraries.boss, doc="best order by BIC, moving one column at a time"),
+    _causal_learn("grasp", libraries.grasp, doc="sparsest order by BIC, by tucks"),
+    Learner(
+        "gies", libraries.gies, ("observational", "interventional"), extra="discovery",
+        package="gies", doc="greedy search over interventional equivalence classes by BIC",
+    ),
+    Learner(
+        "pcmci+", libraries.pcmci_plus, ("observational",), temporal=True, extra="tigramite",
+        package="tigramite",
+        doc="tests of partial correlation over time, with edges within the instant",
+    ),
+)  # fmt: skip
+"""Existing baselines behind our call. Without its library a learner names the extra to install."""
+
+for _learner in (*OURS, *OTHERS):
+    register(_learner)

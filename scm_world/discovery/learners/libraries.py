@@ -1,0 +1,503 @@
+"""Learners of other libraries: PC, GES, BOSS and GRaSP, GIES, and PCMCI+.
+
+None of the libraries is imported before it is used. A setting that is not allowed raises
+``UnknownOption``, data that cannot be used ``ModelError``.
+
+Sources:
+    Zheng et al., *Causal-learn: causal discovery in Python*, JMLR 2024, for PC (Spirtes, Glymour
+    and Scheines, *Causation, Prediction, and Search*, 2000), GES (Chickering, *Optimal structure
+    identification with greedy search*, JMLR 2002), BOSS (Andrews et al., *Fast scalable and
+    accurate discovery of DAGs using the best order score search and grow-shrink trees*, NeurIPS
+    2023) and GRaSP (Lam, Andrews and Ramsey, *Greedy relaxations of the sparsest permutation
+    algorithm*, UAI 2022). Gamella, Taeb, Heinze-Deml and Bühlmann, *Characterization and greedy
+    learning of Gaussian structural causal models under unknown interventions*, 2022, for GIES
+    (Hauser and Bühlmann, JMLR 2012). Runge, *Discovering contemporaneous and lagged causal
+    relations in autocorrelated nonlinear time series datasets*, UAI 2020, for PCMCI+.
+"""
+
+from __future__ import annotations
+
+import random
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib import import_module
+from io import StringIO
+from typing import Any
+
+import numpy as np
+
+from scm_world._arguments import whole_number
+from scm_world._types import Floats, Integers
+from scm_world.discovery.data.dataset import Bools, Dataset
+from scm_world.discovery.learners.found import EstimatedGraph
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption
+
+BIC = "local_score_BIC_from_cov"
+ARROW = 1  # the end mark of causal-learn
+RIDGE = 1e-9
+"""Added to the variances of standardised columns. Some vary only where they are set, and on a
+variance of zero the search of GIES never ends."""
+STILL = 1e-12
+"""A standardised column that moves less than this within each episode does not change there."""
+DEPENDENT = 1e-7
+"""A column with this part of its spread left after regression on the earlier ones adds nothing."""
+SHOWN = 10  # columns that a note names
+PHASES = ("forward", "backward", "turning")
+
+# --- settings -------------------------------------------------------------------------------------
+
+
+def _number(of: str, value: float, below: float = np.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < below:
+        allowed = "a number above 0" if below == np.inf else f"a number between 0 and {below:g}"
+        raise UnknownOption(of, value, (allowed,))
+    return value
+
+
+def _switch(of: str, value: bool) -> bool:
+    if not isinstance(value, bool):
+        raise UnknownOption(of, value, ("a yes or no: True, False",))
+    return value
+
+
+# --- static graphs --------------------------------------------------------------------------------
+
+
+def pc(
+    data: Dataset,
+    *,
+    seed: int = 0,
+    alpha: float = 0.01,
+    stable: bool = True,
+    depth: int | None = None,
+) -> EstimatedGraph:
+    """Find a graph by tests of partial correlation (Fisher's z).
+
+    Args:
+        data: Rows; those in which something is done are left out.
+        seed: Not used: nothing is drawn.
+        alpha: Level of the tests.
+        stable: Whether the order of the columns does not matter while edges are removed.
+        depth: Most columns that a test conditions on; None for no limit.
+    """
+    settings = {
+        "alpha": _number("alpha of 'pc'", alpha, below=1.0),
+        "stable": _switch("stable of 'pc'", stable),
+        "depth": None if depth is None else whole_number("depth of 'pc'", depth, least=0),
+    }
+
+    def search(table: Dataset) -> tuple[Bools, str]:
+        result = import_module("causallearn.search.ConstraintBased.PC").pc(
+            table.values, alpha, "fisherz", stable, background_knowledge=_past_first(table),
+            show_progress=False, max_k=depth,
+        )  # fmt: skip
+        marks = np.array(result.G.graph)
+        contrary = int(np.sum((marks == ARROW) & (marks.T == ARROW))) // 2
+        return edges_of_marks(marks), _contradictions(contrary)
+
+    return _static("pc", search, data, seed, settings)
+
+
+def ges(
+    data: Dataset, *, seed: int = 0, penalty: float = 0.5, max_parents: int | None = None
+) -> EstimatedGraph:
+    """Find a graph by greedy search over equivalence classes.
+
+    Args:
+        data: Rows; those in which something is done are left out.
+        seed: Not used: nothing is drawn.
+        penalty: Of an edge, times log(n); 0.5 is the Bayesian information criterion.
+        max_parents: Most causes of a column; None for no limit.
+    """
+    settings = {
+        "penalty": _number("penalty of 'ges'", penalty),
+        "max_parents": max_parents
+        if max_parents is None
+        else whole_number("max_parents of 'ges'", max_parents, least=1),
+    }
+
+    def search(table: Dataset) -> tuple[Bools, str]:
+        library = import_module("causallearn.search.ScoreBased.GES")
+        found = library.ges(table.values, BIC, max_parents, {"lambda_value": penalty})
+        return edges_of_marks(found["G"].graph), ""
+
+    return _static("ges", search, data, seed, settings)
+
+
+def boss(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> EstimatedGraph:
+    """Find a graph by search over orders, moving one column at a time.
+
+    Args:
+        data: Rows; those in which something is done are left out.
+        seed: Of the order in which columns are moved.
+        penalty: Of an edge, times log(n).
+    """
+    settings = {"penalty": _number("penalty of 'boss'", penalty)}
+
+    def search(table: Dataset) -> tuple[Bools, str]:
+        library = import_module("causallearn.search.PermutationBased.BOSS")
+        found = library.boss(table.values, BIC, {"lambda_value": penalty}, verbose=False)
+        return edges_of_marks(found.graph), ""
+
+    return _static("boss", search, data, seed, settings)
+
+
+def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3) -> EstimatedGraph:
+    """Find a graph by search over orders, by tucks.
+
+    Args:
+        data: Rows; those in which something is done are left out.
+        seed: Of the first order.
+        penalty: Of an edge, times log(n).
+        depth: Of the search.
+    """
+    settings = {
+        "penalty": _number("penalty of 'grasp'", penalty),
+        "depth": whole_number("depth of 'grasp'", depth, least=1),
+    }
+
+    def search(table: Dataset) -> tuple[Bools, str]:
+        library = import_module("causallearn.search.PermutationBased.GRaSP")
+        found = library.grasp(table.values, BIC, depth, {"lambda_value": penalty}, verbose=False)
+        return edges_of_marks(found.graph), ""
+
+    return _static("grasp", search, data, seed, settings)
+
+
+def gies(
+    data: Dataset,
+    *,
+    seed: int = 0,
+    penalty: float = 0.5,
+    phases: Sequence[str] = PHASES,
+    iterate: bool = True,
+) -> EstimatedGraph:
+    """Find a graph by greedy search over interventional equivalence classes.
+
+    Args:
+        data: Rows under any regime.
+        seed: Not used: nothing is drawn.
+        penalty: Of an edge, times log(n); 0.5 is the Bayesian information criterion.
+        phases: Of the search, in their order.
+        iterate: Whether the phases are repeated until nothing improves.
+    """
+    if isinstance(phases, str) or not phases or not set(phases) <= set(PHASES):
+        raise UnknownOption("phases of 'gies'", phases, (f"a list of {', '.join(PHASES)}",))
+    settings = {
+        "penalty": _number("penalty of 'gies'", penalty),
+        "phases": list(phases),
+        "iterate": _switch("iterate of 'gies'", iterate),
+    }
+
+    def search(table: Dataset) -> tuple[Bools, str]:
+        cost = penalty * float(np.log(len(table)))
+        scores = import_module("gies.scores.gauss_int_l0_pen")
+        measure = scores.GaussIntL0Pen(*environments(table), lmbda=cost)
+        measure.part_sample_cov += RIDGE * np.eye(len(table.names))
+        graph, _ = import_module("gies").fit(measure, phases=list(phases), iterate=iterate)
+        return np.array(graph) != 0, ""
+
+    return _static("gies", search, data, seed, settings, done=True)
+
+
+def _static(
+    learner: str,
+    search: Callable[[Dataset], tuple[Bools, str]],
+    data: Dataset,
+    seed: int,
+    settings: dict[str, Any],
+    *,
+    done: bool = False,
+) -> EstimatedGraph:
+    """Let a library find a static graph; ``search`` gives edges and a note."""
+    table, notes = _usable(learner, data, done=done)
+    edges, note = np.zeros((len(table.names), len(table.names)), bool), ""
+    if len(edges) > 1:  # some libraries fail where there is nothing to find
+        with _quietly(learner, seed):
+            edges, note = search(table)
+    notes += (note,) * bool(note)
+    gain = likelihood_gain(table, edges)
+    found = EstimatedGraph.of(table.names, edges, edge_scores=gain, notes=notes, settings=settings)
+    return found.restricted(data.names)
+
+
+def edges_of_marks(marks: Any) -> Bools:
+    """Read the end marks of causal-learn.
+
+    Args:
+        marks: Shape (p, p): at [i, j] the mark at i of the edge between i and j; 1 is an arrow
+            head, -1 a tail, 2 a circle, 0 no edge.
+
+    Returns:
+        Shape (p, p): where i may act on j. Two heads, which PC puts where its tests contradict each
+        other, and two circles are an edge without direction.
+
+    Example:
+        >>> edges_of_marks([[0, -1], [1, 0]]).tolist()
+        [[False, True], [False, False]]
+    """
+    at = np.array(marks)
+    return np.asarray((at != 0) & ((at != ARROW) | (at.T == ARROW)))
+
+
+def _contradictions(count: int) -> str:
+    note = f"{count} edges have no direction, since tests contradict each other"
+    return note if count else ""
+
+
+def _past_first(data: Dataset) -> Any:
+    """Tell PC that later columns do not act on earlier ones; None if all are of one instant."""
+    lags = [column.lag for column in data.columns]
+    if len(set(lags)) < 2:
+        return None
+    knowledge = import_module("causallearn.utils.PCUtils.BackgroundKnowledge").BackgroundKnowledge()
+    node = import_module("causallearn.graph.GraphNode").GraphNode
+    for i, lag in enumerate(lags):
+        knowledge.add_node_to_tier(node(f"X{i + 1}"), max(lags) - lag)  # the names PC gives
+    return knowledge
+
+
+def environments(data: Dataset) -> tuple[list[Floats], list[list[int]]]:
+    """Return rows, shape (n, p), and numbers of the columns set in them, by set of targets.
+
+    Raises:
+        ModelError: A column is set in every row.
+    """
+    always = [
+        f"{data.names[i]!r} is set in every row; 'gies' needs rows in which it is left alone"
+        for i in np.flatnonzero(data.targeted.all(axis=0))
+    ]
+    if always:
+        raise ModelError(always)
+    kinds, number = np.unique(data.targeted, axis=0, return_inverse=True)
+    parts = [data.values[number.reshape(-1) == kind] for kind in range(len(kinds))]
+    return parts, [np.flatnonzero(kind).tolist() for kind in kinds]
+
+
+def likelihood_gain(data: Dataset, edges: Bools) -> Floats:
+    """Compute by how much the likelihood falls if an edge is taken away.
+
+    Each column is regressed on all columns with an edge to it, in the rows where it was not set;
+    noise is Gaussian. Taking column i away from the regression of j multiplies its sum of squares
+    by 1 + b² / (v s), with b the coefficient of i, s the sum of squares and v the entry of i in the
+    inverse of the matrix of the regression.
+
+    Args:
+        data: Rows of p columns, none a linear function of others.
+        edges: Shape (p, p). For an edge without direction the smaller gain counts.
+
+    Returns:
+        Differences of the logarithm of the likelihood, shape (p, p); 0 where there is no edge.
+
+    Source:
+        Seber and Lee, *Linear Regression Analysis*, 2003, chapter 4: the F-test of one coefficient.
+
+    Example:
+        >>> x = np.array([-1.5, -0.5, 0.5, 1.5])
+        >>> data = Dataset.of(np.stack([x, x + [0.1, -0.1, -0.1, 0.1]], axis=1), ["x", "y"])
+        >>> likelihood_gain(data, np.array([[False, True], [False, False]])).round(2).tolist()
+        [[0.0, 9.67], [0.0, 0.0]]
+    """
+    gain, tiny = np.zeros(edges.shape), np.finfo(float).tiny
+    for j in range(len(edges)):
+        parents, rows = np.flatnonzero(edges[:, j]), ~data.targeted[:, j]
+        if len(parents) and rows.sum() > len(parents) + 1:
+            x, y = data.values[rows][:, parents], data.values[rows, j]
+            x, y = x - x.mean(axis=0), y - y.mean()
+            inverse = np.linalg.pinv(x.T @ x)
+            weight = inverse @ (x.T @ y)
+            left = max(float(np.sum((y - x @ weight) ** 2)), 1e-16 * float(y @ y), tiny)
+            ratio = weight**2 / (np.maximum(np.diag(inverse), tiny) * left)
+            gain[parents, j] = 0.5 * len(y) * np.log1p(ratio)
+    return np.where(edges & edges.T, np.minimum(gain, gain.T), gain)
+
+
+# --- through time ---------------------------------------------------------------------------------
+
+
+def pcmci_plus(
+    data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1
+) -> EstimatedGraph:
+    """Find a graph within the instant and over time by tests of partial correlation.
+
+    Columns that never change within an episode are the same at every lag. They act with lag 1 on
+    those that do, which do not act on them.
+
+    Args:
+        data: Rows of episodes in time; those in which something is done are left out, and what
+            comes after begins anew.
+        seed: Not used: nothing is drawn.
+        alpha: Level of the tests.
+        tau_max: Longest lag [control steps].
+    """
+    settings = {
+        "alpha": _number("alpha of 'pcmci+'", alpha, below=1.0),
+        "tau_max": whole_number("tau_max of 'pcmci+'", tau_max, least=1),
+    }
+    table, notes = _usable("pcmci+", data)
+    p = len(table.names)
+    edges, sure = np.zeros((tau_max + 1, p, p), bool), np.zeros((tau_max + 1, p, p))
+    if p:
+        parts = [part for part in runs(table) if len(part) > 2 * tau_max]
+        whole, least = sum(len(part) - 2 * tau_max for part in parts), p * (tau_max + 1)
+        if whole <= least:
+            needed = f"more than {least} rows with {2 * tau_max} rows before them"
+            raise ModelError(
+                [f"'pcmci+' needs {needed}, for as many columns and lags; got {whole}"]
+            )
+        with _quietly("pcmci+", seed):
+            result = _pcmci_plus(parts, alpha, tau_max)
+        edges = edges_of_links(result["graph"])
+        sure = -np.log10(np.clip(np.moveaxis(result["p_matrix"], 2, 0), 1e-300, 1.0))
+        sure[0] = np.where(edges[0].T & ~edges[0], 0.0, sure[0])
+        note = _contradictions(int(np.sum(result["graph"] == "x-x")) // 2)
+        notes += (note,) * bool(note)
+    found = EstimatedGraph.of(table.names, edges, edge_scores=sure, notes=notes, settings=settings)
+    return found.restricted(data.names)
+
+
+def _pcmci_plus(parts: list[Floats], alpha: float, tau_max: int) -> dict[str, Any]:
+    several = len(parts) > 1
+    frame = import_module("tigramite.data_processing").DataFrame(
+        dict(enumerate(parts)) if several else parts[0],
+        analysis_mode="multiple" if several else "single",
+    )
+    test = import_module("tigramite.independence_tests.parcorr").ParCorr()
+    search = import_module("tigramite.pcmci").PCMCI(frame, test, verbosity=0)
+    still = np.all([np.ptp(part, axis=0) < STILL for part in parts], axis=0)
+    links: dict[int, dict[tuple[int, int], str]] = {}  # by effect; cause and negative lag
+    for j, j_still in enumerate(still):
+        links[j] = {(i, 0): "o?o" for i in np.flatnonzero(still == j_still).tolist() if i != j}
+        for i, i_still in enumerate(still):
+            longest = 0 if j_still else 1 if i_still else tau_max
+            links[j].update({(i, -lag): "-?>" for lag in range(1, longest + 1)})
+    result: dict[str, Any] = search.run_pcmciplus(
+        link_assumptions=links, tau_max=tau_max, pc_alpha=alpha
+    )
+    return result
+
+
+def runs(data: Dataset) -> list[Floats]:
+    """Cut rows where they do not follow one another; parts have shape (n, p)."""
+    follows = (np.diff(data.episode) == 0) & (np.diff(data.step) == 1)
+    return np.split(data.values, np.flatnonzero(~follows) + 1)
+
+
+def edges_of_links(graph: Any) -> Bools:
+    """Read the links of tigramite.
+
+    Args:
+        graph: Shape (p, p, lags + 1): ``"-->"`` at [i, j, lag] if i acts on j, ``"<--"`` if j acts
+            on i; ``"o-o"`` and ``"x-x"`` have no direction, and neither has ``"<->"``.
+
+    Returns:
+        Shape (lags + 1, p, p): where i may act on j.
+
+    Example:
+        >>> graph = np.array([[["", ""], ["x-x", "-->"]], [["x-x", ""], ["", ""]]])
+        >>> edges_of_links(graph).tolist()
+        [[[False, True], [True, False]], [[False, True], [False, False]]]
+    """
+    words = np.moveaxis(np.array(graph, dtype=str), 2, 0)
+    return np.asarray((words != "") & (~np.char.startswith(words, "<") | (words == "<->")))
+
+
+# --- data and calls -------------------------------------------------------------------------------
+
+
+def _usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset, tuple[str, ...]]:
+    """Return standardised rows and columns that a learner can use, and notes on what it cannot.
+
+    Where columns are linear functions of one another, earlier control steps are kept rather than
+    later ones, then columns on the left. Without a result its causes are still seen together;
+    without a cause its results would seem to be tied.
+
+    Args:
+        learner: Its name, for messages.
+        data: Rows under any regime.
+        done: Whether it can use rows in which something is done; they are left out otherwise.
+
+    Raises:
+        ModelError: No row is left, or not more rows than columns.
+    """
+    rows = data if done else data.observational
+    if len(rows) == 0:
+        raise ModelError(
+            [f"{learner!r} uses only rows in which nothing is done, and there are none; add some"]
+        )
+    values = rows.standardised().values
+    varying = np.flatnonzero(values.any(axis=0))
+    if len(rows) <= len(varying):
+        given = f"{len(rows)} rows and {len(varying)} columns that vary"
+        raise ModelError([f"{learner!r} needs more rows than columns; there are {given}"])
+    lags = np.array([rows.columns[i].lag for i in varying], dtype=np.int64)
+    order = varying[np.argsort(-lags, kind="stable")]
+    kept = np.sort(order[independent(values[:, order])])
+    left, names = len(data) - len(rows), np.array(data.names, dtype=object)
+    notes = [f"{left} of {len(data)} rows were left out: something is done in them"] * bool(left)
+    constant = np.delete(np.arange(len(names)), varying)
+    for what, which in (
+        ("taken for real numbers", [i for i in kept if data.columns[i].dtype != "real"]),
+        ("without edges, since they do not vary", constant),
+        ("without edges, since other columns determine them", np.setdiff1d(varying, kept)),
+    ):
+        if len(which):
+            more = f" and {len(which) - SHOWN} more" if len(which) > SHOWN else ""
+            notes.append(f"{what}: {', '.join(names[which[:SHOWN]])}{more}")
+    return rows.select([rows.names[i] for i in kept]).standardised(), tuple(notes)
+
+
+def independent(values: Floats) -> Integers:
+    """List the columns that are not linear functions of those before them.
+
+    Args:
+        values: Shape (n, p), of mean 0 and variance 1.
+
+    Returns:
+        Their numbers, sorted.
+    """
+    n, p = values.shape
+    basis = np.zeros((n, p))
+    kept: list[int] = []
+    for column in range(p):
+        q = basis[:, : len(kept)]
+        rest = values[:, column]
+        for _ in range(2):  # once is not exact enough: Parlett, The Symmetric Eigenvalue Problem
+            rest = rest - q @ (q.T @ rest)
+        length = float(np.linalg.norm(rest))
+        if length > DEPENDENT * float(np.linalg.norm(values[:, column])):
+            basis[:, len(kept)] = rest / length
+            kept.append(column)
+    return np.array(kept, dtype=np.int64)
+
+
+@contextmanager
+def _quietly(learner: str, seed: int) -> Iterator[None]:
+    """Run another library seeded, silent, and with its errors as ``ModelError``.
+
+    Some libraries draw from the global generators, which are put back afterwards.
+    """
+    python = random.getstate()
+    numpy = np.random.get_state()  # noqa: NPY002 # not ours: it is put back
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 # the libraries draw from this one
+    try:
+        with (
+            redirect_stdout(StringIO()),
+            redirect_stderr(StringIO()),
+            warnings.catch_warnings(),
+            np.errstate(all="ignore"),
+        ):
+            warnings.simplefilter("ignore")
+            yield
+    except ScmWorldError:
+        raise
+    except (ArithmeticError, AssertionError, IndexError, ValueError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ModelError(
+            [f"the library behind {learner!r} cannot use these data: {said}; try fewer columns"]
+        ) from error
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002

@@ -1,0 +1,446 @@
+"""Scores of estimated graphs: counts, intervention distances, rankings and predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, final
+
+import numpy as np
+from scipy.stats import rankdata
+
+from scm_world._types import Floats, Integers
+from scm_world.discovery.data.dataset import Dataset
+from scm_world.discovery.distances import (
+    MEMBERS,
+    Adjustment,
+    aid,
+    has_gadjid,
+    shd,
+    shd_of_classes,
+    sid_bounds,
+)
+from scm_world.discovery.learners.found import EstimatedGraph
+from scm_world.errors import ModelError, UnknownVariable, raise_all
+from scm_world.graph.equivalence import Bools, extension, is_acyclic, topological_order
+from scm_world.queries.experiments.effects import EdgeKey
+
+
+@final
+@dataclass(frozen=True)
+class GraphScore:
+    """A comparison of two sets of lagged edges.
+
+    Attributes:
+        shd: Structural Hamming distance: edges to add, remove or turn around.
+        precision: Estimated edges that are true, as a fraction; 1 if none was estimated.
+        recall: True edges that were estimated, as a fraction; 1 if there is none.
+        f1: Harmonic mean of the two.
+        undeclared: Estimated but not declared.
+        missed: Declared but not estimated.
+
+    Source:
+        Tsamardinos, Brown and Aliferis, *The max-min hill-climbing Bayesian network structure
+        learning algorithm*, Machine Learning 2006, for the distance.
+    """
+
+    shd: int
+    precision: float
+    recall: float
+    f1: float
+    undeclared: tuple[EdgeKey, ...]
+    missed: tuple[EdgeKey, ...]
+
+
+def score(found: Iterable[EdgeKey], declared: Iterable[EdgeKey]) -> GraphScore:
+    """Compare estimated edges with declared ones.
+
+    Example:
+        >>> score([("a", "b", 0), ("c", "b", 1)], [("b", "a", 0), ("c", "b", 1)]).shd
+        1
+    """
+    found_set, declared_set = set(found), set(declared)
+    common = found_set & declared_set
+    undeclared, missed = found_set - declared_set, declared_set - found_set
+    reversed_ = {
+        (cause, effect, lag)
+        for cause, effect, lag in undeclared
+        if lag == 0 and (effect, cause, lag) in missed
+    }
+    precision = len(common) / len(found_set) if found_set else 1.0
+    recall = len(common) / len(declared_set) if declared_set else 1.0
+    both = precision + recall
+    return GraphScore(
+        shd=len(undeclared) + len(missed) - len(reversed_),
+        precision=precision,
+        recall=recall,
+        f1=2 * precision * recall / both if both else 0.0,
+        undeclared=tuple(sorted(undeclared)),
+        missed=tuple(sorted(missed)),
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Scores:
+    """The distance of an estimated graph from the true one; None for what does not apply.
+
+    Attributes:
+        shd: Structural Hamming distance, over all lags. An edge without direction counts 1 where
+            it is wrong and 1 where it is right.
+        shd_by_lag: The same for each lag, from 0 on. shd_classes: Between the two essential graphs.
+        Only without lags. precision: Estimated edges with a direction that are true, as a fraction;
+        1 if there are none. recall: True edges that were estimated with their direction, as a
+        fraction; 1 if there is none. f1: Harmonic mean of the two. false_discoveries: Estimated
+        edges with a direction that are not true, as a fraction; 0 if
+            there are none.
+        skeleton_precision: As above, without regard to directions within an instant.
+        skeleton_recall: As above.
+        skeleton_f1: As above.
+        auroc: Probability that a true edge has a larger edge_scores than what is not true.
+        auprc: Average precision in the order of edge_scores.
+        sid_lower: Pairs whose interventional distribution comes out wrong, for the best acyclic
+            graph that the estimated one can become. Only without lags.
+        sid_upper: For the worst; the same number if every edge has a direction.
+        parent_aid: Effects that come out wrong if one adjusts for the estimated parents; by
+            ``gadjid``. Only without lags.
+        ancestor_aid: For the estimated ancestors.
+        oset_aid: For the set that would be best in the estimated graph.
+        edges: How many edges were estimated, those without direction counted once.
+        declared: How many edges are true.
+        pairs: How many ordered pairs count, over all lags.
+        notes: Why something is None.
+    """
+
+    shd: int
+    shd_by_lag: tuple[int, ...]
+    shd_classes: int | None
+    precision: float
+    recall: float
+    f1: float
+    false_discoveries: float
+    skeleton_precision: float
+    skeleton_recall: float
+    skeleton_f1: float
+    auroc: float | None
+    auprc: float | None
+    sid_lower: int | None
+    sid_upper: int | None
+    parent_aid: int | None
+    ancestor_aid: int | None
+    oset_aid: int | None
+    edges: int
+    declared: int
+    pairs: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sid(self) -> int | None:
+        """Structural intervention distance, where the estimated graph leaves no choice."""
+        return self.sid_lower if self.sid_lower == self.sid_upper else None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Write the scores as plain data."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+
+
+def evaluate(
+    found: EstimatedGraph,
+    declared: Iterable[EdgeKey],
+    *,
+    names: Sequence[str] | None = None,
+    pairs: Any = None,
+) -> Scores:
+    """Compare an estimated graph with the true one.
+
+    Intervention distances and classes are about acyclic graphs of one instant. The two slices of a
+    graph through time are no such graph: what happened before the first slice acts on all of it.
+    So these scores are None as soon as one of the graphs has a lag.
+
+    Args:
+        found: What a learner gave.
+        declared: The true edges: cause, effect, lag.
+        names: The variables to compare on; those of ``found`` if None. Variables that ``found``
+            does not have count as having no edge.
+        pairs: Which pairs count, shape (p, p) or (lags + 1, p, p): not those that share a cause
+            nobody observes. All of them if None. A missing lag counts in full. Within an instant
+            a pair counts if it does so in both orders, and nothing acts on itself.
+
+    Raises:
+        UnknownVariable: A true edge is about a variable that is not compared on;
+            SeveralProblems if there are more of them.
+        ModelError: ``pairs`` has another shape.
+
+    Source:
+        Of the rates: Tsamardinos et al. 2006; false discoveries as in Benjamini and Hochberg,
+        *Controlling the false discovery rate*, JRSS B 1995. Of the others, see ``distances``.
+
+    Example:
+        >>> found = EstimatedGraph.of_edges(["x", "y", "z"], [("x", "y", 0), ("z", "y", 0)])
+        >>> scores = evaluate(found, [("x", "y", 0), ("y", "z", 0)])
+        >>> scores.shd, scores.sid, scores.precision, scores.skeleton_f1
+        (1, 3, 0.5, 1.0)
+    """
+    keys = list(declared)
+    kept = found if names is None else found.restricted(tuple(names))
+    lags = max([len(kept.edges) - 1, *(lag for *_, lag in keys)])
+    true = matrices(keys, kept.names, lags)
+    counts = _counting(pairs, true.shape)
+    later = ((0, lags + 1 - len(kept.edges)), (0, 0), (0, 0))
+    kept = kept.told(
+        edges=np.pad(kept.edges, later) & counts, edge_scores=np.pad(kept.edge_scores, later)
+    )
+    true = true & counts
+    declared_keys = _keys(kept.names, true)
+    directed = score(kept.directed, declared_keys)
+    either = score(_keys(kept.names, _bare(kept.edges)), _keys(kept.names, _bare(true)))
+    by_lag = (
+        shd(kept.edges[0], true[0]),
+        *(int((kept.edges[lag] != true[lag]).sum()) for lag in range(1, lags + 1)),
+    )
+    return Scores(
+        shd=sum(by_lag),
+        shd_by_lag=by_lag,
+        precision=directed.precision,
+        recall=directed.recall,
+        f1=directed.f1,
+        false_discoveries=1.0 - directed.precision,
+        skeleton_precision=either.precision,
+        skeleton_recall=either.recall,
+        skeleton_f1=either.f1,
+        auroc=auroc(kept.edge_scores[counts], true[counts]),
+        auprc=auprc(kept.edge_scores[counts], true[counts]),
+        edges=len(kept.directed) + len(kept.undirected),
+        declared=len(declared_keys),
+        pairs=int(counts.sum()),
+        **_within_an_instant(kept.edges, true, counts),
+    )
+
+
+def matrices(edges: Iterable[EdgeKey], names: tuple[str, ...], lags: int) -> Bools:
+    """Write lagged edges as matrices, shape (lags + 1, p, p).
+
+    Raises:
+        UnknownVariable: An edge is about another variable.
+    """
+    at = {name: i for i, name in enumerate(names)}
+    result = np.zeros((lags + 1, len(names), len(names)), dtype=bool)
+    keys = list(edges)
+    unknown = dict.fromkeys(name for key in keys for name in key[:2] if name not in at)
+    raise_all([UnknownVariable(name, names) for name in unknown])
+    for cause, effect, lag in keys:
+        result[lag, at[cause], at[effect]] = True
+    return result
+
+
+def _counting(pairs: Any, shape: tuple[int, ...]) -> Bools:
+    counts = np.ones(shape, dtype=bool)
+    if pairs is not None:
+        given = np.asarray(pairs, dtype=bool)
+        given = given[None] if given.ndim == 2 else given
+        if given.ndim != 3 or given.shape[1:] != shape[1:] or len(given) > len(counts):
+            raise ModelError([f"pairs has shape {given.shape}; it can be up to {shape}"])
+        counts[: len(given)] = given
+    counts[0] &= counts[0].T
+    np.fill_diagonal(counts[0], False)
+    return counts
+
+
+def _bare(edges: Bools) -> Bools:
+    bare = edges.copy()
+    bare[0] = np.triu(edges[0] | edges[0].T)
+    return bare
+
+
+def _keys(names: tuple[str, ...], edges: Bools) -> list[EdgeKey]:
+    return [(names[i], names[j], lag) for lag, i, j in np.argwhere(edges).tolist()]
+
+
+def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, Any]:
+    """Compute what is defined for acyclic graphs of one instant only."""
+    kinds: tuple[Adjustment, ...] = ("parent", "ancestor", "oset")
+    result: dict[str, Any] = dict.fromkeys(
+        ("shd_classes", "sid_lower", "sid_upper", *(f"{kind}_aid" for kind in kinds))
+    )
+    reason = _not_comparable(edges, true, counts)
+    if reason:
+        return {**result, "notes": (f"no intervention distances: {reason}",)}
+    notes = []
+    result["shd_classes"] = shd_of_classes(edges[0], true[0])
+    bounds = sid_bounds(edges[0], true[0])
+    if bounds is None:
+        notes.append(f"no SID: there are more than {MEMBERS} ways to direct the found graph")
+    else:
+        result["sid_lower"], result["sid_upper"] = bounds
+    if has_gadjid():
+        result |= {f"{kind}_aid": aid(edges[0], true[0], kind) for kind in kinds}
+    else:
+        notes.append("no adjustment distances: pip install 'scm-world[discovery]'")
+    return {**result, "notes": tuple(notes)}
+
+
+def _not_comparable(edges: Bools, true: Bools, counts: Bools) -> str:
+    if len(true) > 1 and (edges[1:].any() or true[1:].any()):
+        return "there are edges through time"
+    if counts[0].sum() < counts[0].size - len(counts[0]):
+        return "some pairs do not count"
+    if not is_acyclic(true[0]):
+        return "the declared graph has a cycle"
+    if extension(edges[0]) is None:
+        return "the found graph has a cycle, or cannot be directed without another v-structure"
+    return ""
+
+
+def auroc(edge_scores: Floats, present: Bools) -> float | None:
+    """Compute the area under the receiver operating characteristic.
+
+    Args:
+        edge_scores: Of each candidate, shape (n,); the larger, the surer.
+        present: Whether it is there, shape (n,).
+
+    Returns:
+        Probability that something present ranks before something absent, a tie counting half.
+        None if all are present, or none is.
+
+    Source:
+        Hanley and McNeil, *The meaning and use of the area under a receiver operating
+        characteristic (ROC) curve*, Radiology 1982.
+
+    Example:
+        >>> auroc(np.array([0.9, 0.5, 0.5, 0.1]), np.array([True, True, False, False]))
+        0.875
+    """
+    positives = int(present.sum())
+    negatives = len(present) - positives
+    if not positives or not negatives:
+        return None
+    above = rankdata(edge_scores)[present].sum() - positives * (positives + 1) / 2.0
+    return float(above / (positives * negatives))
+
+
+def auprc(edge_scores: Floats, present: Bools) -> float | None:
+    """Compute the average precision: precision at each recall, summed over the steps in recall.
+
+    Candidates with the same edge_scores are accepted together; arguments are those of ``auroc``.
+
+    Source:
+        Davis and Goadrich, *The relationship between precision-recall and ROC curves*, ICML 2006,
+        on why not to interpolate linearly.
+    """
+    positives = int(present.sum())
+    if not positives or positives == len(present):
+        return None
+    levels, at = np.unique(-edge_scores, return_inverse=True)
+    accepted = np.cumsum(np.bincount(at, minlength=len(levels)))
+    hits = np.cumsum(np.bincount(at, weights=present, minlength=len(levels)))
+    steps = np.diff(hits, prepend=0.0) / positives
+    return float((steps * hits / accepted).sum())
+
+
+CONSTANT = 1e-12
+"""A column that varies less than this, relative to its mean, is constant."""
+
+
+@final
+@dataclass(frozen=True)
+class Prediction:
+    """How far predicted means are from the true ones, under held-out interventions.
+
+    Attributes:
+        rmse: Root of the mean square over regimes and columns that were not set, each difference
+            divided by the standard deviation of the column where nothing is done. None if it
+            cannot be computed.
+        unmoved: The same for the prediction that nothing moves; a graph is worth something below.
+        note: Why ``rmse`` is None.
+    """
+
+    rmse: float | None
+    unmoved: float | None = None
+    note: str = ""
+
+
+def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> Prediction:
+    """Predict the mean of every column under interventions that were not learned from.
+
+    The mechanism of each column is linear in its estimated parents, fitted by least squares on the
+    rows of ``train`` where the column was not set. Under the interventions of ``test`` the means
+    of what was set are given, and the others follow in causal order. Scaling a column changes
+    nothing. Of edges without direction one extension is taken, the first of Dor and Tarsi: another
+    member of the class may predict otherwise.
+
+    Args:
+        found: A graph over columns or variables of the tables; columns it does not know are left
+            out. An edge between two vectors joins all their components.
+        train: With rows in which nothing was done.
+        test: With rows in which something was done.
+
+    Raises:
+        UnknownVariable: The graph is about something that is no column and no variable.
+        ModelError: ``train`` has no row in which nothing was done, or ``test`` none in which
+            something was.
+
+    Source:
+        Peters, Janzing and Schölkopf, *Elements of Causal Inference*, 2017, section 6.3, for the
+        truncated factorization; of linear mechanisms only means are needed.
+    """
+    if not len(train.observational):
+        raise ModelError(["train has no row in which nothing was done"])
+    if not any(test.regimes[number].targets for number in np.unique(test.regime)):
+        raise ModelError(["test has no row in which something was done"])
+    if found.edges[1:].any():
+        return Prediction(None, note="the graph has edges through time")
+    dag = extension(found.edges[0])
+    if dag is None:
+        return Prediction(None, note="the graph has a cycle, or no extension")
+    where, graph = _over_columns(found.names, dag, train)
+    seen = train.observational.values[:, where]
+    middle, spread = seen.mean(axis=0), seen.std(axis=0)
+    spread[spread <= CONSTANT * (1.0 + np.abs(middle))] = np.nan
+    weight, offset = _fitted(train.values[:, where], train.targeted[:, where], graph)
+    errors: list[Floats] = []
+    moves: list[Floats] = []
+    for number in np.unique(test.regime):
+        rows = test.regime == number
+        fixed = test.targeted[rows][0, where]
+        came_out = test.values[rows][:, where].mean(axis=0)
+        known = ~fixed & np.isfinite(spread)
+        if fixed.any() and known.any():
+            predicted = came_out.copy()
+            for node in topological_order(graph):
+                if not fixed[node]:
+                    predicted[node] = offset[node] + predicted @ weight[:, node]
+            errors.append(((predicted - came_out) / spread)[known])
+            moves.append(((middle - came_out) / spread)[known])
+    if not moves:
+        return Prediction(None, note="no column varies that was not set")
+    rmse, unmoved = (float(np.sqrt((np.concatenate(p) ** 2).mean())) for p in (errors, moves))
+    return Prediction(rmse, unmoved)
+
+
+def _fitted(values: Floats, targeted: Bools, graph: Bools) -> tuple[Floats, Floats]:
+    """Fit each column on its parents: weights, shape (p, p), and offsets, shape (p,)."""
+    scale = np.maximum(values.std(axis=0), np.finfo(float).tiny)
+    weight, offset = np.zeros(graph.shape), np.zeros(len(graph))
+    for node in range(len(graph)):
+        rows, parents = ~targeted[:, node], graph[:, node]
+        causes, effect = values[np.ix_(rows, parents)], values[rows, node]
+        center, mean = causes.mean(axis=0), effect.mean()
+        slope, *_ = np.linalg.lstsq((causes - center) / scale[parents], effect - mean, rcond=None)
+        weight[parents, node] = slope / scale[parents]
+        offset[node] = mean - center @ weight[parents, node]
+    return weight, offset
+
+
+def _over_columns(names: Sequence[str], dag: Bools, data: Dataset) -> tuple[Integers, Bools]:
+    """Write a graph over variables as one over the columns they have."""
+    groups = []
+    for name in names:
+        if name in data.names:
+            groups.append([data.names.index(name)])
+        elif name in data.blocks:
+            groups.append(data.blocks[name].tolist())
+        else:
+            raise UnknownVariable(name, (*data.names, *data.variables))
+    owner = np.repeat(np.arange(len(names)), [len(group) for group in groups])
+    where = np.array([i for group in groups for i in group], dtype=np.int64)
+    return where, dag[np.ix_(owner, owner)]
