@@ -90,9 +90,9 @@ def test_the_readme_is_short() -> None:
 
 def test_the_tables_of_variables_are_up_to_date() -> None:
     """``docs/variables.md`` is what ``scm-world variables all --markdown`` writes."""
-    from scm_world.cli.variables import markdown
+    from scm_world.cli.inspection import variables_page
 
-    assert (ROOT / "docs" / "variables.md").read_text() == markdown()
+    assert (ROOT / "docs" / "variables.md").read_text() == variables_page()
 
 
 EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it short

@@ -1,46 +1,62 @@
-"""Where the words go, and how numbers and files are written."""
+"""What commands print, and the folders that they write into."""
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 from uuid import uuid4
 
 import numpy as np
 import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
+from scm_world.cli.arguments import suffix
 from scm_world.output.durable import made, removed, write_durably
 from scm_world.output.locations import Location
 from scm_world.output.remote import Remote
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
 WIDTH, PAGE = 160, 200  # [characters] where there is no terminal to ask; for the widest tables
 RESULTS = Path("scm-world-results")
+INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def console(*, stderr: bool = False, file: IO[str] | None = None, width: int = WIDTH) -> Console:
-    """Open the terminal; plain text of a fixed width where there is none."""
-    from rich.console import Console
-
+    """Return the terminal, or plain text of a fixed width where there is none."""
     terminal = Console(stderr=stderr, file=file, highlight=False)
     if terminal.is_terminal:
         return terminal
     return Console(stderr=stderr, file=file, highlight=False, width=width)
 
 
-def table(*headers: str, title: str = "", caption: str = "") -> Table:
-    """Begin a table whose cells wrap and are never cut off."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
+def say(*lines: object, stderr: bool = False) -> None:
+    """Print lines as they are: no markup, no wrapping."""
+    for line in lines:
+        console(stderr=stderr).print(Text(str(line)), soft_wrap=True)
 
+
+def written(*paths: Location) -> None:
+    """Print which files were written."""
+    for number, path in enumerate(paths):
+        say(f"{'         ' if number else 'written: '}{path}")
+
+
+def table(*headers: str, title: str = "", caption: str = "", whole: tuple[int, ...] = ()) -> Table:
+    """Return an empty table whose cells wrap and are never cut off.
+
+    Args:
+        headers: Of the columns.
+        title: Above the table.
+        caption: Below it.
+        whole: Columns whose words are not broken where the terminal is wide enough.
+    """
     begun = Table(
         title=Text(title) if title else None,
         caption=Text(caption) if caption else None,
@@ -50,55 +66,39 @@ def table(*headers: str, title: str = "", caption: str = "") -> Table:
         title_style="bold",
         pad_edge=False,
     )
-    for header in headers:
-        begun.add_column(header, overflow="fold")
+    wide = console().width >= WIDTH
+    for number, header in enumerate(headers):
+        begun.add_column(header, overflow="fold", no_wrap=wide and number in whole)
     return begun
 
 
-def keep_whole(made: Table, terminal: Console, *columns: int) -> Table:
-    """Do not break the words in some columns where there is room enough."""
-    if terminal.width >= WIDTH:
-        for column in columns:
-            made.columns[column].no_wrap = True
-    return made
-
-
-def fail(message: str) -> None:
-    """Write one error line."""
-    from rich.text import Text
-
-    line = Text.assemble(("error:", "bold red"), " ", message)
-    console(stderr=True).print(line, soft_wrap=True)
-
-
-def written(terminal: Console, *paths: Location) -> None:
-    """Say which files were written."""
-    from rich.text import Text
-
-    for number, path in enumerate(paths):
-        lead = "         " if number else "written: "
-        terminal.print(Text(f"{lead}{path}"), soft_wrap=True)
+def facts(rows: Any) -> Table:
+    """Return a table of a name and a value per line: green if it is good, red if it is bad."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="bold")
+    grid.add_column(overflow="fold")
+    for name, value, good in rows:
+        grid.add_row(name, Text(value, style={True: "green", False: "bold red"}.get(good, "")))
+    return grid
 
 
 def show(value: Any, *, per_line: int = 3) -> str:
-    """Write a value down with four digits, long ones over several lines.
+    """Return a value with four digits, long ones over several lines.
 
     Example:
         >>> show(0.0200001), show([1.0, -0.0, 2.5])
         ('0.02', '1 0 2.5')
     """
-    numbers = [_show(float(x)) for x in np.ravel(value)]
+    numbers = [
+        f"{x:.1e}" if 0.0 < abs(x) < 1e-4 else f"{x + 0.0:.4g}" for x in map(float, np.ravel(value))
+    ]
     step = 2 if len(numbers) == 4 else per_line
     rows = [" ".join(numbers[i : i + step]) for i in range(0, len(numbers), step)]
     return "\n".join(rows)
 
 
-def _show(number: float) -> str:
-    return f"{number:.1e}" if 0.0 < abs(number) < 1e-4 else f"{number + 0.0:.4g}"
-
-
 def plain(value: Any) -> Any:
-    """Turn a value into data that JSON can hold; what is not finite becomes None."""
+    """Return a value as data that JSON can hold; what is not finite becomes None."""
     match value:
         case np.ndarray() | np.generic():
             return plain(value.tolist())
@@ -111,6 +111,35 @@ def plain(value: Any) -> Any:
     return value
 
 
+@contextmanager
+def progress(what: str, *, lines: int = 0, about: str = "") -> Iterator[Callable[[int, int], None]]:
+    """Show how much is done: a bar on a terminal, elsewhere some lines.
+
+    Args:
+        what: What is counted, such as ``"episodes"``.
+        lines: How many lines there are where there is no terminal.
+        about: Said before.
+    """
+    terminal = console(stderr=True)
+    if not terminal.is_terminal:
+        last = 0
+
+        def tell(done: int, planned: int) -> None:
+            nonlocal last
+            if lines * done // planned != last:
+                last = lines * done // planned
+                say(f"{about}{done:,} of {planned:,} {what}", stderr=True)
+
+        yield tell
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    columns = (f"{about}{what}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=terminal, transient=True) as bar:
+        row = bar.add_task("", total=None)
+        yield lambda done, planned: bar.update(row, completed=done, total=planned)
+
+
 def check_writable(path: Location, *, folder: bool) -> None:
     """Refuse a place that cannot be written before time is spent on filling it.
 
@@ -118,8 +147,10 @@ def check_writable(path: Location, *, folder: bool) -> None:
         BadParameter: Something else lies there, or it is read-only.
         UnwritableFolder: A store does not answer, or does not allow it.
     """
-    if isinstance(path, Remote):
-        _try(path if folder else path.parent)
+    if isinstance(path, Remote):  # writing something is the only way to know
+        trial = (path if folder else path.parent) / f".trial-{uuid4().hex}"
+        write_durably(trial, b"")
+        removed(trial)
     if path.exists() and path.is_dir() != folder:
         kind = "a file" if folder else "a folder"
         raise typer.BadParameter(f"{str(path)!r} is {kind}", param_hint="'--out'")
@@ -132,11 +163,22 @@ def check_writable(path: Location, *, folder: bool) -> None:
         raise typer.BadParameter(f"{str(there)!r} cannot be written to", param_hint="'--out'")
 
 
-def _try(folder: Remote) -> None:
-    """Write something to a store, and remove it: there is no other way to know."""
-    trial = folder / f".trial-{uuid4().hex}"
-    write_durably(trial, b"")
-    removed(trial)
+def results_folder(out: Location | None, *words: object, option: Any = ()) -> Location:
+    """Return the folder for the results of a command, which can be written to.
+
+    Args:
+        out: What was asked for.
+        words: Name the folder if nothing was asked for.
+        option: Arguments of the task; they end that name.
+    """
+    folder = out or RESULTS / ("-".join(str(word) for word in words if word) + suffix(option or ()))
+    check_writable(folder, folder=True)
+    return folder
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write plain data to a file; numbers that are not finite become null."""
+    path.write_text(json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
 @contextmanager

@@ -1,185 +1,244 @@
-"""``scm-world discover``."""
+"""The commands that recover and check causal graphs: ``discover`` and ``verify``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+from rich.table import Table
 from rich.text import Text
 
+from scm_world.cli import options
+from scm_world.cli.arguments import (
+    backend_of,
+    load_system,
+    load_task,
+    open_system,
+    split,
+    tag,
+)
 from scm_world.cli.console import (
-    RESULTS,
-    check_writable,
+    INTERRUPTED,
     console,
-    keep_whole,
+    facts,
+    progress,
+    results_folder,
+    say,
     staged,
     table,
     written,
 )
-from scm_world.cli.tasks import suffix, system, tag
-from scm_world.discovery import DiscoveryReport, discover
-from scm_world.discovery.names import by_entity
-from scm_world.discovery.plots import draw_graphs
+from scm_world.errors import UnknownOption
 from scm_world.output.locations import Location
-from scm_world.queries import SCM, World
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
+    from scm_world.discovery import DiscoveryReport
+    from scm_world.discovery.problems import TaskView
+    from scm_world.queries.agreement import Agreement
+    from scm_world.queries.verification import Verification
 
-INTERRUPTED = 130
-PROGRESS = "progress.json"
 LONG = 80  # [characters] what is longer is not repeated
-EXTRA, MISSING = "bold dark_orange", "bold red"
+LISTED = 10  # edges
+BRIEF = (
+    *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid"),
+    *("experiments", "seconds"),
+)
+SMALL: dict[str, tuple[str, ...]] = {
+    "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=0.035,0.035,0.07"),
+    "stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
+    "creative_stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
+    "general": ("nums_objects=2",),
+}
+"""Two blocks, where there are more by default: what ``verify all`` verifies."""
 
 
-@final
-@dataclass(frozen=True)
-class Options:
-    """What to discover.
+def discover(
+    task: Annotated[
+        str,
+        typer.Argument(
+            metavar="SYSTEM",
+            help="A task, a model.xml or model.urdf, or module:function; with --learner also a "
+            "family with a size (er2:20, sf2:50, tanh4:100), the JSON file of an SCM, or several "
+            "with commas between them.",
+        ),
+    ],
+    backend: options.Backend = None,
+    probes: Annotated[int, typer.Option(min=1, help="Number of states to experiment in.")] = 32,
+    seed: options.Seed = 0,
+    preset: options.Preset = None,
+    out: options.Out = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if the SHD is not 0.")] = False,
+    option: options.Option = None,
+    resolution: options.Resolution = None,
+    learner: Annotated[
+        str | None,
+        typer.Option(help="Learners to benchmark, with commas; see 'scm-world list'."),
+    ] = None,
+    data: Annotated[
+        str | None,
+        typer.Option(
+            help="Of the benchmark: observational, interventional or paired, with commas.",
+            show_default="what each learner can use best",
+        ),
+    ] = None,
+    budget: Annotated[
+        str,
+        typer.Option(help="Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c."),
+    ] = "1000",
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds of the benchmark.")] = 3,
+    view: Annotated[
+        str, typer.Option(help="Rows of a task: outcome (one per episode) or step (control step).")
+    ] = "outcome",
+    cause: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATTERN", help="What varies, such as '*.mass'; repeat it for more."),
+    ] = None,
+    outcome: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Variable that is measured; repeat it for more."),
+    ] = None,
+    policy: Annotated[
+        str,
+        typer.Option(
+            help="random, sweep, across, grasp or still; usual is sweep, of --view step random."
+        ),
+    ] = "usual",
+    steps: options.Steps = 25,
+    sensor_noise: Annotated[
+        float, typer.Option(min=0.0, help="Of sensors: deviation, in halves of a range.")
+    ] = 0.005,
+    timeout: Annotated[
+        float, typer.Option(min=0.0, help="Limit of a run in seconds; 0 for none.")
+    ] = 300.0,
+    workers: options.Workers = None,
+    executor: options.Executor = None,
+    address: options.Address = None,
+) -> None:
+    """Recover a causal graph by experiments, and score it; or benchmark learners.
 
-    Attributes:
-        task: Name of the task.
-        backend: Name of the engine.
-        preset: Numerical settings.
-        probes: How many probe states.
-        seed: Of the experiments.
-        arguments: Of the task, each as ``name=value``.
-        resolution: Of the graph of the robot; that of the task if None.
+    Without --learner the one-step graph of a system is recovered by paired experiments. With it,
+    and for families, learners run over budgets and seeds, and a table, a picture and a report are
+    written. After Ctrl-C (exit code 130) the same command resumes.
+    Example: scm-world discover er2:20 --learner do_order,gies
     """
+    if learner or re.search(r":\d+$", task) or task.endswith(".json"):
+        from scm_world.discovery.problems import TaskView
 
-    task: str
-    backend: str
-    preset: str | None
-    probes: int
-    seed: int
-    arguments: tuple[str, ...] = ()
-    resolution: str | None = None
-
-
-def run(options: Options, *, out: Location | None, strict: bool) -> int:
-    """Discover, print, write; return the exit code."""
-    about = f"{options.backend}-seed{options.seed}{suffix(options.arguments)}"
-    about += f"-{options.resolution}" if options.resolution else ""
-    folder = out or RESULTS / f"discover-{tag(options.task)}-{about}"
-    check_writable(folder, folder=True)
-    task = system(options.task, options.arguments)
-    made = {"backend": options.backend, "preset": options.preset, "resolution": options.resolution}
-    asked = task if isinstance(task, SCM) else World(task, **made)  # type: ignore[arg-type]
-    with asked, shown_progress(options.probes) as progress:
-        report = discover(
-            asked,
-            probes=options.probes,
-            seed=options.seed,
-            progress=progress,
-            checkpoint=folder / PROGRESS,
+        settings = {"backend": backend, "preset": preset, "resolution": resolution}
+        chosen = TaskView(
+            view=view,
+            causes=tuple(cause) if cause else None,
+            outcomes=tuple(outcome) if outcome else None,
+            policy=policy,
+            steps=steps,
+            sensor_noise=sensor_noise,
+            options={name: value for name, value in settings.items() if value is not None},
         )
-    report = replace(report, arguments=options.arguments)
+        where = {"executor": executor, "workers": workers, "address": address}
+        spent = (budget, seeds, timeout)
+        _benchmark(task, learner or "paired", data or "", chosen, spent, where, option or (), out)
+        return
+
+    from scm_world.discovery import discover as discovered
+    from scm_world.discovery.plots import draw_graphs
+
+    elsewhere = {"--executor": executor, "--workers": workers, "--address": address}
+    for name, value in elsewhere.items():
+        if value not in (None, "serial", 1):
+            allowed = ("left out: discover without --learner runs in this process",)
+            raise UnknownOption(name, value, allowed)
+    settings = {"backend": backend, "preset": preset, "resolution": resolution}
+    with open_system(task, option, **settings) as system:
+        about = (tag(task), backend_of(system), f"seed{seed}")
+        folder = results_folder(out, "discover", *about, option=(*(option or ()), resolution or ""))
+        with progress("probe states", lines=4) as tell:
+            report = discovered(
+                system,
+                probes=probes,
+                seed=seed,
+                progress=tell,
+                checkpoint=folder / "progress.json",
+            )
+        names = tuple(system.graph)
+    report = replace(report, arguments=tuple(option or ()))
     terminal = console()
-    _print(terminal, report, tuple(asked.graph))
+    terminal.print(_edge_table(report, names))
+    used = {name for edge in (*report.found, *report.declared) for name in edge[:2]}
+    if lonely := [name for name in names if name not in used]:
+        from scm_world.discovery.names import by_entity
+
+        terminal.print(Text.assemble(("no edge at all: ", "bold"), ", ".join(by_entity(lonely))))
+        terminal.print()
+    terminal.print(facts(_numbers(report)))
     with staged(folder) as draft:
         report.save(draft / "report.json")
         draw_graphs(report, draft / "graphs.png")
-    written(terminal, folder / "report.json", folder / "graphs.png")
+    written(folder / "report.json", folder / "graphs.png")
     if report.probes < report.planned:
-        return INTERRUPTED
-    return int(strict and report.score.shd > 0)
+        raise typer.Exit(INTERRUPTED)
+    raise typer.Exit(int(strict and report.score.shd > 0))
 
 
-@contextmanager
-def shown_progress(probes: int, about: str = "") -> Iterator[Callable[[int, int], None]]:
-    """Show how far it is: a bar on a terminal, a few plain lines elsewhere."""
-    terminal = console(stderr=True)
-    lead = f"{about}, " if about else ""
-    if not terminal.is_terminal:
-        steps = {max(1, round(probes * quarter / 4)) for quarter in range(1, 5)}
-        yield (
-            lambda done, planned: (
-                terminal.print(f"{lead}probe state {done} of {planned}") if done in steps else None
-            )
-        )
-        return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> Table:
+    """Return one row per effect; a long list of causes is written out once."""
+    from scm_world.discovery.names import by_entity
 
-    columns = (f"{lead}probe states", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=terminal, transient=True) as bar:
-        task = bar.add_task("", total=probes)
-        yield lambda done, planned: bar.update(task, completed=done, total=planned)
-
-
-def _print(terminal: Console, report: DiscoveryReport, names: tuple[str, ...]) -> None:
-    terminal.print(keep_whole(_edges(report, names), terminal, 0))
-    used = {name for edge in (*report.found, *report.declared) for name in edge[:2]}
-    alone = [name for name in names if name not in used]
-    if alone:
-        terminal.print(Text.assemble(("no edge at all: ", "bold"), ", ".join(by_entity(alone))))
-        terminal.print()
-    terminal.print(_summary(report))
-
-
-def _edges(report: DiscoveryReport, names: Iterable[str]) -> Table:
-    """Write one row per effect."""
-    title = f"Recovered graph of {report.task} ({len(report.found)} edges)"
-    caption = "[+] found but not declared   [-] declared but not found"
-    headers = ("effect", "causes at once", "causes one step earlier", "edges")
-    made = table(*headers, title=title, caption=caption)
+    made = table(
+        *("effect", "causes at once", "causes one step earlier", "edges"),
+        title=f"Recovered graph of {report.task} ({len(report.found)} edges)",
+        caption="[+] found but not declared   [-] declared but not found",
+        whole=(0,),
+    )
     made.columns[3].justify = "right"
+    found, declared = set(report.found), set(report.declared)
     first: dict[str, str] = {}
     for effect in names:
-        cells = [_causes(report, names, effect, lag) for lag in (0, 1)]
-        if not any(cells):
-            continue
-        for lag, cell in enumerate(cells):
+        cells = []
+        for lag in (0, 1):
+            edges = [(cause, effect, lag) for cause in names]
+            kinds = (
+                ("", "", [e for e in edges if e in found and e in declared]),
+                ("[+]", "bold dark_orange", [e for e in edges if e in found - declared]),
+                ("[-]", "bold red", [e for e in edges if e in declared - found]),
+            )
+            parts = [
+                Text(symbol + short, style=style)
+                for symbol, style, kind in kinds
+                for short in by_entity(edge[0] for edge in kind)
+            ]
+            cell = Text(", ").join(parts)
             like = first.setdefault(cell.plain, effect)
-            if like != effect and len(cell) > LONG:
-                cells[lag] = Text(f"same as {like}", style="italic")
-        count = sum(edge[1] == effect for edge in report.found)
-        made.add_row(Text(effect, style="bold"), *cells, str(count))
-    return made
-
-
-def _causes(report: DiscoveryReport, names: Iterable[str], effect: str, lag: int) -> Text:
-    found, declared = set(report.found), set(report.declared)
-    edges = [(cause, effect, lag) for cause in names]
-    kinds = (
-        ("", "", [e for e in edges if e in found and e in declared]),
-        ("[+]", EXTRA, [e for e in edges if e in found and e not in declared]),
-        ("[-]", MISSING, [e for e in edges if e in declared and e not in found]),
-    )
-    parts = [
-        Text(symbol + short, style=style)
-        for symbol, style, kind in kinds
-        for short in by_entity(edge[0] for edge in kind)
-    ]
-    return Text(", ").join(parts)
-
-
-def _summary(report: DiscoveryReport) -> Table:
-    """Write the numbers, one per line."""
-    from rich.table import Table
-
-    made = Table.grid(padding=(0, 2))
-    made.add_column(style="bold")
-    made.add_column(overflow="fold")
-    for name, value, good in _numbers(report):
-        style = "" if good is None else ("green" if good else "bold red")
-        made.add_row(name, Text(value, style=style))
+            alike = like != effect and len(cell) > LONG
+            cells.append(Text(f"same as {like}", style="italic") if alike else cell)
+        if any(cells):
+            count = sum(edge[1] == effect for edge in report.found)
+            made.add_row(Text(effect, style="bold"), *cells, str(count))
     return made
 
 
 def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
-    score = report.score
+    """Yield the numbers of a report, what they mean, and whether they are good."""
+
+    def listed(edges: Sequence[tuple[str, str, int]]) -> str:
+        shown = [f"{cause} -> {effect} (lag {lag})" for cause, effect, lag in edges[:LISTED]]
+        more = [f"and {len(edges) - LISTED} more, see report.json"] * (len(edges) > LISTED)
+        return "\n".join([str(len(edges)), *shown, *more])
+
+    score, complete = report.score, report.probes == report.planned
     version = report.versions.get(report.backend, "")
-    complete = report.probes == report.planned
     states = f"{report.probes}" if complete else f"{report.probes} of {report.planned}: interrupted"
-    yield "engine", f"{report.backend} {version}, preset {report.preset}", None
+    yield "backend", f"{report.backend} {version}, preset {report.preset}", None
     if report.arguments:
         yield "options", ", ".join(report.arguments), None
     yield "probe states", states, None if complete else False
     yield "rollouts, at least needed", f"{report.rollouts}, {report.bound}", None
-    yield "floor (do and undo)", f"{report.floor:.3g}", None
+    yield "noise floor (do and undo)", f"{report.floor:.3g}", None
     yield "threshold", f"{report.threshold:.3g}", None
     yield "largest effect without an edge", f"{report.inert:.3g}", None
     yield "edges declared, found", f"{len(report.declared)}, {len(report.found)}", None
@@ -187,15 +246,187 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
     yield "precision", f"{score.precision:.4f}", None
     yield "recall", f"{score.recall:.4f}", None
     yield "F1", f"{score.f1:.4f}", None
-    yield "[+] undeclared", _list(score.undeclared), not score.undeclared
-    yield "[-] missed", _list(score.missed), not score.missed
+    yield "[+] undeclared", listed(score.undeclared), not score.undeclared
+    yield "[-] missed", listed(score.missed), not score.missed
     if report.refused:
         refused = ", ".join(f"{name} ({n})" for name, n in report.refused.items())
         yield "no feasible value in some states", refused, None
     yield "seconds", f"{report.seconds:.1f}", None
 
 
-def _list(edges: tuple[tuple[str, str, int], ...]) -> str:
-    shown = [f"{cause} -> {effect} (lag {lag})" for cause, effect, lag in edges[:10]]
-    more = [f"and {len(edges) - 10} more, see report.json"] if len(edges) > 10 else []
-    return "\n".join([str(len(edges)), *shown, *more])
+def _benchmark(
+    task: str,
+    learner: str,
+    data: str,
+    view: TaskView,
+    spent: tuple[str, int, float],
+    where: dict[str, Any],
+    option: Sequence[str],
+    out: Location | None,
+) -> None:
+    """Run learners over budgets and seeds; print a table per problem."""
+    from scm_world.discovery.benchmark_report import COLUMNS, HEADS, summary
+    from scm_world.discovery.benchmarks import benchmark, slug
+    from scm_world.discovery.problems import FAMILIES
+    from scm_world.policies.scripted import NAMED
+
+    problems, learners, (budget, seeds, timeout) = split(task), split(learner), spent
+    if ":" in learner:  # a custom learner, beside where the command is called
+        sys.path.insert(0, str(Path.cwd()))
+    policies = (*NAMED, "still", "usual")
+    if view.policy not in policies:
+        raise UnknownOption("policy", view.policy, policies)
+    view = replace(view, policy=None) if view.policy == "still" else view
+    drawn = [n.partition(":")[0] in FAMILIES or n.endswith(".json") for n in problems]
+    if option:
+        if drawn != [False]:
+            raise UnknownOption("problem", task, ("one task, if --option is given",))
+        view = replace(view, arguments=dict(load_task(problems[0], option).given))
+    if not all(word.isdecimal() for word in split(budget)):
+        raise UnknownOption("budget", budget, ("whole numbers with commas between them",))
+    words = [*map(slug, (*problems, *learners)), "" if all(drawn) else view.view]
+    folder = results_folder(out, "benchmark", *words, option=option)
+    try:
+        with options.open_executor(**where, what="runs", lines=10, usual="process") as (pool, tell):
+            result = benchmark(
+                learners,
+                problems,
+                [int(word) for word in split(budget)],
+                seeds,
+                data=split(data),
+                view=view,
+                timeout=timeout or None,
+                out=folder,
+                engine=pool,
+                progress=tell,
+            )
+    except KeyboardInterrupt:
+        done = len(list(folder.glob("runs/*/*.json")))
+        say(f"interrupted: {done} runs are safe in {folder}; the same command resumes")
+        raise typer.Exit(INTERRUPTED) from None
+    columns = [column for column in COLUMNS if column.key in BRIEF]
+    for name, rows in summary(result).items():
+        truth = result.problems[name]
+        title = f"{truth.name}: {len(truth.names)} variables, {len(truth.edges)} true edges"
+        made = table(*HEADS[1:], *(column.title for column in columns), title=title)
+        for row in rows:  # the means over seeds; the ranges are in results.md
+            means = (
+                Text(row.text(c).partition(" [")[0], "bold" if c.key in row.best else "")
+                for c in columns
+            )
+            made.add_row(*row.heads[1:], *means)
+        console().print(made)
+    ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
+    for (name, problem, reason), runs in ended.items():
+        say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
+    written(*(folder / name for name in ("report.html", "results.md", "results.csv", "budget.png")))
+
+
+def verify(
+    task: options.Systems,
+    backend: options.Backend = None,
+    both: Annotated[bool, typer.Option("--both", help="On MuJoCo and Bullet; compare.")] = False,
+    probes: Annotated[int, typer.Option(min=1, help="Largest number of probe states.")] = 200,
+    seed: options.Seed = 0,
+    preset: options.Preset = None,
+    out: options.Out = None,
+    option: options.Option = None,
+    resolution: options.Resolution = None,
+) -> None:
+    """Check the declared causal graph of a system against its physics.
+
+    Exits 1 unless every declared edge is seen and nothing else. 'all' takes small variants of
+    tasks with many blocks. Ctrl-C gives the result so far (exit code 130).
+    Example: scm-world verify pushing --both
+    """
+    from scm_world.discovery.plots import draw_verification
+    from scm_world.queries import SCM
+    from scm_world.queries.agreement import Agreement
+    from scm_world.queries.verify import LEAST, verify_engines
+    from scm_world.queries.verify import verify as verified
+    from scm_world.tasks import TASKS
+
+    every = task == "all"
+    systems = {
+        name: option or (SMALL.get(name, ()) if every else ())
+        for name in (TASKS if every else (task,))
+    }
+    first = load_system(*next(iter(systems.items())))
+    used = "both" if both else backend or getattr(first, "backend", "equations")
+    words = (*(option or ()), resolution or "")
+    folder = results_folder(out, "verify", tag(task), used, f"seed{seed}", option=words)
+    terminal, interrupted = console(), False
+    found: list[Verification | Agreement] = []
+    for name, given in systems.items():
+        system = load_system(name, given)
+        settings: dict[str, Any] = {"probes": probes, "least": min(LEAST, probes), "seed": seed}
+        if not isinstance(system, SCM):
+            settings |= {"preset": preset, "resolution": resolution}
+        one: Verification | Agreement
+        try:
+            with progress("probe states", lines=4, about=f"{tag(name)}: ") as tell:
+                if both and not isinstance(system, SCM):
+
+                    def told(_: str, tell: Any = tell) -> Any:
+                        return tell
+
+                    one = verify_engines(system, progress=told, **settings)
+                else:
+                    if not isinstance(system, SCM):
+                        settings["backend"] = backend
+                    one = verified(system, progress=tell, **settings)
+        except KeyboardInterrupt:
+            if not found:
+                raise
+            interrupted = True
+            break
+        about = {"arguments": tuple(given)}
+        reports = one.verifications if isinstance(one, Agreement) else (one,)
+        reports = tuple(report.model_copy(update=about) for report in reports)
+        if isinstance(one, Agreement):
+            one = one.model_copy(update={"verifications": reports})
+        else:
+            one = reports[0]
+        found.append(one)
+        for report in reports:
+            terminal.print(Text(f"Verification of {report.task} on {report.backend}", style="bold"))
+            terminal.print(facts(report.rows()), "")
+        if isinstance(one, Agreement):
+            title = f"Agreement of {' and '.join(one.backends)} on {one.task}"
+            terminal.print(Text(title, style="bold"))
+            terminal.print(facts(one.rows()), "")
+        place = folder / name if every else folder
+        with staged(place) as draft:
+            (draft / "report.json").write_text(one.to_json())
+            draw_verification(one, draft / "verify.png")
+        written(place / "report.json", place / "verify.png")
+        if one.interrupted:
+            interrupted = True
+            break
+    if len(found) > 1:
+        made = table(
+            *("task", "backend", "probe states", "seen", "undeclared", "noise floor", "seconds"),
+            "passed",
+            title="All verifications",
+        )
+        good = {True: Text("yes", "green"), False: Text("no", "bold red")}
+        for one in found:
+            for report in one.verifications if isinstance(one, Agreement) else (one,):
+                made.add_row(
+                    report.task,
+                    report.backend,
+                    str(report.probes),
+                    f"{len(report.fired)} of {len(report.declared)}",
+                    str(len(report.undeclared)),
+                    f"{report.floor:g}",
+                    f"{report.seconds:.1f}",
+                    good[report.passed],
+                )
+            if isinstance(one, Agreement):
+                share = f"same sign: {100 * one.share:.1f} %"
+                cells = (one.task, "both", "", share, "", "", f"{one.seconds:.1f}")
+                made.add_row(*cells, good[one.passed])
+        terminal.print("", made)
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
+    raise typer.Exit(int(not all(one.passed for one in found)))

@@ -1,206 +1,324 @@
-"""``scm-world evaluate``."""
+"""The commands that score policies and explain scores: ``evaluate`` and ``explain``."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, final
+from typing import Annotated, Any
 
+import typer
 from rich.markup import escape
 from rich.text import Text
 
-from scm_world.cli.assignments import parse_assignments
+from scm_world.cli import options
+from scm_world.cli.arguments import load_task, parse_assignments
 from scm_world.cli.console import (
-    RESULTS,
-    check_writable,
+    INTERRUPTED,
     console,
-    keep_whole,
+    progress,
+    results_folder,
+    say,
+    show,
     table,
     written,
 )
-from scm_world.cli.questions import shown_episodes
-from scm_world.cli.tasks import build, suffix
-from scm_world.cli.working import Work
+from scm_world.cli.datasets import check_parquet
 from scm_world.errors import UnknownOption
-from scm_world.evaluation import METRICS, Evaluation, evaluate
-from scm_world.evaluation.files import CODECS
-from scm_world.evaluation.players import NAMES
-from scm_world.evaluation.reporting import write_outputs
-from scm_world.evaluation.setups import task_of
-from scm_world.evaluation.shards import FOLDER
-from scm_world.output.locations import Location
 
-INTERRUPTED = 130
-_WORDS = {"true": True, "false": False, "none": None}
+WORDS = {"true": True, "false": False, "none": None}
+SHOWN = 8  # variables that are listed
 
 
-@final
-@dataclass(frozen=True)
-class Options:
-    """What is evaluated, as it was typed.
+def evaluate(
+    policy: Annotated[
+        str | None,
+        typer.Argument(
+            help="A file (.safetensors, .onnx, .zip, .npz, .parquet), the folder of a training "
+            "run, zoo:NAME, random, still, sweep, grasp, or module:function; several with commas; "
+            "NAME=POLICY names one, and A+B are its runs."
+        ),
+    ] = None,
+    task: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="SYSTEM",
+            help="A task (see 'scm-world list'), a model.xml or model.urdf, or module:function.",
+            show_default="what the policy was trained for, or pushing",
+        ),
+    ] = None,
+    protocols: Annotated[
+        str | None,
+        typer.Option(
+            help="Names with commas, such as P0,P5; P2@100 intervenes within episodes, from "
+            "control step 100 on.",
+            show_default="all of the task",
+        ),
+    ] = None,
+    n: Annotated[int, typer.Option("-n", "--n", min=1, help="Episodes of each protocol.")] = 200,
+    seeds: Annotated[str, typer.Option(help="Seeds of the noise, with commas.")] = "0",
+    backend: Annotated[
+        str | None,
+        typer.Option(
+            help="Physics backend: mujoco, bullet, step or fake; or two with a comma, compared.",
+            show_default="that of the task",
+        ),
+    ] = None,
+    env: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--env",
+            metavar="NAME=VALUE",
+            help="Option of the environment, such as frame_skip=3; repeat it for more.",
+        ),
+    ] = None,
+    option: options.Option = None,
+    metric: Annotated[
+        str | None,
+        typer.Option(
+            help="Score that is shown and drawn; all are written.",
+            show_default="last_fractional_success, or return where a task has none",
+        ),
+    ] = None,
+    workers: options.ManyWorkers = 0,
+    executor: options.Executor = None,
+    address: options.Address = None,
+    format_: options.Files = "parquet",
+    videos: Annotated[
+        bool, typer.Option("--videos", help="Film the best, median and worst episodes.")
+    ] = False,
+    out: options.Out = None,
+    check: Annotated[
+        Any,  # a Location or None
+        typer.Option(
+            parser=options.read_location,
+            metavar="PATH",
+            help="Repeat a random part of these results, and compare every bit.",
+        ),
+    ] = None,
+    part: Annotated[int, typer.Option(min=1, help="Episodes that --check repeats.")] = 12,
+    trust: options.Trust = None,
+) -> None:
+    """Score policies in protocols, with 95 % intervals.
 
-    Attributes:
-        policies: With commas between them.
-        task: Name of the task; None for the one that the policies were trained for.
-        protocols: With commas between them; None for all.
-        n: Episodes of each protocol, for each seed.
-        seeds: With commas between them.
-        backends: With commas between them.
-        env: Options of the environment, each as ``name=value``.
-        arguments: Of the task, likewise.
-        metric: Score that is shown.
-        work: Where the episodes are played.
-        form: ``"parquet"`` or ``"csv"``.
-        videos: Whether episodes are filmed.
+    Writes results.json, a table of all episodes, plots and an HTML report. After Ctrl-C (exit code
+    130) the same command resumes. With --check PATH nothing is evaluated: a part of PATH is
+    repeated; exit code 1 if anything differs.
+    Example: scm-world evaluate zoo:pushing,random --protocols P0,P5 -n 100
     """
+    from scm_world import evaluation
+    from scm_world.evaluation import METRICS
+    from scm_world.evaluation.files import CODECS, false_scores
+    from scm_world.evaluation.reporting import write_outputs
+    from scm_world.evaluation.setups import task_of
+    from scm_world.evaluation.shards import FOLDER
 
-    policies: str
-    task: str | None
-    protocols: str | None
-    n: int
-    seeds: str
-    backends: str
-    env: tuple[str, ...]
-    arguments: tuple[str, ...]
-    metric: str | None
-    work: Work
-    form: str
-    videos: bool
+    if check is not None:
+        _look_here(trust, policy)
+        results = evaluation.Evaluation.load(check)
+        wrong = list(false_scores(check, results))
+        again = None if policy is None else policies_of(policy)
+        with progress("episodes") as tell:
+            repeated = evaluation.check(
+                results, episodes=part, policy=again, trusted=tuple(trust or ()), progress=tell
+            )
+        said = "the same bits in all of them" if repeated else f"{len(repeated.wrong)} differ"
+        chosen = f"{repeated.episodes} of {len(results)} episodes, chosen with seed {repeated.seed}"
+        say(*wrong, *repeated.wrong, f"played again: {chosen}: {said}")
+        raise typer.Exit(0 if repeated and not wrong else 1)
 
-    def folder(self) -> Path:
-        """Name the folder of the results."""
-        names = "-".join(policies_of(self.policies))
-        about = suffix((*self.arguments, *self.env))
-        return RESULTS / f"evaluate-{names}-{self.as_task()}{about}"
+    if policy is None:
+        raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
+    if metric not in (None, *METRICS):
+        raise UnknownOption("metric", metric, METRICS)
+    if format_ not in CODECS:
+        raise UnknownOption("format", format_, CODECS)
+    check_parquet(format_)
+    if videos and find_spec("moviepy") is None:
+        needed = ("none, or after: pip install 'scm-world[video]'",)
+        raise UnknownOption("videos", "--videos", needed)
+    words = [word.strip() for word in seeds.split(",")]
+    if not all(word.isdecimal() for word in words):
+        raise UnknownOption("seeds", seeds, ("whole numbers with commas between them",))
+    sys.path.insert(0, str(Path.cwd()))  # for a custom policy, beside where this is called
+    agents = policies_of(policy)
+    task = task or task_of(agents)
+    made = load_task(task, option)
+    given = parse_assignments(env, "'--env'")
+    settings = {k: WORDS.get(v, v) if isinstance(v, str) else v for k, v in given.items()}
+    if option:
+        settings["task_options"] = dict(made.given)
+    folder = results_folder(out, "evaluate", *agents, task, option=(*(option or ()), *(env or ())))
+    try:
+        with options.open_executor(executor, workers, address, "episodes") as (pool, tell):
+            found = evaluation.evaluate(
+                agents,
+                protocols,
+                task=task,
+                n=n,
+                seeds=tuple(map(int, words)),
+                backend=backend or made.backend,
+                env=settings,
+                engine=pool,
+                out=folder,
+                progress=tell,
+            )
+    except KeyboardInterrupt:
+        safe = len(list((folder / FOLDER).glob("*.json")))
+        say(f"interrupted: {safe} files are safe in {folder}; the same command resumes")
+        raise typer.Exit(INTERRUPTED) from None
+    metric = metric or next(name for name in METRICS if name in found.metrics)
+    files = found.save(folder, kind=format_)
+    with progress("control steps") as tell:
+        more = write_outputs(found, folder, metric=metric, videos=videos, progress=tell)
 
-    def environment(self) -> dict[str, Any]:
-        """Read the options of the environment, and the arguments of the task."""
-        given = parse_assignments(self.env, "'--env'")
-        found = {k: _WORDS.get(v, v) if isinstance(v, str) else v for k, v in given.items()}
-        if self.arguments:
-            found["task_options"] = dict(build(self.as_task(), self.arguments).given)
-        return found
-
-    def as_task(self) -> str:
-        """Name the task, also if it was not typed."""
-        return self.task or task_of(policies_of(self.policies))
+    who = [(agent, engine) for engine in found.engines for agent in found.agents]
+    heads = [agent if len(found.engines) == 1 else f"{agent}, {engine}" for agent, engine in who]
+    scores = table(
+        *("protocol", "varied", *map(escape, heads)),
+        title=f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals",
+        whole=(0,),
+    )
+    docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
+    for protocol in found.protocols:
+        cells = (found.score(protocol, metric, agent=agent, engine=name) for agent, name in who)
+        varied = docs.get(protocol, "")
+        scores.add_row(*(Text(str(cell)) for cell in (protocol, varied, *cells)))
+    console().print(scores)
+    if len(found.engines) == 2:
+        one, other = found.engines
+        title = f"{one} minus {other}, the same draws on both"
+        gaps = table("protocol", *map(escape, found.agents), title=title, whole=(0,))
+        for protocol in found.protocols:
+            cells = (found.gap(one, other, protocol, metric, agent=name) for name in found.agents)
+            gaps.add_row(protocol, *(Text(str(cell)) for cell in cells))
+        console().print(gaps)
+    written(*files, *more)
 
 
 def policies_of(text: str) -> dict[str, list[str]]:
-    """Read policies: ``NAME=POLICY`` or ``POLICY``, with commas; ``A+B`` are runs of one.
+    """Return the runs of each policy: ``NAME=POLICY`` or ``POLICY``, with commas; ``A+B`` are runs.
+
+    Raises:
+        UnknownOption: A name is missing or stands twice.
 
     Example:
         >>> policies_of("mine=a.onnx+b.onnx,random")
         {'mine': ['a.onnx', 'b.onnx'], 'random': ['random']}
     """
+    from scm_world.evaluation.players import NAMES
+
     found: dict[str, list[str]] = {}
     for word in (part.strip() for part in text.split(",")):
-        name, equals, given = word.partition("=")
+        name, equals, given = (part.strip() for part in word.partition("="))
         is_path = word not in NAMES and Path(word).exists()  # which may have any letters
-        if is_path:
-            name, equals, given = "", "", word
         runs = [word] if is_path else (given if equals else word).split("+")
-        label = name.strip() if equals else _label(runs[0])
-        if not word or not all(runs) or not label or label in found:
+        if not equals or is_path:
+            path = Path(runs[0])
+            if ":" in runs[0] and not path.is_dir():
+                name = runs[0].replace(":", ".")
+            else:
+                name = path.resolve().name if path.is_dir() else path.stem
+        if not word or not all(runs) or not name or name in found:
             allowed = ("names or files, each once; NAME=POLICY gives a name",)
             raise UnknownOption("policy", text, allowed)
-        found[label] = runs
+        found[name] = runs
     return found
 
 
-def _label(policy: str) -> str:
-    """Name an agent after a file, a folder, or a function."""
-    is_folder = Path(policy).is_dir()
-    if ":" in policy and not is_folder:
-        return policy.replace(":", ".")
-    return Path(policy).resolve().name if is_folder else Path(policy).stem
+def _look_here(trust: list[str] | None, policy: str | None = None) -> None:
+    """Find custom modules beside where the command is called, if they are asked for."""
+    if trust or policy is not None:
+        sys.path.insert(0, str(Path.cwd()))
 
 
-def run(options: Options, *, out: Location | None) -> int:
-    """Evaluate, print a table, write everything; return the exit code."""
-    _check(options)
-    sys.path.insert(0, str(Path.cwd()))  # for a policy of one's own, beside where this is called
-    options = replace(options, task=options.as_task())
-    folder = out or options.folder()
-    check_writable(folder, folder=True)
-    terminal = console()
-    try:
-        with options.work.begun() as executor, shown_episodes() as progress:
-            found = evaluate(
-                policies_of(options.policies),
-                options.protocols,
-                task=options.task,
-                n=options.n,
-                seeds=_seeds(options.seeds),
-                backend=options.backends,
-                env=options.environment(),
-                engine=executor,
-                out=folder,
-                progress=progress,
+def explain(
+    results: Annotated[
+        Any,  # a Location
+        typer.Argument(
+            parser=options.read_location,
+            metavar="RESULTS",
+            help="Folder or results.json of an evaluation.",
+        ),
+    ],
+    protocol: Annotated[
+        str | None,
+        typer.Option(help="Name of a protocol.", show_default="all that vary something"),
+    ] = None,
+    episode: Annotated[
+        int | None,
+        typer.Option(min=0, help="Episode whose counterfactuals are run, one for each variable."),
+    ] = None,
+    agent: Annotated[
+        str | None, typer.Option(help="Name of a policy, if there are several.")
+    ] = None,
+    backend: Annotated[str | None, typer.Option(help="Backend, if there are several.")] = None,
+    metric: Annotated[
+        str, typer.Option(help="Score that is explained.")
+    ] = "last_fractional_success",
+    versus: Annotated[
+        str | None,
+        typer.Option(
+            help="Value of the variable instead: A (from the training support) or default."
+        ),
+    ] = None,
+    trust: options.Trust = None,
+) -> None:
+    """Say which variables decided the scores, or what an episode would have been without them.
+
+    Example: scm-world explain results.json --protocol P8 --episode 3
+    """
+    from scm_world.evaluation import Evaluation, why
+
+    _look_here(trust)
+    found = Evaluation.load(results)
+    chosen = []
+    for name, flag, given in (("agent", "'--agent'", agent), ("engine", "'--backend'", backend)):
+        try:
+            chosen.append(found.the(name, given))
+        except UnknownOption as error:
+            said = "choose one" if given is None else f"{given!r} is none"
+            message = f"{said} of {', '.join(error.choices)}"
+            raise typer.BadParameter(message, param_hint=flag) from None
+    agent, engine = chosen
+    if episode is None:
+        for name in found.protocols if protocol is None else (protocol,):
+            causes = found.causes(name, metric, agent=agent, engine=engine)
+            score = found.score(name, metric, agent=agent, engine=engine)
+            title = f"{name}: {agent} on {engine}, {metric.replace('_', ' ')} {score}"
+            if not causes.causes:
+                if protocol is not None:
+                    say(title, causes if causes.left_out else "nothing is varied in it")
+                continue
+            made = table(
+                *("variable", "share of variance", "p (Holm)", "upper - lower third"),
+                title=title,
+                whole=(0,),
             )
-    except KeyboardInterrupt:
-        safe = len(list((folder / FOLDER).glob("*.json")))
-        said = f"interrupted: {safe} files are safe in {folder}; the same command goes on"
-        terminal.print(said, soft_wrap=True)
-        return INTERRUPTED
-    metric = options.metric or next(name for name in METRICS if name in found.metrics)
-    files = found.save(folder, kind=options.form)
-    with shown_episodes() as progress:
-        more = write_outputs(found, folder, metric=metric, videos=options.videos, progress=progress)
-    for made in _tables(found, metric):
-        terminal.print(keep_whole(made, terminal, 0))
-    written(terminal, *files, *more)
-    return 0
-
-
-def _check(options: Options) -> None:
-    """Refuse what could not be shown or written in the end."""
-    if options.metric not in (None, *METRICS):
-        raise UnknownOption("metric", options.metric, METRICS)
-    if options.form not in CODECS:
-        raise UnknownOption("format", options.form, CODECS)
-    if options.form == "parquet" and find_spec("pyarrow") is None:
-        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
-        raise UnknownOption("format", "parquet", allowed)
-    if options.videos and find_spec("moviepy") is None:
-        needed = ("none, or after: pip install 'scm-world[video]'",)
-        raise UnknownOption("videos", "--videos", needed)
-
-
-def _seeds(text: str) -> tuple[int, ...]:
-    words = [word.strip() for word in text.split(",")]
-    if not all(word.isdecimal() for word in words):
-        raise UnknownOption("seeds", text, ("whole numbers with commas between them",))
-    return tuple(map(int, words))
-
-
-def _tables(found: Evaluation, metric: str) -> Iterable[Any]:
-    """Write down the scores, and the gaps between engines."""
-    title = f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals"
-    doers = [(agent, engine) for engine in found.engines for agent in found.agents]
-    heads = [agent if len(found.engines) == 1 else f"{agent}, {engine}" for agent, engine in doers]
-    made = table("protocol", "varied", *map(escape, heads), title=title)
-    docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
-    for protocol in found.protocols:
-        scores = (
-            str(found.score(protocol, metric, agent=agent, engine=engine))
-            for agent, engine in doers
+            for cause in causes.ranked()[:SHOWN]:
+                column = cause.column
+                of = "" if column.name == cause.variable else f" ({column.name})"
+                contrast = Text(f"{column.contrast}{of}")
+                share = Text(str(cause.share))
+                made.add_row(cause.variable, share, f"{cause.p_holm:.3g}", contrast)
+            if len(causes.causes) > SHOWN:
+                made.add_row(f"and {len(causes.causes) - SHOWN} more", "", "", "")
+            console().print(made)
+        return
+    if protocol is None:
+        raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
+    asked: dict[str, Any] = {"agent": agent, "engine": engine, "metric": metric, "versus": versus}
+    with progress("counterfactuals") as tell:
+        reasons = why(found, protocol, episode, **asked, trusted=tuple(trust or ()), progress=tell)
+    title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
+    made = table("had it been", "instead of", "score", "success", title=title)
+    for other in reasons.others:
+        made.add_row(
+            Text(f"{other.variable} = {show(other.would_be)}"),
+            show(other.was),
+            f"{other.would_score:.3g} ({other.gain:+.3g})",
+            "yes" if other.would_succeed else "no",
         )
-        made.add_row(protocol, Text(docs.get(protocol, "")), *map(Text, scores))
-    yield made
-    if len(found.engines) == 2:
-        yield _gaps(found, metric)
-
-
-def _gaps(found: Evaluation, metric: str) -> Any:
-    one, other = found.engines
-    made = table(
-        "protocol", *map(escape, found.agents), title=f"{one} minus {other}, the same draws on both"
-    )
-    for protocol in found.protocols:
-        gaps = (found.gap(one, other, protocol, metric, agent=agent) for agent in found.agents)
-        made.add_row(protocol, *(Text(str(gap)) for gap in gaps))
-    return made
+    for name, reason in reasons.left_out.items():
+        made.add_row(Text(name), "", "left out", Text(reason))
+    console().print(made)

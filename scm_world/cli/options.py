@@ -1,70 +1,102 @@
-"""Options that several commands have."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import Annotated, Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from scm_world.cli.console import progress, say
 from scm_world.errors import ScmWorldError
 from scm_world.output.locations import Location, located
 
+if TYPE_CHECKING:
+    from scm_world.queries.progress import Progress
+    from scm_world.work.executors import Executor as AnyExecutor
 
-class Format(StrEnum):
-    """How a graph is written down."""
+# --- systems --------------------------------------------------------------------------------------
 
-    TABLE = "table"
-    DOT = "dot"
-    JSON = "json"
-    PNG = "png"
-    HTML = "html"
-    GML = "gml"
-    GRAPHML = "graphml"
-    NODE_LINK = "node-link"
-    DAGITTY = "dagitty"
-    CSV = "csv"
-
-
-Task = Annotated[
+System = Annotated[
     str,
     typer.Argument(
-        help="A task (see 'scm-world list'), a model.xml or model.urdf, or module:function."
+        metavar="SYSTEM",
+        help="A task (see 'scm-world list'), a model.xml or model.urdf, or module:function.",
     ),
 ]
-Backend = Annotated[str, typer.Option(help="Physics engine: mujoco, bullet or fake.")]
-TaskBackend = Annotated[
+Systems = Annotated[
+    str,
+    typer.Argument(
+        metavar="SYSTEM", help="A task, a model.xml or model.urdf, module:function, or 'all'."
+    ),
+]
+Option = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=VALUE",
+        help="Argument of the task or model, such as num_of_levels=2 or control_dt=0.01; "
+        "repeat it for more.",
+    ),
+]
+Backend = Annotated[
     str | None,
     typer.Option(
-        "--backend",
-        help="Physics engine: mujoco, bullet, step or fake.",
-        show_default="that of the task",
+        help="Physics backend: mujoco, bullet, step or fake.", show_default="that of the task"
     ),
 ]
 Preset = Annotated[
     str | None,
-    typer.Option(help="Numerical settings of the robot: fast or precise.", show_default="fast"),
+    typer.Option(help="Physics time step of the TriFinger: fast or precise.", show_default="fast"),
 ]
 Resolution = Annotated[
     str | None,
     typer.Option(
-        help="Nodes of the robot's graph: vector, finger or joint.", show_default="vector"
+        help="Nodes of the TriFinger's graph: vector, finger or joint.", show_default="vector"
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Of every random choice.")]
-Arguments = Annotated[
+
+# --- episodes and interventions -------------------------------------------------------------------
+
+Seed = Annotated[int, typer.Option(min=0, help="Seed of every random choice.")]
+Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
+Policy = Annotated[
+    str | None,
+    typer.Option(
+        help="random, still or mpc; of the TriFinger also grasp, or sweep: the fingertips go to "
+        "the middle.",
+        show_default="random; still without a backend",
+    ),
+]
+Assignments = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="NAME=VALUE...",
+        help="Interventions. A value is a number, a list 1,2,3, shift:0.1, scale:2 or draw:A.",
+    ),
+]
+Nature = Annotated[
     list[str] | None,
     typer.Option(
-        "--option",
         metavar="NAME=VALUE",
-        help="Argument of the task, such as num_of_levels=2 or, of a model, control_dt=0.01; "
-        "give it once for each argument.",
+        help="Context distribution: what varies between episodes, such as gravity=draw:A; "
+        "repeat it for more.",
     ),
 ]
+Outcomes = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="HOW:NAME",
+        help="Outcome, such as reward or sum:reward; repeat it for more.",
+        show_default="the usual ones",
+    ),
+]
+
+# --- results --------------------------------------------------------------------------------------
 
 
 def read_location(text: str) -> Location:
-    """Read where results are, or are to be: a path or a URL.
+    """Return where results are, or are to be: a path or a URL.
 
     Raises:
         BadParameter: The URL cannot be reached from here; it says why.
@@ -84,26 +116,96 @@ Out = Annotated[
         show_default="under scm-world-results",
     ),
 ]
-
-
-Acts = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="NAME=VALUE...",
-        help="A number, a list 1,2,3 or [1,2,3], shift:0.1, scale:2, or draw:A.",
-    ),
-]
-Steps = Annotated[int, typer.Option(min=1, help="Control steps of an episode.")]
-Policy = Annotated[
-    str,
+Shard = Annotated[int, typer.Option(min=1, help="Episodes in one file.")]
+Files = Annotated[str, typer.Option("--format", help="Format of the table: parquet or csv.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print the result only.")]
+Trust = Annotated[
+    list[str] | None,
     typer.Option(
-        help="random, still; of the robot also grasp, or sweep: the fingertips go to the middle."
+        metavar="PACKAGE",
+        help="Package whose functions may be called because results name them; repeat it for more.",
     ),
 ]
+
+# --- training -------------------------------------------------------------------------------------
+
 Observations = Annotated[
     str | None,
     typer.Option(
-        help="Of the policy: plain, or privileged: with every causal parameter.",
+        help="Observations of the policy: plain, or privileged: with every causal parameter.",
         show_default="plain",
     ),
 ]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Any other field, such as network.hidden=[64,64] or env.frame_skip=5; the value is "
+        "JSON or a word. Repeat it for more.",
+    ),
+]
+
+# --- executors ------------------------------------------------------------------------------------
+
+Executor = Annotated[
+    str | None,
+    typer.Option(
+        "--executor",
+        "--engine",
+        help="What runs independent episodes: serial, process or ray.",
+        show_default="process; with one worker serial",
+    ),
+]
+
+
+def _workers(usual: str) -> Any:
+    said = "How many run at the same time; 0 for as many as there are cores."
+    return typer.Option(min=0, help=said, show_default=usual)
+
+
+Workers = Annotated[int | None, _workers("1; with --executor as many as there are cores")]
+ManyWorkers = Annotated[int | None, _workers("as many as there are cores")]
+Address = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        help="Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
+    ),
+]
+
+
+@contextmanager
+def open_executor(
+    executor: str | None,
+    workers: int | None,
+    address: str | None,
+    what: str,
+    *,
+    lines: int = 0,
+    usual: str | None = None,
+) -> Iterator[tuple[AnyExecutor, Progress]]:
+    """Open an executor, print in a line where it runs, and show its progress.
+
+    Args:
+        executor: ``"serial"``, ``"process"``, ``"ray"``, or None.
+        workers: How many; 0 for as many as there are cores, None for that with an executor and
+            for one without.
+        address: Of a Ray cluster.
+        what: See ``progress``; also ``lines``.
+        lines: How many lines are printed where there is no terminal.
+        usual: The executor if None was asked for; decided by the number of workers if None.
+
+    Raises:
+        UnknownOption: There is no such executor, or it cannot have so many workers.
+    """
+    from scm_world.work.executors import engine_of
+    from scm_world.work.threads import cores
+
+    count = workers or None
+    if executor is None:
+        count = 1 if workers is None else (workers or cores())
+    with engine_of(executor or usual, workers=count, address=address) as opened:
+        say(f"the work is done {opened.where}", stderr=True)
+        with progress(what, lines=lines) as tell:
+            yield opened, tell

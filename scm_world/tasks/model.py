@@ -529,7 +529,8 @@ def model_task(source: Any, options: Mapping[str, Any], known: Callable[[], Iter
             made = factory(**options)
         made = getattr(made, "task", made)  # of a world
         if isinstance(made, SCM):
-            allowed = ("a function that gives a task, a model or a world", "discover", "verify")
+            commands = "discover, verify, graph, variables, effect, counterfactual or collect"
+            allowed = ("a function that gives a task, a model or a world", commands)
             raise UnknownOption("command for a causal model without a backend", source, allowed)
         return made if isinstance(made, Task) else ModelTask(made)
     raise UnknownOption("task", source, (*known(), "file.xml", "file.urdf", "module:function"))

@@ -5,56 +5,139 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
-from scm_world.cli.app import app
+import scm_world as sw
+from scm_world.cli import app
+from scm_world.discovery.data import Design, collect, load
+from scm_world.graph import from_json
+from scm_world.variables import Box, Normal
 
 FILE = """
 import scm_world as sw
-from scm_world.variables import Normal
+from scm_world.variables import Box, Normal, Parent
 
 
 def chain(weight=2.0):
     return sw.SCM([
-        sw.Exogenous(name="x", distribution=Normal()),
+        sw.Exogenous(name="x", distribution=Normal(), a=Box(0.0, 1.0)),
         sw.Derived(name="y", parents=("x",), mechanism=sw.Linear(weights=(weight,)),
                    noise=Normal()),
+    ])
+
+
+def growth():
+    return sw.SCM([
+        sw.Exogenous(name="rate", default=1.0, a=Box(0.5, 1.5)),
+        sw.Derived(name="size", parents=(Parent("size", lag=1), Parent("rate", lag=1)), start=1.0,
+                   mechanism=sw.Linear(weights=(1.0, 1.0))),
     ])
 """
 
 
 @pytest.fixture
-def reference(tmp_path: Path) -> str:
+def file() -> str:
     """Write the file."""
-    (tmp_path / "chain.py").write_text(FILE)
-    return f"{tmp_path / 'chain.py'}:chain"
+    Path("models.py").write_text(FILE)
+    return "models.py"
+
+
+def call(*arguments: str) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [*arguments])
 
 
 @pytest.mark.parametrize(
     ("command", "report"),
     [
-        (["discover", "--probes", "2"], "report.json"),
-        (["verify", "--probes", "16"], "report.json"),
-        (["effect", "y", "x=1", "--versus", "x=0", "-n", "5"], "effect.json"),
+        (("discover", "--probes", "2"), "report.json"),
+        (("verify", "--probes", "16"), "report.json"),
+        (("effect", "y", "x=1", "--versus", "x=0", "-n", "5"), "effect.json"),
     ],
 )
 def test_commands_take_a_model_without_a_backend(
-    reference: str, tmp_path: Path, command: list[str], report: str
+    file: str, command: tuple[str, ...], report: str
 ) -> None:
     """Their reports are those of the functions."""
     name, *rest = command
-    out = tmp_path / "out"
-    found = CliRunner().invoke(app, [name, reference, *rest, "--out", str(out)])
+    found = call(name, f"{file}:chain", *rest, "--out", "out")
     assert found.exit_code == 0, found.output
-    data = json.loads((out / report).read_text())
+    data = json.loads(Path("out", report).read_text())
     if name == "effect":
         assert data["mean"] == pytest.approx(2.0, abs=1e-12)
         assert data["engine"] == "equations"
 
 
-def test_other_commands_say_what_they_take(reference: str) -> None:
+def test_the_graph_and_the_variables_are_shown(file: str) -> None:
+    """With the arguments of the function."""
+    found = call("graph", f"{file}:chain", "--format", "json", "--option", "weight=3")
+    model = from_json(found.stdout)
+    assert (list(model), model.declared("y").mechanism.weights) == (["x", "y"], (3.0,))
+    assert "x" in call("variables", f"{file}:chain").stdout
+
+
+def test_a_dataset_is_collected(file: str) -> None:
+    """It is that of the function; a model with lagged edges has a row per control step."""
+    given = ("--design", "single", "-n", "6", "--format", "csv", "--out")
+    done = call("collect", f"{file}:chain", *given, "static")
+    assert done.exit_code == 0, done.output
+    assert "do(x)" in done.output
+    model = sw.SCM(
+        [
+            sw.Exogenous(name="x", distribution=Normal(), a=Box(0.0, 1.0)),
+            sw.Derived(
+                name="y", parents=("x",), mechanism=sw.Linear(weights=(2.0,)), noise=Normal()
+            ),
+        ]
+    )
+    told = collect(model, Design("single", ("x",), "A", 0.3), 6)
+    assert np.array_equal(load("static").values, told.values)
+    done = call("collect", f"{file}:growth", *given, "lagged", "--steps", "4", "--target", "ra*")
+    assert done.exit_code == 0, done.output
+    assert len(load("lagged")) == 6 * 4
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--nature", "x=1"), "circumstance of a model"),
+        (("--policy", "random"), "circumstance of a model"),
+        (("--backend", "mujoco"), "--backend cannot be 'mujoco'; it can be: left out"),
+        (("--target", "z*"), "z*"),
+    ],
+)
+def test_what_equations_do_not_have_is_refused(
+    file: str, wrong: tuple[str, ...], said: str
+) -> None:
+    """A policy, a context distribution and a backend are those of a world."""
+    done = call("collect", f"{file}:chain", *wrong, "--format", "csv", "--out", "out")
+    assert done.exit_code == 2, done.output
+    assert said in " ".join(done.output.split())
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "do", "final"), [("chain", "x=5", None), ("growth", "rate=3", 4.0)]
+)
+def test_a_counterfactual_keeps_the_noise(
+    file: str, name: str, do: str, final: float | None
+) -> None:
+    """The difference is written; episodes of equations have no file, and none is promised."""
+    done = call("counterfactual", f"{file}:{name}", do, "--steps", "2", "--out", "out")
+    assert done.exit_code == 0, done.output
+    found = json.loads(Path("out/difference.json").read_text())["variables"]
+    variable = do.partition("=")[0]
+    if final is None:  # y = 2 x + noise: the noise cancels
+        assert found["y"]["final"] == pytest.approx(2 * found[variable]["final"])
+    else:
+        assert -found["size"]["final"] == pytest.approx(final)
+    assert [path.name for path in Path("out").iterdir()] == ["difference.json"]
+
+
+def test_other_commands_say_what_they_take(file: str) -> None:
     """Stepping needs a world."""
-    found = CliRunner().invoke(app, ["do", reference, "x=1"])
+    found = call("do", f"{file}:chain", "x=1")
     assert found.exit_code != 0
     assert "without a backend" in found.output

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from scm_world.cli.app import Format, app
+from scm_world.cli.app import app
+from scm_world.cli.inspection import Format
 from scm_world.graph.exchange import FORMATS, CausalGraph, causal_graph, read_graph
 from scm_world.world import World
 

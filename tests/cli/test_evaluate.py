@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,16 +17,14 @@ from scm_world.evaluation import METRICS, Evaluation, evaluate, protocols_of
 from scm_world.policies import save_policy
 
 QUICK = ("--backend", "fake", "--env", "max_episode_length=3", "--workers", "1")
+POLICIES = {"random": ["random"], "still": ["still"]}
+SHORT = {"max_episode_length": 3}
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run where nothing is lost, on a wide terminal."""
-    monkeypatch.chdir(tmp_path)
+def _wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Print on a wide terminal."""
     monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "GITHUB_ACTIONS"):
-        monkeypatch.delenv(name, raising=False)
 
 
 def call(*arguments: str) -> Result:
@@ -37,12 +32,19 @@ def call(*arguments: str) -> Result:
     return CliRunner().invoke(app, [*arguments])
 
 
-def results(folder: str = "out", *arguments: str) -> Evaluation:
-    """Evaluate something small into a folder."""
-    given = ("evaluate", "random,still", "--protocols", "P0,P8", "-n", "12", *QUICK, *arguments)
-    done = call(*given, "--out", folder)
-    assert done.exit_code == 0, done.output
-    return Evaluation.load(folder)
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write results once."""
+    folder = tmp_path_factory.mktemp("saved")
+    evaluate(POLICIES, "P0,P8", n=12, backend="fake", env=SHORT).save(folder)
+    return folder
+
+
+@pytest.fixture
+def results(saved: Path, tmp_path: Path) -> Evaluation:
+    """Show these results in the present folder as ``out``."""
+    (tmp_path / "out").symlink_to(saved)
+    return Evaluation.load("out")
 
 
 def test_evaluate_writes_everything_and_prints_a_table() -> None:
@@ -52,7 +54,7 @@ def test_evaluate_writes_everything_and_prints_a_table() -> None:
         "mine=random+sweep,still",
         "picking",
         "--protocols=P0,P6,P8@2",
-        "-n2",
+        "-n1",
         *QUICK,
         "--seeds=3,4",
         "--option=tool_block_mass=0.05",
@@ -68,7 +70,7 @@ def test_evaluate_writes_everything_and_prints_a_table() -> None:
         ("mine", "still"),
         ("P0", "P6", "P8@2"),
     )
-    assert len(found) == 3 * 3 * 2 * 2
+    assert len(found) == 3 * 3 * 2
     assert found.about["arguments"] == {} or found.about["env"]["task_options"]
     data = json.loads((folder / "results.json").read_text())
     assert {*METRICS} <= {*data["scores"][0]}
@@ -79,7 +81,7 @@ def test_evaluate_writes_everything_and_prints_a_table() -> None:
 
 def test_two_engines_show_the_gap() -> None:
     """A second table has one minus the other."""
-    done = call("evaluate", "still", "--protocols=P8", "-n2", *QUICK, "--backend=fake,mujoco")
+    done = call("evaluate", "still", "--protocols=P8", "-n1", *QUICK, "--backend=fake,mujoco")
     assert done.exit_code == 0, done.output
     assert "fake minus mujoco, the same draws on both" in " ".join(done.stdout.split())
 
@@ -87,7 +89,7 @@ def test_two_engines_show_the_gap() -> None:
 def test_a_policy_beside_where_it_is_called(tmp_path: Path) -> None:
     """``module:function`` is found in the present folder, and again for the check."""
     Path("policies_of_a_test.py").write_text("def lazy(observation):\n    return [0.0] * 9\n")
-    done = call("evaluate", "policies_of_a_test:lazy", "--protocols=P8", "-n3", *QUICK, "--out=o")
+    done = call("evaluate", "policies_of_a_test:lazy", "--protocols=P8", "-n2", *QUICK, "--out=o")
     assert done.exit_code == 0, done.output
     refused = call("evaluate", "--check", "o")  # a file does not decide what is run
     assert refused.exit_code == 2
@@ -97,23 +99,22 @@ def test_a_policy_beside_where_it_is_called(tmp_path: Path) -> None:
     assert told.exit_code == 0
 
 
-def test_check_plays_again() -> None:
+def test_check_plays_again(results: Evaluation) -> None:
     """Exit code 0 for the same bits; 1 if a number was changed, with the place."""
-    found = results()
     again = call("evaluate", "--check", "out", "--part", "48")
     assert again.exit_code == 0, again.output
     assert "48 of 48 episodes" in again.stdout
-    changed = found.columns["return"] + 1.0
-    Evaluation(found.about, {**found.columns, "return": changed}).save("forged")
+    changed = results.columns["return"] + 1.0
+    Evaluation(results.about, {**results.columns, "return": changed}).save("forged")
     forged = call("evaluate", "--check", "forged/results.json", "--part", "5")
     assert forged.exit_code == 1
     assert "5 differ" in forged.stdout
     assert "return is" in forged.stdout
 
 
+@pytest.mark.usefixtures("results")
 def test_explain_ranks_causes_and_asks_what_would_have_been() -> None:
     """A table for each protocol that varies something; one for an episode."""
-    results()
     done = call("explain", "out", "--agent", "still")
     assert done.exit_code == 0, done.output
     assert "P8: still on fake" in done.stdout
@@ -130,9 +131,9 @@ def test_explain_ranks_causes_and_asks_what_would_have_been() -> None:
     assert "goal_block.cylindrical_position" in one.stdout
 
 
-def test_explain_names_the_options_that_choose() -> None:
-    """Of several agents, and of several engines, it says with which option one is chosen."""
-    found = results()
+def test_explain_names_the_options_that_choose(results: Evaluation) -> None:
+    """Of several agents, and of several backends, it says with which option one is chosen."""
+    found = results
     for missing, said in (((), "--agent"), (("--agent=nobody",), "'nobody' is none of")):
         refused = call("explain", "out", *missing)
         assert refused.exit_code == 2
@@ -185,11 +186,11 @@ def test_an_agent_of_another_task_is_told() -> None:
         (("explain", "out", "--agent=still", "--backend=bullet"), "bullet"),
     ],
 )
+@pytest.mark.usefixtures("results")
 def test_what_is_wrong_is_told(
     arguments: tuple[str, ...], said: str, saved: Path, tmp_path: Path
 ) -> None:
     """Exit code 2, the word that is wrong, no traceback, and nothing written."""
-    (tmp_path / "out").symlink_to(saved)
     done = call(*arguments)
     assert done.exit_code == 2, done.output
     assert said in " ".join(done.output.replace("│", " ").split())
@@ -197,37 +198,29 @@ def test_what_is_wrong_is_told(
     assert not [path for path in tmp_path.rglob("*.json") if saved not in path.parents]
 
 
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write results once."""
-    from scm_world.evaluation import evaluate
+def test_ctrl_c_keeps_what_is_finished(
+    results: Evaluation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit code 130 and what is safe; the same command resumes, with the scores of the call."""
+    from scm_world.evaluation import pipeline
 
-    folder = tmp_path_factory.mktemp("saved")
-    policies = {"still": "still", "random": "random"}
-    evaluate(policies, "P0,P8", n=2, backend="fake", env={"max_episode_length": 3}).save(folder)
-    return folder
+    command = ("evaluate", "random,still", "--protocols=P0,P8", "-n12", *QUICK, "--format=csv")
+    write = pipeline.write_part
 
+    def interrupted(*arguments: Any) -> None:
+        write(*arguments)
+        raise KeyboardInterrupt
 
-def test_ctrl_c_keeps_what_is_finished(tmp_path: Path) -> None:
-    """Exit code 130 and what is safe; the same command goes on and writes the same table."""
-    options = ["random", "--protocols=P0,P6", "-n", "400", *QUICK, "--format=csv"]
-    command = [sys.executable, "-m", "scm_world", "evaluate", *options]
-    process = subprocess.Popen(  # noqa: S603 # ours
-        [*command, "--out", "first"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    deadline = time.monotonic() + 120.0
-    while not [*Path("first").glob("parts/*.json")] and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    said, _ = process.communicate()
-    assert process.returncode == 130
-    assert "the same command goes on" in said
-    assert 1 <= len([*Path("first").glob("parts/*.json")]) < 32
-    assert not Path("first/results.json").exists()
-    for folder in ("first", "second"):
-        assert call("evaluate", *options, "--out", folder).exit_code == 0
-    first, second = (Path(folder, "episodes.csv").read_bytes() for folder in ("first", "second"))
-    assert first == second
+    with monkeypatch.context() as patched:
+        patched.setattr(pipeline, "write_part", interrupted)
+        stopped = call(*command, "--out", "mine")
+    assert stopped.exit_code == 130
+    assert "1 files are safe in mine; the same command resumes" in stopped.output
+    assert not Path("mine/results.json").exists()
+    assert call(*command, "--out", "mine").exit_code == 0
+    found = Evaluation.load("mine")
+    assert found == results
+    assert np.array_equal(found.scores(agent="still"), results.scores(agent="still"))
 
 
 def test_policies_have_names() -> None:
@@ -251,17 +244,6 @@ def test_list_shows_protocols() -> None:
         assert protocol.doc in done.stdout
 
 
-def test_scores_of_the_command_are_those_of_the_call() -> None:
-    """The command adds nothing of its own: the same table, bit for bit."""
-    from scm_world.evaluation import evaluate
-
-    policies = {"random": ["random"], "still": ["still"]}
-    mine = evaluate(policies, "P0,P8", n=12, backend="fake", env={"max_episode_length": 3})
-    found = results()
-    assert found == mine
-    assert np.array_equal(found.scores(agent="still"), mine.scores(agent="still"))
-
-
 def test_the_file_of_a_policy_says_the_task_and_the_environment(tmp_path: Path) -> None:
     """The task need not be typed; an option that contradicts the file is refused."""
     layers = {
@@ -272,7 +254,7 @@ def test_the_file_of_a_policy_says_the_task_and_the_environment(tmp_path: Path) 
     run = tmp_path / "run=1"
     run.mkdir()
     save_policy(run / "policy.safetensors", layers, about)
-    done = call("evaluate", "run=1,still", "--protocols=P0", "-n2", *QUICK)
+    done = call("evaluate", "run=1,still", "--protocols=P0", "-n1", *QUICK)
     assert done.exit_code == 0, done.output
     assert "in picking" in done.output
     found = Evaluation.load(

@@ -1,4 +1,4 @@
-"""Arguments of tasks on the command line."""
+"""Arguments of tasks on the command line, and custom tasks."""
 
 from __future__ import annotations
 
@@ -8,68 +8,84 @@ from pathlib import Path
 import pytest
 import typer
 from matplotlib.image import imread
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
-from scm_world.cli import app, discovery, graphs, intervene, variables
-from scm_world.cli.tasks import build, suffix
+from scm_world.cli import app
+from scm_world.cli.arguments import load_task, suffix
 from scm_world.errors import ConflictingTargets, UnknownOption
+from scm_world.evaluation import Evaluation
 from scm_world.graph import from_json
-from scm_world.tasks import TASKS
 from scm_world.world import World
 
-SMALL = {
-    "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=[0.035, 0.035, 0.07]"),
-    "stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
-    "creative_stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
-    "general": ("nums_objects=2",),
-}
+SMALL = ("--option", "nums_objects=2")
+STEP = """
+from scm_world import Action, Exogenous, Measured, StepTask
+from scm_world.variables import Box
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run where nothing is lost."""
-    monkeypatch.chdir(tmp_path)
+def step(parameters, state, action, noise):
+    return {"x": parameters["rate"] * state["x"] + action["push"]}
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_every_task_is_discovered_with_its_options(task: str) -> None:
-    """There is a report that names the options, and a picture, for each of the nine tasks."""
-    arguments = SMALL.get(task, ())
-    options = discovery.Options(task, "fake", "fast", 1, 0, arguments)
-
-    assert discovery.run(options, out=Path("here"), strict=False) == 0
-    report = json.loads(Path("here/report.json").read_text())
-    assert (report["task"], tuple(report["arguments"])) == (task, arguments)
-    assert imread("here/graphs.png").shape[:2] == (900, 1600)
-    assert len(report["declared"]) == len(World(build(task, arguments), backend="fake").model.edges)
+def make():
+    return StepTask(
+        step,
+        parameters=[Exogenous(name="rate", default=0.5, a=Box(0.2, 0.8))],
+        states=[Measured(name="x", default=1.0, parents=("x", "rate", "push"))],
+        actions=[Action(name="push", bounds=Box(-1.0, 1.0))],
+        reward=(lambda x: -x, "x"),
+    )
+"""
 
 
-def test_default_folders_are_those_of_the_options() -> None:
-    """Two variants of a task do not overwrite one another."""
-    options = discovery.Options("stacked_blocks", "fake", "fast", 1, 0, SMALL["stacked_blocks"])
-    discovery.run(options, out=None, strict=False)
+def call(*arguments: str) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [*arguments])
 
-    folder = "discover-stacked_blocks-fake-seed0-num_of_levels=2-max_level_width=0.04"
-    assert Path("scm-world-results", folder, "report.json").exists()
+
+def test_a_variant_is_discovered_in_a_folder_of_its_own() -> None:
+    """The folder is named after the options, and the report has them and the variant's edges."""
+    done = call("discover", "general", *SMALL, "--backend", "fake", "--probes", "1")
+
+    assert done.exit_code == 0, done.output
+    folder = Path("scm-world-results/discover-general-fake-seed0-nums_objects=2")
+    report = json.loads((folder / "report.json").read_text())
+    assert (report["task"], report["arguments"]) == ("general", ["nums_objects=2"])
+    small = load_task("general", ["nums_objects=2"])
+    assert len(report["declared"]) == len(World(small, backend="fake").model.edges)
+    assert imread(folder / "graphs.png").shape[:2] == (900, 1600)
     assert suffix(()) == ""
 
 
-def test_graph_takes_options(capsys: pytest.CaptureFixture[str]) -> None:
-    """The declared graph is that of the variant."""
-    graphs.run("general", "json", None, "joint_positions", SMALL["general"])
-    graphs.run("general", "png", None, "joint_positions", SMALL["general"])
+def test_graph_and_variables_take_options() -> None:
+    """The declared graph is that of the variant, and so are the tables."""
+    shown = call("graph", "general", "--format", "json", *SMALL).stdout
+    small = World(load_task("general", ["nums_objects=2"]), backend="fake").model
+    assert from_json(shown) == small
+    tables = [call("variables", "general", *given).stdout for given in (SMALL, ())]
+    assert tables[0] != tables[1]
 
-    expected = World(build("general", SMALL["general"]), backend="fake").model
-    assert from_json(capsys.readouterr().out) == expected
-    assert Path("general-nums_objects=2-graph.png").exists()
+
+def test_do_takes_options() -> None:
+    """An intervention on a block that only the variant leaves out is refused there."""
+    given = ("--backend", "fake", "--steps", "1", *SMALL, "--out", "here")
+    assert call("do", "general", "tool_1.friction=0.5", *given).exit_code == 0
+    assert json.loads(Path("here/result.json").read_text())["arguments"] == ["nums_objects=2"]
+    refused = call("do", "general", "tool_2.friction=0.5", *given)
+    assert refused.exit_code == 2
+    assert "tool_2.friction" in refused.stderr
 
 
-def test_variables_takes_options(capsys: pytest.CaptureFixture[str]) -> None:
-    """The table is that of the variant."""
-    variables.run("general", SMALL["general"], as_markdown=False)
-    small = capsys.readouterr().out
-    variables.run("general", as_markdown=False)
-    assert small != capsys.readouterr().out
+def test_a_do_may_change_what_there_is() -> None:
+    """Bodies that come and go are named, and what is there before and after is compared."""
+    words = ("do", "towers", "number_of_blocks_in_tower=1,1,4", "--backend", "fake")
+    done = call(*words, "--steps", "1", "--out", "here")
+    assert done.exit_code == 0, done.output
+    assert "gone: tool_level_4_col_0_row_0" in done.output
+    result = json.loads(Path("here/result.json").read_text())
+    assert result["went"] == ["tool_level_4_col_0_row_0"]
+    assert "tool_level_4_col_0_row_0.mass" not in result["variables"]
+    assert result["variables"]["tool_level_0_col_0_row_0.size"]["moved"]
 
 
 @pytest.mark.parametrize(
@@ -83,42 +99,52 @@ def test_variables_takes_options(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_factory_that_fails_is_named(text: str, message: str) -> None:
     """With the cause, and without a traceback."""
     Path("own.py").write_text(text)
-    result = CliRunner().invoke(app, ["variables", "own.py:make"])
+    result = call("variables", "own.py:make")
     assert result.exit_code == 2
     assert message in " ".join(result.stderr.split())
     assert "Traceback" not in result.output
 
 
 def test_a_step_function_needs_no_backend() -> None:
-    """It is that of the task."""
-    Path("own.py").write_text(
-        "from scm_world import Measured, StepTask\n"
-        "def step(parameters, state, action, noise):\n    return {'x': 0.5 * state['x']}\n"
-        "def make():\n"
-        "    states = [Measured(name='x', default=1.0, parents=('x',))]\n"
-        "    return StepTask(step, states=states)\n"
-    )
-    result = CliRunner().invoke(app, ["do", "own.py:make", "x=2", "--steps", "1", "--out", "here"])
-    assert result.exit_code == 0, result.stderr
-    assert "on step" in result.stdout
+    """Its own backend is the default, also of an evaluation."""
+    Path("own.py").write_text(STEP)
+    done = call("do", "own.py:make", "x=2", "--steps", "1", "--out", "done")
+    assert done.exit_code == 0, done.stderr
+    assert "on step" in done.stdout
+    given = ("--protocols", "P0", "-n", "1", "--env", "max_episode_length=2", "--format", "csv")
+    done = call("evaluate", "random", "own.py:make", *given, "--workers", "1", "--out", "scores")
+    assert done.exit_code == 0, done.output
+    assert Evaluation.load("scores").engines == ("step",)
 
 
-def test_do_takes_options() -> None:
-    """An intervention on a block that only the variant leaves out is refused there."""
-    options = intervene.Options("general", "fake", "fast", 0, 1, None, SMALL["general"])
-    intervene.run(["tool_1.friction=0.5"], options, show_all=False, out=Path("here"))
+@pytest.mark.parametrize("command", ["train", "clone"])
+def test_training_is_on_the_backend_of_the_task(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless another one is asked for."""
+    from scm_world.tasks import Picking
+    from scm_world.training import imitation, loop
 
-    assert json.loads(Path("here/result.json").read_text())["arguments"] == [*SMALL["general"]]
-    with pytest.raises(Exception, match=r"tool_2\.friction"):
-        intervene.run(["tool_2.friction=0.5"], options, show_all=False, out=Path("here"))
+    seen: list[str] = []
+
+    def interrupted(*_: object, backend: str, **__: object) -> None:
+        seen.append(backend)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop, "train", interrupted)
+    monkeypatch.setattr(imitation, "clone", interrupted)
+    monkeypatch.setattr(Picking, "backend", "fake")
+    assert call(command, "picking").exit_code == 130
+    assert call(command, "picking", "--backend", "mujoco").exit_code == 130
+    assert seen == ["fake", "mujoco"]
 
 
 def test_values_of_all_kinds_are_read() -> None:
     """Numbers, points, truth values and names of weights."""
-    task = build("pushing", ["tool_block_mass=0.05", "weights=sparse"])
+    task = load_task("pushing", ["tool_block_mass=0.05", "weights=sparse"])
     assert {name for name, weight in task.weights.items() if weight} == {"success"}
-    assert build("pushing", ["activate_sparse_reward=true"]).weights == task.weights
-    assert build("reaching", ["default_goal_60=0,0,0.2"]).name == "reaching"
+    assert load_task("pushing", ["activate_sparse_reward=true"]).weights == task.weights
+    assert load_task("reaching", ["default_goal_60=0,0,0.2"]).name == "reaching"
 
 
 @pytest.mark.parametrize(
@@ -134,18 +160,18 @@ def test_values_of_all_kinds_are_read() -> None:
 def test_wrong_options_are_refused(task: str, argument: str, message: str) -> None:
     """What does not exist, or is out of bounds, is named."""
     with pytest.raises(UnknownOption, match=message):
-        build(task, [argument])
+        load_task(task, [argument])
 
 
 @pytest.mark.parametrize("argument", ["num_of_levels=many", "num_of_levels", "num_of_levels="])
 def test_what_cannot_be_read_is_refused(argument: str) -> None:
     """The message is about ``--option``."""
     with pytest.raises(typer.BadParameter) as caught:
-        build("stacked_blocks", [argument])
+        load_task("stacked_blocks", [argument])
     assert caught.value.param_hint == "'--option'"
 
 
 def test_an_option_can_be_given_once() -> None:
     """The same argument twice is a conflict."""
     with pytest.raises(ConflictingTargets):
-        build("general", ["nums_objects=2", "nums_objects=3"])
+        load_task("general", ["nums_objects=2", "nums_objects=3"])

@@ -15,12 +15,6 @@ from scm_world.queries import load_episode
 SMALL = ("--backend", "fake", "--samples", "4", "--horizon", "2", "--steps", "2")
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run where nothing is lost."""
-    monkeypatch.chdir(tmp_path)
-
-
 def test_an_episode_is_planned_and_kept() -> None:
     """The numbers are printed; the episode, pictures of it and what was asked are on the disk."""
     believed = ("--do", "tool_block.mass=0.02", "--given", "tool_block.mass=0.04")

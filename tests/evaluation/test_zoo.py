@@ -181,9 +181,9 @@ def test_large_policies_are_not_published(folder: Path, tmp_path: Path) -> None:
 
 def test_the_command_line_lists_the_zoo(published: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Name, task, seed, scores and command."""
-    from scm_world.cli.listing import show_zoo
+    from scm_world.cli.inspection import list_
 
-    show_zoo()
+    list_(zoo=True)
     shown = " ".join(capsys.readouterr().out.split())
     for part in ("zoo:small", "pushing", " 4 ", "P0 0."):
         assert part in shown

@@ -13,8 +13,8 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from scm_world.cli import app
-from scm_world.cli.tasks import build
-from scm_world.cli.verification import SMALL
+from scm_world.cli.arguments import load_task
+from scm_world.cli.discovery import SMALL
 from scm_world.discovery.plots import draw_verification
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.agreement import Agreement, Sign
@@ -305,7 +305,7 @@ def test_the_command_verifies_all_tasks_and_keeps_what_is_finished(
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_is_verified_on_both_engines(task: str) -> None:
     """Two hundred probe states see 99 % of the edges, nothing undeclared, and equal signs."""
-    found = verify_engines(build(task, SMALL.get(task, ())))
+    found = verify_engines(load_task(task, SMALL.get(task, ())))
     for report in found.verifications:
         assert report.undeclared == ()
         assert report.colors == ()

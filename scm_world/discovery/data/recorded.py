@@ -27,8 +27,8 @@ NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRES
 """What looks, or disturbs the measurement, but moves nothing; patterns of names."""
 
 
-def default_causes(world: World) -> tuple[str, ...]:
-    """List the parameters that an experiment on a world varies, if nothing else is asked for.
+def default_causes(world: World | SCM) -> tuple[str, ...]:
+    """List the parameters that an experiment varies, if nothing else is asked for.
 
     They are exogenous and real, can be set, have a space A, and are physical: no cameras, lights,
     noises or settings of the engine, and nothing that decides which bodies there are. The
@@ -40,11 +40,14 @@ def default_causes(world: World) -> tuple[str, ...]:
         >>> "tool_block.mass" in found, "tool_block.color" in found, "floor_color" in found
         (True, True, False)
     """
-    colors = {f"{block}.color" for block in world.compiled.task.tools()}
-    structure = set(world.structures.head)
+    model = world.model if isinstance(world, World) else world
+    colors, structure = set[str](), set[str]()
+    if isinstance(world, World):
+        colors = {f"{block}.color" for block in world.compiled.task.tools()}
+        structure = set(world.structures.head)
     return tuple(
         variable.name
-        for variable in map(world.model.declared, world.model)
+        for variable in map(model.declared, model)
         if isinstance(variable, Exogenous)
         and variable.settable
         and variable.a is not None
@@ -75,14 +78,14 @@ def _is_like(name: str, patterns: Iterable[str]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def settable(world: World, patterns: Iterable[str]) -> tuple[str, ...]:
+def settable(world: World | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
     """List the variables that can be set and are named like one of the patterns.
 
     Raises:
         UnknownVariable: A pattern names nothing that can be set.
     """
-    model = world.model
-    actions = world.compiled.commanded
+    model = world.model if isinstance(world, World) else world
+    actions = world.compiled.commanded if isinstance(world, World) else ()
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
     for pattern in given:

@@ -1,0 +1,275 @@
+"""Values, interventions and systems as they are typed on the command line."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+import typer
+
+from scm_world.errors import ConflictingTargets, ModelError, ScmWorldError, UnknownOption
+
+if TYPE_CHECKING:
+    from scm_world.queries import SCM, Outcome, World
+    from scm_world.tasks import Task
+
+HINT = "'NAME=VALUE...'"
+WORDS = {"true": True, "false": False}
+NO_NUMBERS = ("shape", "terms")  # what is made of them cannot be written on a command line
+
+
+def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
+    """Return the error of a text that cannot be read."""
+    return typer.BadParameter(f"{text!r}: {why}", param_hint=hint)
+
+
+def _numbers(text: str) -> Any:
+    """Read a number, ``1,2,3`` or ``[1, 2, 3]``; the model refuses other texts where it must."""
+    bare = text.strip()
+    listed = bare.startswith("[") and bare.endswith("]")
+    if listed or "," in bare:
+        parts = (bare[1:-1] if listed else bare).strip()
+        return [_numbers(part) for part in parts.split(",")] if parts else []
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(bare)
+    return bare
+
+
+def parse_value(text: str, hint: str = HINT) -> Any:
+    """Return a value or an intervention.
+
+    Args:
+        text: A number, a list of numbers, ``shift:…``, ``scale:…``, or ``draw:A``.
+        hint: The option that it was given for, for the message.
+
+    Raises:
+        BadParameter: It is empty, or an intervention that does not exist.
+
+    Example:
+        >>> parse_value("0.05"), parse_value("[0, 0, -5]"), parse_value("shift:0.1")
+        (0.05, [0, 0, -5], Shift(kind='shift', by=0.1))
+    """
+    from scm_world.variables import Draw, Scale, Shift
+
+    if not text.strip():
+        raise refused(text, "there is no value", hint)
+    kind, colon, rest = text.partition(":")
+    if not colon:
+        return _numbers(text)
+    try:
+        match kind.strip().lower():
+            case "shift":
+                return Shift(_numbers(rest))
+            case "scale":
+                return Scale(_numbers(rest))
+            case "draw":
+                return Draw(rest.strip())
+    except UnknownOption:
+        wanted = "draw:A, draw:B or draw:A|B" if kind.strip().lower() == "draw" else "numbers"
+        raise refused(text, f"expected {wanted}", hint) from None
+    raise refused(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)
+
+
+def parse_json(text: str, hint: str) -> Any:
+    """Return a value that is JSON or a word.
+
+    Example:
+        >>> parse_json("[64, 64]", "'--set'"), parse_json("linear", "'--set'")
+        ([64, 64], 'linear')
+    """
+    if not text.strip():
+        raise refused(text, "expected name=value", hint)
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text.strip()
+
+
+def parse_assignments(
+    texts: Iterable[str] | None,
+    hint: str = HINT,
+    read: Callable[[str, str], Any] = parse_value,
+) -> dict[str, Any]:
+    """Return the values of ``name=value`` texts by name.
+
+    Args:
+        texts: One pair each.
+        hint: The option that they were given for, for messages.
+        read: Reads a value.
+
+    Raises:
+        BadParameter: One has no ``=``, no name, or a value that cannot be read.
+        ConflictingTargets: A name is given twice.
+    """
+    request: dict[str, Any] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise refused(text, "expected name=value, for example floor_friction=0.4", hint)
+        if name in request:
+            raise ConflictingTargets((name, name), name)
+        request[name] = read(value, hint)
+    return request
+
+
+def parse_outcome(text: str, how: str = "final") -> Outcome:
+    """Return what is measured: ``name``, ``name[2]`` or ``how:name``.
+
+    Example:
+        >>> print(parse_outcome("reward"), parse_outcome("sum:gravity[2]"))
+        final reward sum gravity[2]
+    """
+    from scm_world.queries import Outcome
+
+    before, _, name = text.rpartition(":")
+    component = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    if component is None:
+        return Outcome(name, before or how)
+    return Outcome(component[1], before or how, int(component[2]))
+
+
+def split(text: str) -> list[str]:
+    """Return the words of a text with commas between them, each once."""
+    return list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+
+
+def load_task(name: str, option: Sequence[str] | None = None) -> Task:
+    """Return a task.
+
+    Args:
+        name: Of the task, or what ``make_task`` takes besides.
+        option: What differs from its defaults, each as ``name=value``.
+
+    Raises:
+        UnknownOption: There is no such task or argument, or the value is not allowed.
+        ConflictingTargets: An argument is given twice.
+        BadParameter: An argument cannot be read.
+
+    Example:
+        >>> load_task("towers", ["number_of_blocks_in_tower=1,1,2"]).tools()
+        ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
+    """
+    from scm_world.tasks import TASKS, make_task
+
+    given = parse_assignments(option, "'--option'")
+    if name in TASKS:
+        hints = get_type_hints(TASKS[name].__init__)
+        known: list[str] = []
+        for parameter in inspect.signature(TASKS[name]).parameters.values():
+            is_open = parameter.kind is inspect.Parameter.VAR_KEYWORD
+            common = get_args(hints[parameter.name])[0] if is_open else None
+            known += get_type_hints(common) if is_open else (parameter.name,)
+        known = [key for key in known if key not in NO_NUMBERS]
+        for key, value in given.items():
+            if known and key not in known:
+                raise UnknownOption(f"argument of {name}", key, known)
+            given[key] = _argument(key, value)
+    try:
+        return make_task(name, **given)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, ScmWorldError) and not (option and isinstance(error, ModelError)):
+            raise
+        said = f"{', '.join(option or ())}: {error}"
+        raise typer.BadParameter(said, param_hint="'--option'") from None
+
+
+def _argument(name: str, value: Any) -> Any:
+    """Turn lists into tuples, and accept words where there are words to choose from."""
+    match value:
+        case list() if all(isinstance(part, int | float) for part in value):
+            return tuple(value)
+        case int() | float():
+            return value
+        case str() if name == "weights" or value.lower() in WORDS:
+            return WORDS.get(value.lower(), value)
+    raise typer.BadParameter(f"{name}: expected numbers, got {value!r}", param_hint="'--option'")
+
+
+def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
+    """Return a task, or the causal model that ``module:function`` returns; see ``load_task``."""
+    from scm_world.graph import scm as graph
+    from scm_world.queries import SCM
+    from scm_world.tasks.factories import load_factory
+
+    if ":" in name:
+        with suppress(Exception):  # ``load_task`` raises it again, and says what is wrong
+            made = load_factory(name)(**parse_assignments(option, "'--option'"))
+            if isinstance(made, graph.SCM):
+                return SCM(made)
+    return load_task(name, option)
+
+
+def open_system(
+    name: str, option: Sequence[str] | None = None, **settings: str | None
+) -> World | SCM:
+    """Return the world of a task, or the causal model that ``module:function`` returns.
+
+    Args:
+        name: See ``load_task``.
+        option: See ``load_task``.
+        settings: ``backend``, ``preset`` and ``resolution`` of a world.
+
+    Raises:
+        UnknownOption: It does not exist, or equations are given settings of a world.
+    """
+    from scm_world.queries import SCM, World
+
+    made = load_system(name, option)
+    if not isinstance(made, SCM):
+        return World(made, **settings)  # type: ignore[arg-type] # names are checked by the world
+    for setting, value in settings.items():
+        if value is not None:
+            allowed = ("left out: a causal model without a backend has none",)
+            raise UnknownOption(f"--{setting}", value, allowed)
+    return made
+
+
+def backend_of(system: World | SCM) -> str:
+    """Return the name of the backend; ``"equations"`` where there is none."""
+    return system.backend.name if hasattr(system, "backend") else "equations"
+
+
+def policy_of(policy: str | None, system: World | SCM) -> str | None:
+    """Return a policy as ``rollout`` takes it: in a world random by default.
+
+    Raises:
+        UnknownOption: No policy has this name.
+    """
+    from scm_world.policies.scripted import NAMED
+
+    if policy not in (None, "still", *NAMED):
+        raise UnknownOption("policy", policy, (*NAMED, "still"))
+    if policy is None and hasattr(system, "backend"):
+        return "random"
+    return None if policy == "still" else policy
+
+
+def tag(name: str) -> str:
+    """Return the name of a system in titles and folders: of a file, its stem.
+
+    Example:
+        >>> tag("pushing"), tag("models/cartpole.xml"), tag("my.worlds:cartpole")
+        ('pushing', 'cartpole', 'my.worlds-cartpole')
+    """
+    home, colon, function = name.rpartition(":")
+    if colon:
+        return f"{Path(home).stem if home.endswith('.py') else home}-{function}"
+    return Path(name).stem if name.lower().endswith((".xml", ".mjcf", ".urdf")) else name
+
+
+def suffix(option: Iterable[str]) -> str:
+    """Return arguments as the end of the name of a folder.
+
+    Example:
+        >>> suffix(["num_of_levels=2", "tower_center=[0, 0.1]"])
+        '-num_of_levels=2-tower_center=0_0.1'
+    """
+    words = (re.sub(r"[^\w.=-]+", "_", text).strip("_").replace("=_", "=") for text in option)
+    return "".join(f"-{word}" for word in words if word)

@@ -1,0 +1,314 @@
+"""The commands that collect tables of episodes: ``collect`` and ``sweep``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from scm_world.cli import options
+from scm_world.cli.arguments import (
+    backend_of,
+    load_task,
+    open_system,
+    parse_assignments,
+    parse_outcome,
+    parse_value,
+    policy_of,
+    refused,
+    tag,
+)
+from scm_world.cli.console import (
+    INTERRUPTED,
+    console,
+    results_folder,
+    say,
+    show,
+    table,
+    written,
+)
+from scm_world.errors import UnknownOption
+from scm_world.output.locations import Location
+
+SHOWN, POINTS = 12, 40  # targets, and points of a grid, that are printed
+
+
+def check_parquet(form: str) -> None:
+    """Refuse Parquet where nothing is installed that writes it.
+
+    Raises:
+        UnknownOption: Nothing is.
+    """
+    if form == "parquet" and find_spec("pyarrow") is None:
+        allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
+        raise UnknownOption("format", "parquet", allowed)
+
+
+def _interrupted(folder: Location, episodes: int, shard: int) -> typer.Exit:
+    """Print what an interruption has left of episodes in shards."""
+    safe, whole = len(list(folder.glob("shard-*.*"))), -(-episodes // shard)
+    say(f"interrupted: {safe} of {whole} files are safe in {folder}; the same command resumes")
+    return typer.Exit(INTERRUPTED)
+
+
+def collect(
+    task: options.System,
+    design: Annotated[
+        str,
+        typer.Option(
+            help="Targets of an episode: observational (none), single, all, or half of them."
+        ),
+    ] = "single",
+    n: Annotated[int, typer.Option("-n", "--n", min=1, help="Number of episodes.")] = 1000,
+    target: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATTERN",
+            help="Targets of interventions, such as '*.mass'; repeat it for more.",
+            show_default="the causes",
+        ),
+    ] = None,
+    cause: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATTERN",
+            help="Parameters that are written down; repeat it for more.",
+            show_default="physical ones with a space A",
+        ),
+    ] = None,
+    outcome: options.Outcomes = None,
+    values: Annotated[
+        str,
+        typer.Option(help="Support of interventions: A (training), B (held out) or 'A|B'."),
+    ] = "A",
+    observational_fraction: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of episodes without an intervention.")
+    ] = 0.3,
+    nature: options.Nature = None,
+    every_step: Annotated[
+        bool, typer.Option("--every-step", help="A row for each control step.")
+    ] = False,
+    steps: options.Steps = 25,
+    policy: options.Policy = None,
+    backend: options.Backend = None,
+    seed: options.Seed = 0,
+    preset: options.Preset = None,
+    shard: options.Shard = 100,
+    format_: options.Files = "parquet",
+    workers: options.Workers = None,
+    executor: options.Executor = None,
+    address: options.Address = None,
+    out: options.Out = None,
+    option: options.Option = None,
+) -> None:
+    """Collect an interventional dataset in a folder.
+
+    Of a causal model without a backend all variables are written down, and those with lagged edges
+    have a row for each control step. After Ctrl-C (exit code 130) the same command resumes.
+    Example: scm-world collect pushing --design half -n 1000 --out data
+    """
+    from scm_world.discovery.data import Design, default_causes
+    from scm_world.discovery.data import collect as collected
+    from scm_world.discovery.data.folders import SIDECAR
+    from scm_world.discovery.data.recorded import settable
+    from scm_world.queries import SCM
+    from scm_world.variables.kinds import SPACES
+
+    if values not in SPACES:
+        raise UnknownOption("values", values, SPACES)
+    check_parquet(format_)
+    asked: dict[str, Any] = {
+        "policy": policy,
+        "nature": parse_assignments(nature, "'--nature'"),
+        "causes": cause,
+        "outcomes": [parse_outcome(text) for text in outcome or ()],
+        "every_step": every_step,
+    }
+    asked = {name: value for name, value in asked.items() if value}
+    with open_system(task, option, backend=backend, preset=preset) as system:
+        used = backend_of(system)
+        folder = results_folder(
+            out, f"collect-{design}", tag(task), used, f"seed{seed}", option=option
+        )
+        if not isinstance(system, SCM):
+            asked["policy"] = policy_of(policy, system)
+        if not isinstance(system, SCM) or system.is_temporal:
+            asked["steps"] = steps
+        targets: Sequence[str] = ()
+        if design != "observational":
+            patterns = target or cause
+            targets = settable(system, patterns) if patterns else default_causes(system)
+        try:
+            with options.open_executor(executor, workers, address, "episodes") as (pool, tell):
+                found = collected(
+                    system,
+                    Design(design, tuple(targets), values, observational_fraction),
+                    n,
+                    seed=seed,
+                    out=folder,
+                    shard=shard,
+                    format=format_,
+                    progress=tell,
+                    engine=pool,
+                    **asked,
+                )
+        except KeyboardInterrupt:
+            raise _interrupted(folder, n, shard) from None
+    title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
+    made = table("", "episodes", "rows", title=title)
+    _, first = np.unique(found.episode, return_index=True)
+    made.add_row("all", str(len(first)), str(len(found)))
+    rows = [found.regimes[number].targets for number in found.regime]
+    begins = [rows[row] for row in first]
+    made.add_row("nothing done", str(begins.count(())), str(rows.count(())))
+    names = sorted({name for one in begins for name in one})
+    for name in names[:SHOWN]:
+        counts = (sum(name in one for one in regimes) for regimes in (begins, rows))
+        made.add_row(f"do({name})", *map(str, counts))
+    if len(names) > SHOWN:
+        made.add_row(f"and {len(names) - SHOWN} more targets", "", "")
+    made.add_row("columns", "", str(len(found.columns)))
+    if impossible := found.about.get("refused"):
+        made.add_row("refused", str(len(impossible)), f"see {SIDECAR}")
+    console().print(made)
+    shards = list[Location](folder.glob("shard-*.*"))
+    written(folder / SIDECAR, *sorted(shards, key=str)[:1])
+
+
+def sweep(
+    task: options.System,
+    over: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=VALUES",
+            help="LOW:HIGH:COUNT, A, B:COUNT, or values with commas; repeat it for more variables.",
+        ),
+    ],
+    outcome: options.Outcomes = None,
+    n: Annotated[int, typer.Option("-n", "--n", min=1, help="Episodes at each point.")] = 50,
+    do: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--do",
+            metavar="NAME=VALUE",
+            help="Further intervention at every point; repeat it for more.",
+        ),
+    ] = None,
+    nature: options.Nature = None,
+    steps: options.Steps = 25,
+    policy: options.Policy = None,
+    backend: options.Backend = None,
+    seed: options.Seed = 0,
+    preset: options.Preset = None,
+    shard: options.Shard = 100,
+    format_: options.Files = "parquet",
+    workers: options.Workers = None,
+    executor: options.Executor = None,
+    address: options.Address = None,
+    out: options.Out = None,
+    option: options.Option = None,
+) -> None:
+    """Estimate outcomes over a grid of interventions (dose-response), with 95 % intervals.
+
+    Every point has the same episodes, with the same noise. After Ctrl-C (exit code 130) the same
+    command resumes.
+    Example: scm-world sweep pushing --over tool_block.mass=0.02:0.08:5
+    """
+    from scm_world.discovery.data import sweep as swept
+    from scm_world.discovery.data.levels import points_of
+    from scm_world.discovery.data.swept import ENDS, SUMMARY, TABLE
+    from scm_world.queries import World
+
+    check_parquet(format_)
+    grid, held = read_over(over), parse_assignments(do, "'--do'")
+    measured = [parse_outcome(text) for text in outcome or ()] or None
+    with (
+        World(load_task(task, option), backend=backend, preset=preset) as plain,
+        plain.given(held) as world,
+    ):
+        words = "-".join(("sweep", *grid)).replace(".", "_")
+        folder = results_folder(
+            out, words, tag(task), backend_of(world), f"seed{seed}", option=option
+        )
+        try:
+            with options.open_executor(executor, workers, address, "episodes") as (pool, tell):
+                found = swept(
+                    world,
+                    grid,
+                    measured,
+                    n=n,
+                    steps=steps,
+                    policy=policy_of(policy, world),
+                    nature=parse_assignments(nature, "'--nature'"),
+                    seed=seed,
+                    out=folder,
+                    shard=shard,
+                    format=format_,
+                    engine=pool,
+                    progress=tell,
+                )
+        except KeyboardInterrupt:
+            episodes = n * len(points_of(grid, world.model))
+            raise _interrupted(folder, episodes, shard) from None
+    rows, names = found.rows(), [column.name for column in found.measured]
+    results = {name + end for base in names for name in (base, f"{base}.change") for end in ENDS}
+    columns = [key for key in rows[0] if key not in results and key not in ("n", "refused")]
+    title = f"Sweep of {tag(task)} on {found.data.about['engine']}, seed {seed}"
+    made = table(*columns, "n", *names, title=f"{title}, with 95 % intervals")
+    for row in rows[:POINTS]:
+        cells = []
+        for name in names:
+            ends = (row[name + end] for end in ENDS)
+            mean, low, high = ("-" if number is None else show(number) for number in ends)
+            cells.append(f"{mean} ({low} … {high})")
+        made.add_row(*(show(row[key]) for key in columns), str(row["n"]), *cells)
+    if len(rows) > POINTS:
+        made.caption = f"and {len(rows) - POINTS} more points, see {TABLE}"
+    console().print(made)
+    written(folder / TABLE, folder / SUMMARY)
+
+
+def read_over(texts: Iterable[str]) -> dict[str, Any]:
+    """Return which values variables take.
+
+    Raises:
+        BadParameter: It cannot be read, or a variable is given twice.
+
+    Example:
+        >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
+        {'tool_block.mass': [0.02, 0.05, 0.08], ... 'gravity': [-9, -10]}
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, equals, values = (part.strip() for part in text.partition("="))
+        if not equals or not name or not values or name in found:
+            raise refused(text, "expected name=values, each name once", "'--over'")
+        found[name] = _levels(values)
+    return found
+
+
+def _levels(text: str) -> Any:
+    from scm_world.discovery.data import Levels
+    from scm_world.discovery.data.levels import check_points
+    from scm_world.variables.kinds import SPACES
+
+    hint = "'--over'"
+    first, *rest = text.split(":")
+    if (first in SPACES and len(rest) == 1) or len(rest) == 2:
+        if not rest[-1].isdecimal() or not int(rest[-1]):
+            raise refused(rest[-1], "is no number of values", hint)
+        check_points(int(rest[-1]))
+    if first in SPACES and len(rest) < 2:
+        return Levels(first, *map(int, rest))
+    if len(rest) == 2:
+        low, high = (parse_value(word, hint) for word in (first, rest[0]))
+        if isinstance(low, int | float) and isinstance(high, int | float):
+            return [round(x, 12) for x in np.linspace(low, high, int(rest[1])).tolist()]
+    value = None if rest else parse_value(text, hint)
+    several = value if isinstance(value, list) else [value]
+    if not all(isinstance(one, int | float) for one in several):
+        raise refused(text, "expected LOW:HIGH:COUNT, A, B:COUNT, or numbers with commas", hint)
+    return several

@@ -1,0 +1,107 @@
+"""Options of executors: the same ones for every command with independent episodes or runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from scm_world.cli import app
+from scm_world.cli.options import open_executor
+from scm_world.errors import UnknownOption
+from scm_world.work.threads import cores
+
+FAKE = ("--backend", "fake", "--format", "csv")
+SHORT = ("--env", "max_episode_length=1", "--protocols", "P0")
+COMMANDS = {
+    "collect": ("collect", "reaching", *FAKE, "--steps", "1", "-n", "2"),
+    "evaluate": ("evaluate", "still", *FAKE, *SHORT, "-n", "2"),
+    "discover": ("discover", "er2:3", "--learner", "pooled", "--budget", "20", "--seeds", "1"),
+    "sweep": ("sweep", "reaching", *FAKE, "--steps", "1", "-n", "1", "--over", "gravity=A:2"),
+}
+
+
+def call(*arguments: str) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [*arguments])
+
+
+@pytest.mark.parametrize("command", ["collect", "evaluate", "sweep"])
+def test_commands_say_where_they_run(command: str) -> None:
+    """In a line, with the executor that was asked for."""
+    done = call(*COMMANDS[command], "--executor", "serial", "--out", "out")
+    assert done.exit_code == 0, done.output
+    assert "the work is done in this process\n" in done.output
+
+
+def test_failed_learners_are_printed_with_the_reason() -> None:
+    """Below the tables, with the learner, the problem and how many runs it is."""
+    lines = ("def broken(data, *, seed=0):", "    raise ValueError('no idea at all')", "")
+    Path("learner_of_a_test.py").write_text("\n".join(lines))
+    done = call(
+        *("discover", "er2:4", "--learner=learner_of_a_test:broken", "--seeds=1", "--budget=4,5"),
+        *("--executor=serial", "--out=failed"),
+    )
+    assert done.exit_code == 0, done.output
+    said = " ".join(done.output.split())
+    assert "the work is done in this process" in said
+    assert "not done in 3 run(s): " in said
+    assert "no idea at all" in said
+    assert "er2:4: 4 variables" in said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--executor", "dask"), "'dask'"),
+        (("--engine", "serial", "--workers", "2"), "'serial'"),
+        (("--address", "auto"), "'ray' has one"),
+    ],
+)
+def test_commands_refuse_what_does_not_fit(command: str, wrong: tuple[str, ...], said: str) -> None:
+    """In a line, with exit code 2; nothing was begun."""
+    done = call(*COMMANDS[command], *wrong, "--out", "out")
+    assert done.exit_code == 2, done.output
+    assert said in " ".join(done.output.split())
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    "wrong", [("--executor", "ray"), ("--workers", "2"), ("--address", "auto")]
+)
+def test_experiments_of_one_graph_stay_here(wrong: tuple[str, str]) -> None:
+    """Without --learner there is one process, and nobody is told that there are more."""
+    done = call("discover", "pushing", "--backend", "fake", *wrong, "--out", "out")
+    assert done.exit_code == 2, done.output
+    said = " ".join(done.output.split())
+    assert f"{wrong[0]} cannot be" in said
+    assert "discover without --learner runs in this process" in said
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "usual"),
+    [("evaluate", "as many as there are cores"), ("collect", "1; with --executor")],
+)
+def test_help_tells_how_many_workers_there_are(command: str, usual: str) -> None:
+    """An evaluation has all cores without being asked."""
+    done = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "400"})
+    line = next(text for text in done.output.splitlines() if "--workers" in text)
+    assert f"default: ({usual}" in line
+
+
+def test_zero_workers_are_all_cores() -> None:
+    """Without an executor None means one, with one all; a usual executor keeps the number."""
+    with open_executor(None, None, None, "runs") as (executor, _):
+        assert executor.where == "in this process"
+    for workers in (None, 0):
+        with open_executor("process", workers, None, "runs") as (executor, _):
+            assert executor.workers == cores()
+    with open_executor(None, None, None, "runs", usual="process") as (executor, _):
+        assert executor.where == "in 1 process of this machine"
+    with open_executor(None, 0, None, "runs", usual="process") as (executor, _):
+        assert executor.workers == cores()
+    with pytest.raises(UnknownOption, match="workers"), open_executor(None, -1, None, "runs"):
+        pass
