@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from hashlib import blake2b
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -104,6 +107,15 @@ class Fingerprint:
         return self._sum.hexdigest()
 
 
+class Stepped(NamedTuple):
+    """What a control step gave: fraction and success are None where the task has no such thing."""
+
+    reward: float
+    fraction: float | None
+    success: bool | None
+    over: bool
+
+
 @final
 class RunningEpisode:
     """An episode under way, and what is kept of it.
@@ -112,31 +124,48 @@ class RunningEpisode:
         env: At the beginning of the episode, with what the protocol does at its reset.
         player: The policy.
         turn: What acts within the episode.
+        place: Agent, run, engine, protocol, seed and episode.
+        remembers: Whether to keep every observation, and the action that followed.
 
     Attributes:
-        mark: Sums it up; whoever plays lets it look at the beginning of every instant.
+        mark: Sums it up.
+        seen: Observations and actions, if it remembers.
     """
 
-    def __init__(self, env: ScmWorldEnv, player: Player, turn: Turn) -> None:
+    def __init__(
+        self,
+        env: ScmWorldEnv,
+        player: Player,
+        turn: Turn,
+        place: tuple[str, int, str, str, int, int],
+        *,
+        remembers: bool = False,
+    ) -> None:
         self._drawn = _drawn(env, 0)
         player.begin(env)
         self.mark = Fingerprint(env)
-        self._player, self._turn = player, turn
+        self.seen: list[tuple[Any, bytes]] | None = [] if remembers else None
+        self._player, self._turn, self._place = player, turn, place
         self._fractions: list[float] = []
+        self._success: bool | None = None
         self._total, self._steps = 0.0, 0
 
     def act(self, observation: Any) -> Actions:
         """Let the player choose an action, shape (n,)."""
+        shown = observation if self.seen is None else deepcopy(observation)
         action = self._player.act(observation)
         self.mark.act(action)
+        if self.seen is not None:
+            self.seen.append((shown, action.tobytes()))
         return action
 
-    def stepped(self, reward: float, fraction: float | None) -> None:
-        """Note what a control step gave: the reward, and the fractional success if there is one."""
-        self._total += reward
+    def stepped(self, found: Stepped) -> None:
+        """Note what a control step gave."""
+        self._total += found.reward
         self._steps += 1
-        if fraction is not None:
-            self._fractions.append(fraction)
+        self._success = found.success
+        if found.fraction is not None:
+            self._fractions.append(found.fraction)
 
     @property
     def is_due(self) -> bool:
@@ -150,15 +179,71 @@ class RunningEpisode:
         self._drawn |= _drawn(env, env.world.index)
         return True
 
-    def row(self, place: tuple[str, int, str, str, int, int], *, success: bool | None) -> Row:
-        """Give what is kept.
+    @property
+    def row(self) -> Row:
+        """What is kept in the end."""
+        scores = scored(self._fractions, success=self._success, total=float(self._total))
+        return Row(*self._place, self._steps, scores, self._drawn, str(self.mark))
 
-        Args:
-            place: Agent, run, engine, protocol, seed and episode.
-            success: Whether it succeeded in the end, if the task says so.
-        """
-        scores = scored(self._fractions, success=success, total=float(self._total))
-        return Row(*place, self._steps, scores, self._drawn, str(self.mark))
+
+class Envs(typing.Protocol):
+    """Environments in which episodes are under way: one, or those of a native batch."""
+
+    def observation(self, row: int) -> Any:
+        """Return what the player of an episode observes now."""
+
+    def step(self, actions: Mapping[int, Actions]) -> Mapping[int, Stepped]:
+        """Take a control step in each of these episodes."""
+
+    def arrive(self, row: int, episode_run: RunningEpisode, *, over: bool) -> None:
+        """Let the protocol act if the episode is not over, and its mark look at the instant."""
+
+
+def play(
+    envs: Envs, running: Sequence[RunningEpisode], watch: Callable[[], Any] = lambda: None
+) -> None:
+    """Play episodes that have begun to their ends: the only loop of evaluation.
+
+    Args:
+        envs: Where they happen.
+        running: One for each row.
+        watch: Called at every instant.
+    """
+    going = dict(enumerate(running))
+    while going:
+        watch()
+        # Copies: a policy may return one array again and again.
+        actions = {
+            row: episode_run.act(envs.observation(row)).copy() for row, episode_run in going.items()
+        }
+        for row, found in envs.step(actions).items():
+            going[row].stepped(found)
+            envs.arrive(row, going[row], over=found.over)
+            if found.over:
+                del going[row]
+    watch()
+
+
+@final
+class _Single:
+    """One environment; see ``Envs``."""
+
+    def __init__(self, env: ScmWorldEnv, observation: Any) -> None:
+        self._env, self._observation = env, observation
+
+    def observation(self, row: int) -> Any:
+        return self._observation
+
+    def step(self, actions: Mapping[int, Actions]) -> Mapping[int, Stepped]:
+        found = self._env.step(actions[0])
+        self._observation, reward, terminated, truncated, info = found
+        over = terminated or truncated
+        return {0: Stepped(reward, info.get(FRACTION), info.get(SUCCESS), over)}
+
+    def arrive(self, row: int, episode_run: RunningEpisode, *, over: bool) -> None:
+        if not over and episode_run.intervene(self._env):
+            self._observation = self._env.observe()
+        episode_run.mark.look()
 
 
 def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
@@ -222,34 +307,17 @@ class EpisodeRunner:
             EvaluationError: The policy gave no action, or an intervention was refused; with the
                 place.
         """
-        engine = self.env.world.backend.name
+        env, engine = self.env, self.env.world.backend.name
         named = (who[0], engine, protocol.name, seed, episode)
         place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
-        with _placed(place, self.env):
+        with _placed(place, env):
             turn, observation = self.begin(protocol, seed=seed, episode=episode)
-            episode_run = RunningEpisode(self.env, player, turn)
-            success = self._finish(episode_run, observation, watch)
-        return episode_run.row((*who, engine, protocol.name, seed, episode), success=success)
-
-    def _finish(
-        self, episode_run: RunningEpisode, observation: Any, watch: Watch | None
-    ) -> bool | None:
-        """Run an episode that has begun; return whether it succeeded, if the task has that."""
-        env, over = self.env, False
-        while not over:
-            if watch is not None:
-                watch(env)
-            observation, reward, terminated, truncated, info = env.step(
-                episode_run.act(observation)
+            episode_run = RunningEpisode(
+                env, player, turn, (*who, engine, protocol.name, seed, episode)
             )
-            episode_run.stepped(reward, info.get(FRACTION))
-            over = terminated or truncated
-            if not over and episode_run.intervene(env):
-                observation = env.observe()
-            episode_run.mark.look()
-        if watch is not None:
-            watch(env)
-        return info.get(SUCCESS)
+            looks = (lambda: None) if watch is None else partial(watch, env)
+            play(_Single(env, observation), [episode_run], looks)
+        return episode_run.row
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
         """Check that a protocol fits: begin the first episode with it.

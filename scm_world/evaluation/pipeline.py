@@ -12,7 +12,7 @@ from typing import Any, final
 from scm_world.errors import UnreadableFile
 from scm_world.evaluation.agents import AgentRun
 from scm_world.evaluation.episodes import EpisodeRunner, Row
-from scm_world.evaluation.lockstep import Episodes, Lockstep
+from scm_world.evaluation.lockstep import Lockstep
 from scm_world.evaluation.players import Player, as_player
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import SHARD, Setup, Shard, prepare
@@ -47,9 +47,13 @@ class ShardRunner:
     def __call__(self, shard: Shard) -> list[Row]:
         """Play all episodes of a shard, side by side where that is faster."""
         agent_run, numbers = self.setup.agents[shard.agent], range(shard.first, shard.stop)
-        protocol = self.setup.protocols[shard.protocol]
-        episodes = Episodes((agent_run.agent, agent_run.run), protocol, shard.seed, numbers)
-        rows = self.lockstep(shard).play(self.player(shard.agent), episodes)
+        rows = self.lockstep(shard).play(
+            self.player(shard.agent),
+            self.setup.protocols[shard.protocol],
+            seed=shard.seed,
+            episodes=numbers,
+            who=(agent_run.agent, agent_run.run),
+        )
         return rows or [self.play(shard, episode) for episode in numbers]
 
     def play(self, shard: Shard, episode: int, watch: Any = None) -> Row:

@@ -114,8 +114,8 @@ def test_side_by_side_is_one_after_another(monkeypatch: pytest.MonkeyPatch) -> N
     played: list[int] = []
     original = Lockstep.play
 
-    def play(self: Lockstep, *given: Any) -> Any:
-        rows = original(self, *given)
+    def play(self: Lockstep, *given: Any, **how: Any) -> Any:
+        rows = original(self, *given, **how)
         played.append(len(rows or ()))
         return rows
 
