@@ -88,15 +88,15 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
     rewards, and what is known beside them.
     """
     inner = envs.unwrapped
-    crew = inner.crew
-    tables, lenses = crew._batch._tables.values(), crew._lenses.values()
+    executor = inner.executor
+    tables, readers = executor._batch._tables.values(), executor._readers.values()
     places: list[tuple[str, Any, str]] = [
-        (PHYSICS, crew._batch._engine, "step"),
+        (PHYSICS, executor._batch._engine, "step"),
         *(("mechanisms", one, "evaluate") for one in {t.compiled.mechanisms for t in tables}),
-        *(("observation", lens, "write") for lens in lenses),
+        *(("observation", reader, "write") for reader in readers),
         ("observation", inner, "_observations"),
         ("info", inner, "_infos"),
-        ("command", crew._commands, "read"),
+        ("command", executor._commands, "read"),
         (REST, inner, "step"),
     ]
     for part, owner, name in places:

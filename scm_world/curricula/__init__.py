@@ -30,9 +30,9 @@ from scm_world.curricula.phrases import (
     resample,
 )
 from scm_world.curricula.published import ACTORS, active, published_actor, published_curriculum
+from scm_world.curricula.runner import CurriculumRunner
 from scm_world.curricula.situations import Memory, Situation
 from scm_world.curricula.times import at_reset, at_step, during, every
-from scm_world.curricula.turns import Turn
 from scm_world.curricula.vector import CurriculumVectorEnv, make_vec
 from scm_world.curricula.wrapper import CurriculumEnv
 from scm_world.variables import AB, A, B, Subset
@@ -44,6 +44,7 @@ __all__ = [
     "B",
     "Curriculum",
     "CurriculumEnv",
+    "CurriculumRunner",
     "CurriculumVectorEnv",
     "Do",
     "Follow",
@@ -55,7 +56,6 @@ __all__ = [
     "Resample",
     "Situation",
     "Subset",
-    "Turn",
     "active",
     "as_curriculum",
     "at_reset",

@@ -1,4 +1,4 @@
-"""An environment under a curriculum, as a member of a crew."""
+"""An environment under a curriculum, as a member of an executor."""
 
 from __future__ import annotations
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
 from scm_world.curricula.choices import count
-from scm_world.curricula.crew import CurriculumCrew
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
+from scm_world.curricula.executor import CurriculumExecutor
 from scm_world.curricula.members import Member
 from scm_world.curricula.situations import Memory
 from scm_world.curricula.wrapper import CurriculumEnv, place
 from scm_world.env import IDS, MODEL_ID
-from scm_world.env.batched.choice import fastest
+from scm_world.env.batched.executor import fastest
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.tasks import Task
 
@@ -72,7 +72,7 @@ def make_vec(
     n = whole_number("num_envs", num_envs, least=1)
     made = as_curriculum(curriculum)
     if mode in (NATIVE, PROCESSES, LOOP):
-        return CurriculumVectorEnv(_crewed(env_id, n, made, autoreset_mode, mode, options), made)
+        return CurriculumVectorEnv(_make(env_id, n, made, autoreset_mode, mode, options), made)
     one = partial(_one, env_id, made, options)
     kind: Any = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
     return CurriculumVectorEnv(kind([one] * n, autoreset_mode=autoreset_mode), made)
@@ -85,26 +85,26 @@ def _has_native(env_id: str, options: Mapping[str, Any]) -> bool:
     return kind == NATIVE and env_id in (*IDS, MODEL_ID) and options.get(_TIME_LIMIT) is None
 
 
-def _crewed(
+def _make(
     env_id: str,
     n: int,
     curriculum: Curriculum,
     mode: AutoresetMode,
-    crew: str,
+    executor: str,
     options: Mapping[str, Any],
 ) -> Any:
     if options.get(_TIME_LIMIT) is not None:
         allowed = ("max_episode_length=…", "vectorization_mode='sync'")
-        raise UnknownOption(f"{_TIME_LIMIT} with {crew!r}", options[_TIME_LIMIT], allowed)
+        raise UnknownOption(f"{_TIME_LIMIT} with {executor!r}", options[_TIME_LIMIT], allowed)
     own = {name: value for name, value in options.items() if name not in _OF_MAKE}
-    if crew != NATIVE:
+    if executor != NATIVE:
         own["member"] = partial(Member.of, curriculum)
     kind = VectorizeMode.VECTOR_ENTRY_POINT
     envs: Any = gymnasium.make_vec(
-        env_id, n, vectorization_mode=kind, autoreset_mode=mode, crew=crew, **own
+        env_id, n, vectorization_mode=kind, autoreset_mode=mode, executor=executor, **own
     )
-    if crew == NATIVE:
-        envs.crew = CurriculumCrew(envs.crew, curriculum)
+    if executor == NATIVE:
+        envs.executor = CurriculumExecutor(envs.executor, curriculum)
     return envs
 
 
@@ -125,7 +125,7 @@ class CurriculumVectorEnv(VectorWrapper):
 
     Args:
         env: A vector environment whose members are each in a ``CurriculumEnv``, or are in a
-            ``CurriculumCrew``.
+            ``CurriculumExecutor``.
         curriculum: The same as theirs.
 
     Raises:
@@ -207,7 +207,7 @@ class CurriculumVectorEnv(VectorWrapper):
         """Play episodes again up to where they were, bit for bit.
 
         Args:
-            running: What ``running`` gave, of as many environments in a crew.
+            running: What ``running`` gave, of as many environments in an executor.
             actions: Of each control step since their resets, shape (steps, n, n_actions).
             lengths: How many of them each member took, shape (n,).
 
@@ -230,10 +230,10 @@ class CurriculumVectorEnv(VectorWrapper):
         self.resume({name: running[name] for name in ("episode", "stages", "again", "noises")})
         self._members.set_attr("turn", [(memory.episode, memory) for memory in memories])
         self.env.reset()
-        crew: Any = self.unwrapped.crew  # type: ignore[attr-defined] # not of Gymnasium's kinds
+        executor: Any = self.unwrapped.executor  # type: ignore[attr-defined] # not of Gymnasium's kinds
         for step, row in enumerate(np.asarray(actions, dtype=np.float64)):
             if (which := np.asarray(lengths) > step).any():
-                crew.step(which, row)
+                executor.step(which, row)
         self._members.set_attr("turn", turns)
         self._present, self._waiting, self._again = kept["present"], kept["waiting"], left
         self._stepped = np.array(kept["stepped"], bool)

@@ -10,8 +10,8 @@ from gymnasium.utils import RecordConstructorArgs
 
 from scm_world._arguments import whole_number
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
+from scm_world.curricula.runner import CurriculumRunner
 from scm_world.curricula.situations import Memory
-from scm_world.curricula.turns import Turn
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import flatten
@@ -72,7 +72,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._inner = environment(env, "CurriculumEnv")
         _refuse_forgetful(self._layers())
         self._checked = is_checked(made, self._inner.world)
-        self._turn = Turn(made)
+        self._turn = CurriculumRunner(made)
         self._begun = self._running = self._stepped = self._success = False
         self._next: tuple[int, Memory] | None = None
         self._place: tuple[int, int] | None = None

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.curricula import Memory, Turn
+from scm_world.curricula import CurriculumRunner, Memory
 from scm_world.curricula.choices import Stages
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
@@ -136,7 +136,7 @@ class RunningEpisode:
         self,
         env: ScmWorldEnv,
         player: Player,
-        turn: Turn,
+        turn: CurriculumRunner,
         place: tuple[str, int, str, str, int, int],
         *,
         remembers: bool = False,
@@ -246,7 +246,7 @@ class _Single:
         episode_run.mark.look()
 
 
-def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
+def turn_of(protocol: Protocol, env: ScmWorldEnv) -> CurriculumRunner:
     """Prepare a protocol for an environment.
 
     Raises:
@@ -259,7 +259,7 @@ def turn_of(protocol: Protocol, env: ScmWorldEnv) -> Turn:
     if any(isinstance(part, Stages) for part in protocol.part.walk()):
         allowed = ("parts without stages: an episode must not depend on others",)
         raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
-    turn = Turn(protocol.curriculum())
+    turn = CurriculumRunner(protocol.curriculum())
     try:
         turn.curriculum.check(env.world)
         if isinstance(protocol.space, Subset) and not env.world.structures.head:
@@ -281,7 +281,7 @@ class EpisodeRunner:
 
     def __init__(self, env: ScmWorldEnv) -> None:
         self.env = env
-        self._turns: dict[str, tuple[Protocol, Turn]] = {}
+        self._turns: dict[str, tuple[Protocol, CurriculumRunner]] = {}
 
     def play(
         self,
@@ -331,7 +331,7 @@ class EpisodeRunner:
         with _placed({**place, "seed": seed, "episode": 0}, self.env):
             self.begin(protocol, seed=seed, episode=0)
 
-    def begin(self, protocol: Protocol, *, seed: int, episode: int) -> tuple[Turn, Any]:
+    def begin(self, protocol: Protocol, *, seed: int, episode: int) -> tuple[CurriculumRunner, Any]:
         """Begin an episode, with what a protocol does at its reset.
 
         Returns:
@@ -349,7 +349,7 @@ class EpisodeRunner:
             observation = self.env.observe()
         return turn, observation
 
-    def _turn(self, protocol: Protocol) -> Turn:
+    def _turn(self, protocol: Protocol) -> CurriculumRunner:
         kept, found = self._turns.get(protocol.name, (None, None))
         if found is None or kept != protocol:
             found = turn_of(protocol, self.env)

@@ -9,9 +9,9 @@ from typing import Any, final
 import numpy as np
 
 from scm_world.env import ScmWorldEnv
-from scm_world.env.batched.inside import Inside
-from scm_world.env.batched.native import NativeCrew
-from scm_world.env.batched.sheet import FLAGS, FRACTION
+from scm_world.env.batched.buffers import FLAGS, FRACTION
+from scm_world.env.batched.native import NativeExecutor
+from scm_world.env.batched.reader import EnvLayout
 from scm_world.evaluation.episodes import EpisodeRunner, Row, RunningEpisode, Stepped, play
 from scm_world.evaluation.players import Actions, Player
 from scm_world.evaluation.protocols import Protocol
@@ -24,36 +24,36 @@ LONG = 0.1
 class _Rows:
     """Environments of a native batch; see ``Envs``."""
 
-    def __init__(self, crew: NativeCrew, n_actions: int) -> None:
-        self._crew = crew
-        self._actions = np.zeros((crew.num_envs, n_actions))
+    def __init__(self, executor: NativeExecutor, n_actions: int) -> None:
+        self._executor = executor
+        self._actions = np.zeros((executor.num_envs, n_actions))
 
     def observation(self, row: int) -> Any:
-        return self._crew.sheet.observation(row)
+        return self._executor.buffers.observation(row)
 
     def step(self, actions: Mapping[int, Actions]) -> Mapping[int, Stepped]:
-        which = np.zeros(self._crew.num_envs, dtype=np.bool_)
+        which = np.zeros(self._executor.num_envs, dtype=np.bool_)
         for row, action in actions.items():
             which[row], self._actions[row] = True, action
-        self._crew.step(which, self._actions)
-        sheet = self._crew.sheet
-        infos: Mapping[str, Any] = sheet.infos
+        self._executor.step(which, self._actions)
+        buffers = self._executor.buffers
+        infos: Mapping[str, Any] = buffers.infos
         fractions, successes = infos.get(FRACTION), infos.get(FLAGS[0])
         return {
             row: Stepped(
-                float(sheet.rewards[row]),
+                float(buffers.rewards[row]),
                 None if fractions is None else float(fractions[row]),
                 None if successes is None else bool(successes[row]),
-                bool(sheet.terminations[row] or sheet.truncations[row]),
+                bool(buffers.terminations[row] or buffers.truncations[row]),
             )
             for row in actions
         }
 
     def arrive(self, row: int, episode_run: RunningEpisode, *, over: bool) -> None:
         if over or not episode_run.is_due:
-            episode_run.mark.look(self._crew.state(row))
+            episode_run.mark.look(self._executor.state(row))
             return
-        with self._crew.alone(row) as env:
+        with self._executor.alone(row) as env:
             episode_run.intervene(env)
             episode_run.mark.look()
 
@@ -76,7 +76,7 @@ class Lockstep:
 
     def __init__(self, env: ScmWorldEnv, most: int, threads: int) -> None:
         self._env, self._most, self._threads = env, most, threads
-        self._crew: NativeCrew | None = None
+        self._executor: NativeExecutor | None = None
         self._runners: dict[int, EpisodeRunner] = {}
         self._apart: list[Player] = []  # who plays one episode at a time
 
@@ -124,7 +124,7 @@ class Lockstep:
             self._threads > 1
             and world.backend.capabilities.batch
             and not len(world.structures.head)  # else bodies may come and go in some of them
-            and not Inside.of(self._env).is_partial
+            and not EnvLayout.of(self._env).is_partial
             and not any(player is one for one in self._apart)
             and player.parallel
         )
@@ -159,13 +159,13 @@ class Lockstep:
             twin.act(observation).tobytes() == action for observation, action in episode_run.seen
         )
 
-    def _ready(self) -> NativeCrew:
-        if self._crew is None:
-            self._crew = NativeCrew(self._env.sibling, self._most, threads=self._threads)
-        return self._crew
+    def _ready(self) -> NativeExecutor:
+        if self._executor is None:
+            self._executor = NativeExecutor(self._env.sibling, self._most, threads=self._threads)
+        return self._executor
 
     def close(self) -> None:
         """Free the engines."""
-        if self._crew is not None:
-            self._crew.close()
-        self._crew, self._runners = None, {}
+        if self._executor is not None:
+            self._executor.close()
+        self._executor, self._runners = None, {}

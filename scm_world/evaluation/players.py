@@ -35,7 +35,7 @@ Actions = NDArray[Any]
 About = dict[str, Any]
 """Description of a policy as plain data: its kind, its name, and where it comes from."""
 
-Act = Callable[[Any], Any]
+Actor = Callable[[Any], Any]
 """Gives an action for an observation, within one episode."""
 
 PACKAGE = "scm_world"
@@ -115,7 +115,7 @@ class Player:
     def __init__(
         self,
         about: Mapping[str, Any],
-        start: Callable[[ScmWorldEnv], Act],
+        start: Callable[[ScmWorldEnv], Actor],
         *,
         made_for: PolicyAbout | None = None,
         is_plain: bool = False,
@@ -124,7 +124,7 @@ class Player:
         self._about, self._start = dict(about), start
         self.made_for, self.is_plain, self.parallel = made_for, is_plain, parallel
         self._env: ScmWorldEnv | None = None
-        self._act: Act | None = None
+        self._act: Actor | None = None
 
     @property
     def about(self) -> About:
@@ -215,14 +215,14 @@ def checked(action: Any, env: Any, name: str) -> Actions:
 # --- how episodes begin -----------------------------------------------------------------------
 
 
-def _function(policy: Any, env: ScmWorldEnv) -> Act:
+def _function(policy: Any, env: ScmWorldEnv) -> Actor:
     if callable(getattr(policy, "reset", None)):
         policy.reset()
-    act: Act = policy
+    act: Actor = policy
     return act
 
 
-def _model(model: Any, env: ScmWorldEnv) -> Act:
+def _model(model: Any, env: ScmWorldEnv) -> Actor:
     """Carry what a recurrent model remembers from step to step."""
     state, first = None, True
 
@@ -237,14 +237,14 @@ def _model(model: Any, env: ScmWorldEnv) -> Act:
     return act
 
 
-def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Act:
+def _network(policy: MlpPolicy | OnnxPolicy, name: str, env: ScmWorldEnv) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
     return policy
 
 
-def _of_world(make: Any, name: str, env: ScmWorldEnv) -> Act:
+def _of_world(make: Any, name: str, env: ScmWorldEnv) -> Actor:
     """Give actions that lead as near to the command of a world policy as one action can."""
     policy = _function(make(), env)
     return lambda _: env.toward(checked(policy(env.world), env, name))
@@ -260,7 +260,7 @@ def _itself(policy: Policy) -> Policy:
 
 def _open_loop(
     actions: Actions, name: str, given: Mapping[str, Any] | None, env: ScmWorldEnv
-) -> Act:
+) -> Actor:
     """Play actions one after another and hold the last one.
 
     Where the environment has the same kind of actions they are played bit for bit; where it has

@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.env import IDS
-from scm_world.env.batched.choice import fastest
+from scm_world.env.batched.executor import fastest
 from scm_world.errors import Diverged, MissingExtra, UnknownOption, UnreadableFile
 from scm_world.output.durable import made, write_durably, write_whole
 from scm_world.policies import save_policy
@@ -151,7 +151,7 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     )
     try:
         vec_env = sb3_vec_env(envs, [])
-        there = vec_env.crew.sheet.infos
+        there = vec_env.executor.buffers.infos
         vec_env.names = tuple(name for name in (SUCCESS, FRACTION) if name in there)
         (length,) = vec_env.get_attr("limit", 0)
         return Episodes(vec_env, length, staggered=recipe.staggered)

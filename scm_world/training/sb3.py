@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from scm_world.env.batched import Crew, ScmWorldVectorEnv
+from scm_world.env.batched import EnvExecutor, ScmWorldVectorEnv
 from scm_world.errors import MissingExtra, UnknownOption
 
 try:
@@ -66,15 +66,15 @@ class Sb3VecEnv(VecEnv):
 
     Attributes:
         worlds: For all that Stable-Baselines3 knows nothing of: ``do``, ``branch``, …
-        crew: What simulates them.
+        executor: What simulates them.
         names: What is told of ``info`` at every step; all of it if None.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None) -> None:
         self.worlds: Any = envs
         bare: Any = envs.unwrapped
-        self.crew: Crew = bare.crew
-        known = self.crew.sheet.infos
+        self.executor: EnvExecutor = bare.executor
+        known = self.executor.buffers.infos
         self.names = infos and tuple(name for name in infos if name in known or name not in USUAL)
         for name in self.names or ():
             if name not in known:
@@ -120,17 +120,17 @@ class Sb3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of some worlds."""
-        return self.crew.attribute(self._chosen(indices), attr_name)
+        return self.executor.attribute(self._chosen(indices), attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of some worlds to one value."""
-        self.crew.assign(attr_name, dict.fromkeys(self._chosen(indices), value))
+        self.executor.assign(attr_name, dict.fromkeys(self._chosen(indices), value))
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of some worlds."""
-        return self.crew.call(self._chosen(indices), method_name, *method_args, **method_kwargs)
+        return self.executor.call(self._chosen(indices), method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Tell whether worlds are in a wrapper: none is, one by one."""

@@ -97,7 +97,7 @@ def test_native_is_sync_value_by_value(name: str, mode: AutoresetMode) -> None:
 
 @pytest.mark.parametrize("kind", ["loop", "processes"])
 @pytest.mark.parametrize("name", CURRICULA)
-def test_other_crews_are_sync_value_by_value(name: str, kind: str) -> None:
+def test_other_executors_are_sync_value_by_value(name: str, kind: str) -> None:
     """One after another in this process, or several in each of some processes."""
     mode = AutoresetMode.SAME_STEP
     pair = [made(one, CURRICULA[name], mode, backend="fake") for one in (kind, "sync")]
@@ -177,11 +177,11 @@ def test_a_snapshot_goes_back_to_what_is_due() -> None:
 def test_members_that_are_left_alone_are_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing is due within an episode, only resets ask an environment by itself."""
     envs = made("native", goals("A"), AutoresetMode.NEXT_STEP)
-    crew = envs.env.crew._crew
+    executor = envs.env.executor._executor
     envs.reset(seed=0)
     asked: list[int] = []
-    alone = crew.alone
-    monkeypatch.setattr(crew, "alone", lambda index: asked.append(index) or alone(index))
+    alone = executor.alone
+    monkeypatch.setattr(executor, "alone", lambda index: asked.append(index) or alone(index))
     for _ in range(4):
         envs.step(np.zeros((3, 9), np.float32))
     assert asked == []

@@ -123,11 +123,13 @@ def test_an_episode_is_terminated_where_the_variable_says_so() -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", [Balance, Falling, Scored])
-@pytest.mark.parametrize("crew", ["native", "loop"])
-def test_many_do_what_single_ones_do(kind: Any, mode: str, crew: str) -> None:
+@pytest.mark.parametrize("executor", ["native", "loop"])
+def test_many_do_what_single_ones_do(kind: Any, mode: str, executor: str) -> None:
     """Bit for bit, with compiled rewards and with functions of Python, in all modes of resets."""
     options = {"context": "observation"}
-    many = gymnasium.make_vec(MODEL_ID, 3, model=kind(), autoreset_mode=mode, crew=crew, **options)
+    many = gymnasium.make_vec(
+        MODEL_ID, 3, model=kind(), autoreset_mode=mode, executor=executor, **options
+    )
     single = SyncVectorEnv([lambda: make(kind(), **options)] * 3, autoreset_mode=mode)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (45, 3, 1)).astype(np.float32)
     actions[:, 1] = 1.0  # it drives off
@@ -148,10 +150,10 @@ def test_many_do_what_single_ones_do(kind: Any, mode: str, crew: str) -> None:
     single.close()
 
 
-@pytest.mark.parametrize("crew", ["native", "loop"])
-def test_many_worlds_of_a_function(crew: str) -> None:
+@pytest.mark.parametrize("executor", ["native", "loop"])
+def test_many_worlds_of_a_function(executor: str) -> None:
     """Also where the physics is a function, and actions have two components."""
-    many = gymnasium.make_vec(MODEL_ID, 2, model=Decay(), backend="step", crew=crew)
+    many = gymnasium.make_vec(MODEL_ID, 2, model=Decay(), backend="step", executor=executor)
     one = make(Decay(), backend="step")
     seen, _ = many.reset(seed=0)
     np.testing.assert_array_equal(seen[0], one.reset(seed=0)[0])

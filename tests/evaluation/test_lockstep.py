@@ -39,10 +39,10 @@ def found(policy: Any, protocols: Any, threads: int, n: int = 3, **env: Any) -> 
     )
     shard_runner = ShardRunner(setup, None, threads)
     rows = [row for shard in setup.shards() for row in shard_runner(shard)]
-    crews = [lockstep._crew is not None for lockstep in shard_runner.locksteps.values()]
+    executors = [lockstep._executor is not None for lockstep in shard_runner.locksteps.values()]
     apart = [lockstep._apart for lockstep in shard_runner.locksteps.values()]
     shard_runner.close()
-    return Found(rows, any(crews) and not any(apart))
+    return Found(rows, any(executors) and not any(apart))
 
 
 class Cell:

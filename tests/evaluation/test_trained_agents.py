@@ -131,14 +131,16 @@ def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:
         env={"max_episode_length": 5},
         trusted=None,
     )
-    rows, crews = [], []
+    rows, executors = [], []
     for threads in (1, 3):
         shard_runner = ShardRunner(setup, None, threads)
         rows.append([row for shard in setup.shards() for row in shard_runner(shard)])
-        crews.append([lockstep._crew is not None for lockstep in shard_runner.locksteps.values()])
+        executors.append(
+            [lockstep._executor is not None for lockstep in shard_runner.locksteps.values()]
+        )
         shard_runner.close()
     assert rows[0] == rows[1]
-    assert crews == [[False], [True]]
+    assert executors == [[False], [True]]
 
 
 # --- what counts ------------------------------------------------------------------------------

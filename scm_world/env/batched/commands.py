@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
-from scm_world.env.batched.crew import check_actions
-from scm_world.env.batched.inside import Inside
+from scm_world.env.batched.executor import check_actions
+from scm_world.env.batched.reader import EnvLayout
 from scm_world.env.delta import JOINTS
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.world.batch import Batch, Table
@@ -28,7 +28,7 @@ class Commands:
     """
 
     def __init__(self, env: ScmWorldEnv, num_envs: int) -> None:
-        inside = Inside.of(env)
+        inside = EnvLayout.of(env)
         self._middle, self._half = inside.middle, inside.half
         self._low, self._high = env.world.action_low, env.world.action_high
         self._delta = inside.delta
@@ -78,7 +78,7 @@ class Commands:
     def look(self, index: int, env: ScmWorldEnv) -> None:
         """Note whether the joints of an environment were put somewhere."""
         if self._delta is not None and self._mode == JOINTS:
-            delta = Inside.of(env).delta
+            delta = EnvLayout.of(env).delta
             self._are_set[index] = delta is not None and delta.is_set()
 
     def passed(self, rows: Integers) -> None:

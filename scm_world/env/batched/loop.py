@@ -9,8 +9,8 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.env.batched.crew import check_actions, located
-from scm_world.env.batched.sheet import Form, Sheet
+from scm_world.env.batched.buffers import Buffers, Form
+from scm_world.env.batched.executor import check_actions, located
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import NotReset, ScmWorldError
@@ -22,18 +22,18 @@ SNAPSHOT = "the snapshot"
 
 
 @final
-class LoopCrew:
-    """Environments that take turns: what every other crew is held against. See ``Crew``.
+class LoopExecutor:
+    """Environments that take turns: what every other executor is held against. See ``EnvExecutor``.
 
     Args:
         make: Makes one of them.
         num_envs: How many.
-        first: The number of the first one in messages, where these are a part of a larger crew.
+        first: The number of the first one in messages, where these are a part of a larger executor.
 
     Attributes:
         num_envs: How many there are.
         form: What they have in common.
-        sheet: What they said last.
+        buffers: What they said last.
         envs: The environments.
     """
 
@@ -43,7 +43,7 @@ class LoopCrew:
         lead = make()
         self.envs = [lead, *(lead.sibling() for _ in range(num_envs - 1))]
         self.form = Form.of(self.envs[0])
-        self.sheet = Sheet.empty(self.form, num_envs)
+        self.buffers = Buffers.empty(self.form, num_envs)
         self._seen = [env.observation_space for env in self.envs]
         self._before: dict[int, EnvSnapshot] = {}
 
@@ -60,13 +60,13 @@ class LoopCrew:
             chosen = None if given is None else dict(given)
             shown = self.envs[index].reset(seed=seeds[index], options=chosen)
             self._accept(index, _first_name((given or {}).get("do"), RESET))
-            self.sheet.write(index, *shown)
+            self.buffers.write(index, *shown)
 
         self._all_or_none(np.flatnonzero(which).tolist(), begin)
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step."""
-        sheet, rows = self.sheet, np.flatnonzero(which)
+        buffers, rows = self.buffers, np.flatnonzero(which)
         check_actions(rows, actions, self._first)
         failed: ScmWorldError | None = None
         for index in rows.tolist():
@@ -77,10 +77,10 @@ class LoopCrew:
             except ScmWorldError as error:
                 failed = failed or located(error, self._first + index)
                 continue
-            sheet.rewards[index] = reward
-            sheet.terminations[index] = terminated
-            sheet.truncations[index] = truncated
-            sheet.write(index, observation, info)
+            buffers.rewards[index] = reward
+            buffers.terminations[index] = terminated
+            buffers.truncations[index] = truncated
+            buffers.write(index, observation, info)
         if failed is not None:
             raise failed
 
@@ -118,7 +118,7 @@ class LoopCrew:
             env.restore(snapshots[index])
             shown = env.present()
             self._accept(index, SNAPSHOT)
-            self.sheet.write(index, *shown)
+            self.buffers.write(index, *shown)
 
         self._all_or_none(snapshots, go)
 
@@ -162,7 +162,7 @@ class LoopCrew:
             raise
 
     def _show(self, index: int) -> None:
-        self.sheet.write(index, *self.envs[index].present())
+        self.buffers.write(index, *self.envs[index].present())
 
     def _accept(self, index: int, variable: str) -> None:
         """Refuse an environment that is not observed like the others any more."""

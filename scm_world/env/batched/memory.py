@@ -1,4 +1,4 @@
-"""What several processes share: memory, and bells to ring."""
+"""What several processes share: memory, and signals."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def shared(place: Path) -> mmap.mmap:
 
 
 @final
-class Carver:
+class Allocator:
     """Cuts arrays out of memory, one after another.
 
     Args:
@@ -69,10 +69,10 @@ class Carver:
         size: How many bytes are cut so far.
 
     Example:
-        >>> carver = Carver(bytearray(128))
-        >>> carver((3,), np.float64), carver((2,), np.bool_)
+        >>> allocator = Allocator(bytearray(128))
+        >>> allocator((3,), np.float64), allocator((2,), np.bool_)
         (array([0., 0., 0.]), array([False, False]))
-        >>> carver.size
+        >>> allocator.size
         128
     """
 
@@ -90,14 +90,14 @@ class Carver:
 
 
 @final
-class Bell:
+class Signal:
     """Lets another process do something, many times, at the cost of two bytes through the kernel.
 
-    The other one calls ``answer_bell`` before it is rung.
+    The other one calls ``answer_signal`` before the first one.
 
     Args:
         place: Where the other process finds it.
-        name: Of the bell.
+        name: Of the signal.
     """
 
     def __init__(self, place: Path, name: str) -> None:
@@ -108,7 +108,7 @@ class Bell:
         self._back = os.open(back, os.O_RDONLY | os.O_NONBLOCK)  # as nobody writes to it yet
         os.set_blocking(self._back, True)
 
-    def ring(self, what: bytes) -> None:
+    def send(self, what: bytes) -> None:
         """Ask for something, one byte; ``answer`` tells when it is done."""
         os.write(self._there, what)
 
@@ -117,17 +117,17 @@ class Bell:
         return os.read(self._back, 1)
 
     def close(self) -> None:
-        """Ring no more."""
+        """Send no more."""
         os.close(self._there)
         os.close(self._back)
 
 
-def answer_bell(place: Path, name: str, serve: Callable[[bytes], bytes]) -> None:
-    """Answer a bell from now on, in a thread, for as long as there is somebody to ring it.
+def answer_signal(place: Path, name: str, serve: Callable[[bytes], bytes]) -> None:
+    """Answer a signal from now on, in a thread, for as long as there is somebody to send it.
 
     Args:
         place: Where it is.
-        name: Of the bell.
+        name: Of the signal.
         serve: Takes and gives one byte.
     """
     there, back = _paths(place, name)

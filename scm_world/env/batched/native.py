@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.env.batched.commands import Commands
-from scm_world.env.batched.crew import located
-from scm_world.env.batched.inside import Inside
-from scm_world.env.batched.lens import Lens
-from scm_world.env.batched.loop import LoopCrew
+from scm_world.env.batched.executor import located
+from scm_world.env.batched.loop import LoopExecutor
+from scm_world.env.batched.reader import EnvLayout, ObservationReader
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import REWARD, ScmWorldEnv
 from scm_world.errors import EngineFailure, ScmWorldError
@@ -28,11 +27,11 @@ from scm_world.world.mechanisms import FunctionFailure
 
 
 @final
-class NativeCrew:
+class NativeExecutor:
     """Environments that are stepped by threads of the engine, and read in compiled loops.
 
     Pictures, the corners of blocks, contacts and the noise of sensors are read in one environment
-    after another. See ``Crew``.
+    after another. See ``EnvExecutor``.
 
     Args:
         make: Makes one of them.
@@ -42,21 +41,21 @@ class NativeCrew:
     Attributes:
         num_envs: How many there are.
         form: What they have in common.
-        sheet: What they said last.
+        buffers: What they said last.
     """
 
     def __init__(
         self, make: Callable[[], ScmWorldEnv], num_envs: int, *, threads: int | None = None
     ) -> None:
-        self._members = LoopCrew(make, num_envs)
+        self._members = LoopExecutor(make, num_envs)
         self.num_envs = num_envs
-        self.form, self.sheet = self._members.form, self._members.sheet
+        self.form, self.buffers = self._members.form, self._members.buffers
         self._envs = self._members.envs
         lead = self._envs[0]
         self._commands = Commands(lead, num_envs)
-        names = (*Inside.of(lead).needed, *self._commands.names)
+        names = (*EnvLayout.of(lead).needed, *self._commands.names)
         self._batch = Batch([env.world for env in self._envs], threads=threads, names=names)
-        self._lenses: WeakKeyDictionary[Table, Lens] = WeakKeyDictionary()
+        self._readers: WeakKeyDictionary[Table, ObservationReader] = WeakKeyDictionary()
         self._sensed: set[int] = set()
         self._alone: set[int] = set()  # they were used by themselves since they were stepped
 
@@ -74,21 +73,21 @@ class NativeCrew:
             self._bring(rows.tolist())
             for row in rows.tolist():
                 with suppress(ScmWorldError):
-                    self.sheet.write(row, *self._envs[row].present())
+                    self.buffers.write(row, *self._envs[row].present())
             if isinstance(error, FunctionFailure):
                 raise located(error, error.row) from error.__cause__
             raise
         self._commands.passed(rows)
         for table, members in self._batch.tables(rows):
-            lens = self._lens(table, int(members[0]))
-            wrong = lens.write(table, members, self.sheet)
+            reader = self._reader(table, int(members[0]))
+            wrong = reader.write(table, members, self.buffers)
             if wrong is not None:
                 self._explain(wrong)
-            again: Iterable[int] = members.tolist() if lens.is_partial else self._sensed
+            again: Iterable[int] = members.tolist() if reader.is_partial else self._sensed
             for row in again:
                 if which[row]:
                     self._bring([row])
-                    self.sheet.write(row, *self._envs[row].present())
+                    self.buffers.write(row, *self._envs[row].present())
 
     def reset(
         self,
@@ -153,7 +152,7 @@ class NativeCrew:
         shown = env.present()
         if env.observation_space is not seen:
             self.form.check(env, "what was done")
-        self.sheet.write(index, *shown)
+        self.buffers.write(index, *shown)
 
     def state(self, index: int) -> Floats:
         """Give where everything is in one that was just stepped, as ``PhysicalState.vector``.
@@ -188,10 +187,10 @@ class NativeCrew:
                 self._sensed.discard(index)
         self._alone.clear()
 
-    def _lens(self, table: Table, row: int) -> Lens:
-        found = self._lenses.get(table)
+    def _reader(self, table: Table, row: int) -> ObservationReader:
+        found = self._readers.get(table)
         if found is None:
-            found = self._lenses[table] = Lens(self._envs[row], table)
+            found = self._readers[table] = ObservationReader(self._envs[row], table)
         return found
 
     def _explain(self, row: int) -> None:
@@ -201,7 +200,7 @@ class NativeCrew:
             ModelError: Its reward is no finite number.
         """
         self._bring([row])
-        terms = Inside.of(self._envs[row]).terms
+        terms = EnvLayout.of(self._envs[row]).terms
         try:
             one_number(self._envs[row].world.evaluate((REWARD, *terms)), REWARD, terms)
         except ScmWorldError as error:

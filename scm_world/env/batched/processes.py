@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
-from scm_world.env.batched.crew import check_actions
-from scm_world.env.batched.memory import Bell, Carver, meeting_place, share
-from scm_world.env.batched.sheet import Form
-from scm_world.env.batched.station import DONE, RESET, STEP, Desk, Station
+from scm_world.env.batched.buffers import Form
+from scm_world.env.batched.executor import check_actions
+from scm_world.env.batched.memory import Allocator, Signal, meeting_place, share
+from scm_world.env.batched.worker import DONE, RESET, STEP, EnvWorker, SharedBuffers
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import EngineFailure, UnknownOption
@@ -28,8 +28,8 @@ ANEW = "make the environments anew"
 
 
 @final
-class ProcessCrew:
-    """Environments in several processes: how engines without threads use all cores. See ``Crew``.
+class ProcessExecutor:
+    """Environments in several processes: how engines without threads use all cores.
 
     Each process has some neighbors, and writes what they say into memory that all share; so do
     actions come to it. Only what is no number goes through a pipe. What comes out does not
@@ -44,11 +44,11 @@ class ProcessCrew:
     Attributes:
         num_envs: How many there are.
         form: What they have in common.
-        sheet: What they said last.
+        buffers: What they said last.
 
     Raises:
         UnknownOption: ``make`` cannot be pickled, or ``workers`` is no number from 1 on.
-        EngineFailure: A process ended. The crew is lost then.
+        EngineFailure: A process ended. The executor is lost then.
     """
 
     def __init__(
@@ -61,12 +61,12 @@ class ProcessCrew:
         self._parts = [slice(start, end) for start, end in pairwise(ends)]
         self._home = np.repeat(np.arange(count), np.diff(ends)).tolist()
         self._workers = [
-            Worker(partial(Station, make, part.stop - part.start, part.start))
+            Worker(partial(EnvWorker, make, part.stop - part.start, part.start))
             for part in self._parts
         ]
-        self._bells: list[Bell] = []
+        self._signals: list[Signal] = []
         self._lost = ""
-        self._end = weakref.finalize(self, _stop, self._workers, self._bells)
+        self._end = weakref.finalize(self, _stop, self._workers, self._signals)
         try:
             self._share()
         except BaseException:
@@ -77,13 +77,15 @@ class ProcessCrew:
         """Start the processes, and let all of them write into one memory."""
         everyone = range(len(self._workers))
         self.form: Form = self._ask(dict.fromkeys(everyone, ("form",)))[0]
-        needed = Carver()
-        Desk(self.form, self.num_envs, needed)
+        needed = Allocator()
+        SharedBuffers(self.form, self.num_envs, needed)
         with meeting_place() as place:
-            self._desk = Desk(self.form, self.num_envs, Carver(share(place, needed.size)))
-            self._bells.extend(Bell(place, str(k)) for k in everyone)
+            self._shared = SharedBuffers(
+                self.form, self.num_envs, Allocator(share(place, needed.size))
+            )
+            self._signals.extend(Signal(place, str(k)) for k in everyone)
             self._ask({k: ("attach", place, str(k), self.num_envs) for k in everyone})
-        self.sheet = self._desk.sheet
+        self.buffers = self._shared.buffers
 
     def reset(
         self,
@@ -99,15 +101,15 @@ class ProcessCrew:
                 "reset", {k: (which[mine], seeds[mine], options[mine]) for k, mine in parts.items()}
             )
         else:
-            self._desk.which[:] = which
-            self._ring(RESET, busy)
+            self._shared.which[:] = which
+            self._signal_all(RESET, busy)
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step."""
         check_actions(np.flatnonzero(which), actions)
-        self._desk.which[:] = which
-        self._desk.actions[:] = actions
-        self._ring(STEP, self._busy(which))
+        self._shared.which[:] = which
+        self._shared.actions[:] = actions
+        self._signal_all(STEP, self._busy(which))
 
     def do(
         self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
@@ -180,14 +182,14 @@ class ProcessCrew:
 
     # --- asking -----------------------------------------------------------------------------------
 
-    def _ring(self, what: bytes, busy: Sequence[int]) -> None:
-        """Let some processes do what the desk says; resets happen in all of them or in none."""
+    def _signal_all(self, what: bytes, busy: Sequence[int]) -> None:
+        """Let some processes step or reset; resets happen in all of them or in none."""
         if self._lost:
             raise EngineFailure(self._lost, PROCESS)
         try:
             for k in busy:
-                self._bells[k].ring(what)
-            said = {k: self._bells[k].answer() for k in busy}
+                self._signals[k].send(what)
+            said = {k: self._signals[k].answer() for k in busy}
         except BaseException as error:
             self._give_up(f"they were interrupted by {type(error).__name__}")
             raise
@@ -253,7 +255,7 @@ class ProcessCrew:
     def _heard(self, k: int) -> Any:
         answer, extras = self._workers[k].answer()
         if extras is not None:
-            self.sheet.extras[self._parts[k]] = extras
+            self.buffers.extras[self._parts[k]] = extras
         return answer
 
     def _who(self, k: int) -> str:
@@ -271,8 +273,8 @@ def _raise_first(errors: Mapping[int, Exception]) -> None:
         raise errors[min(errors)]
 
 
-def _stop(workers: Sequence[Worker], bells: list[Bell]) -> None:
+def _stop(workers: Sequence[Worker], signals: list[Signal]) -> None:
     for worker in workers:
         worker.stop()
-    while bells:
-        bells.pop().close()
+    while signals:
+        signals.pop().close()

@@ -23,9 +23,8 @@ from scm_world.env.batched.asking import (
     seeds_of,
     spread,
 )
-from scm_world.env.batched.choice import made_crew
-from scm_world.env.batched.crew import Crew, located
-from scm_world.env.batched.sheet import told
+from scm_world.env.batched.buffers import gymnasium_infos
+from scm_world.env.batched.executor import EnvExecutor, located, make_executor
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
@@ -55,7 +54,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
     Made by ``gymnasium.make_vec("scm_world/Pushing-v0", num_envs=64)``. What comes out is, bit
     for bit, what Gymnasium's ``SyncVectorEnv`` makes of as many single environments, whichever
-    crew simulates them and however many threads or processes it has. Environments of one batch
+    executor simulates them and however many threads or processes it has. Environments of one batch
     are observed alike: what would change which bodies exist in one of them is refused.
 
     Args:
@@ -63,12 +62,12 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: When one that is done begins anew: ``"NextStep"``, ``"SameStep"`` or
             ``"Disabled"``, as in Gymnasium.
         copy: Give observations that are yours; else the next step overwrites them.
-        crew: ``"loop"``: one after another in this process; ``"processes"``: several processes;
+        executor: ``"loop"``: one after another in this process; ``"processes"``: several processes;
             ``"native"``: many in one call of the engine; None: the fastest that there is.
-        threads: Of the native crew; as many as there are cores if None.
+        threads: Of the native executor; as many as there are cores if None.
         workers: How many processes; as many as there are cores if None.
         member: Makes one of them from the options: something that can do what a ``ScmWorldEnv``
-            can. Not with the native crew.
+            can. Not with the native executor.
         options: Of ``ScmWorldEnv``.
 
     Raises:
@@ -90,7 +89,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         copy: bool = True,
-        crew: str | None = None,
+        executor: str | None = None,
         threads: int | None = None,
         workers: int | None = None,
         member: Callable[..., Any] = ScmWorldEnv,
@@ -102,10 +101,10 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         make = partial(member, **options)
         usual = getattr(options.get("task"), "backend", Task.backend)
         backend = str(options.get("backend") or usual)
-        self.crew: Crew = made_crew(
-            crew, make, self.num_envs, backend=backend, threads=threads, workers=workers
+        self.executor: EnvExecutor = make_executor(
+            executor, make, self.num_envs, backend=backend, threads=threads, workers=workers
         )
-        form = self.crew.form
+        form = self.executor.form
         self.metadata = {**form.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = form.render_mode
         self.single_observation_space = form.observation_space
@@ -137,7 +136,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         """
         which = masked((options or {}).get(MASK), self.num_envs)
         wishes = options_of(options, which)
-        self.crew.reset(which, seeds_of(seed, self.num_envs), wishes)
+        self.executor.reset(which, seeds_of(seed, self.num_envs), wishes)
         self._begun |= which
         self._ended &= ~which
         return self._observations(), self._infos(which)
@@ -156,28 +155,28 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
                 nothing resets it.
             NotReset: One of them has no episode yet.
         """
-        sheet, stepping = self.crew.sheet, self._stepping(actions)
+        buffers, stepping = self.executor.buffers, self._stepping(actions)
         given = actions_of(actions, stepping, self._action_size)
         if not stepping.all():
             self._begin_next(~stepping)
-        self.crew.step(stepping, given)
-        ended = sheet.terminations | sheet.truncations
+        self.executor.step(stepping, given)
+        ended = buffers.terminations | buffers.truncations
         infos: dict[str, Any] = {}
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended = ended
         elif ended.any():
             infos = self._final(ended)
-            self.crew.reset(ended, *self._nothing)
-        flags = sheet.terminations.copy(), sheet.truncations.copy()
+            self.executor.reset(ended, *self._nothing)
+        flags = buffers.terminations.copy(), buffers.truncations.copy()
         infos |= self._infos(self._everyone)
-        return self._observations(), sheet.rewards.copy(), *flags, infos
+        return self._observations(), buffers.rewards.copy(), *flags, infos
 
     def _begin_next(self, which: NDArray[np.bool_]) -> None:
         """Begin the next episode of some of them, which takes the place of a step."""
-        sheet = self.crew.sheet
-        self.crew.reset(which, *self._nothing)
-        sheet.rewards[which] = 0.0
-        sheet.terminations[which] = sheet.truncations[which] = False
+        buffers = self.executor.buffers
+        self.executor.reset(which, *self._nothing)
+        buffers.rewards[which] = 0.0
+        buffers.terminations[which] = buffers.truncations[which] = False
         self._ended &= ~which
 
     def _stepping(self, actions: Any) -> NDArray[np.bool_]:
@@ -196,7 +195,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         """Keep what is seen last of episodes that ended."""
         shown = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended).tolist():
-            shown[index] = self.crew.sheet.observation(index)
+            shown[index] = self.executor.buffers.observation(index)
         return {
             "final_obs": shown,
             "_final_obs": ended.copy(),
@@ -210,7 +209,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of every environment; what cannot be called is given as it is."""
-        return tuple(self.crew.call(self._all, name, *args, **kwargs))
+        return tuple(self.executor.call(self._all, name, *args, **kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Look an attribute of every environment up."""
@@ -229,7 +228,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         given = values if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(given) != self.num_envs:
             raise UnknownOption(f"list for {name}", values, (f"one of length {self.num_envs}",))
-        self.crew.assign(name, dict(enumerate(given)))
+        self.executor.assign(name, dict(enumerate(given)))
 
     @property  # type: ignore[misc] # read only in Gymnasium's own kinds too
     def np_random(self) -> Any:
@@ -243,7 +242,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free what simulates."""
-        self.crew.close()
+        self.executor.close()
 
     # --- what a causal world can do besides -------------------------------------------------------
 
@@ -261,7 +260,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             InterventionError: One of them refused; the message says which. Nothing has changed.
         """
-        return self.crew.do(spread("do", requests, self.num_envs), space)
+        return self.executor.do(spread("do", requests, self.num_envs), space)
 
     def present(self) -> tuple[Any, dict[str, Any]]:
         """Give observations and infos of the present, as after an intervention."""
@@ -273,7 +272,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             NotReset: One of them has none yet.
         """
-        worlds = self.crew.snapshot(self._all)
+        worlds = self.executor.snapshot(self._all)
         return VectorSnapshot(tuple(worlds), tuple(self._ended.tolist()))
 
     def restore(self, snapshot: VectorSnapshot | Mapping[int, EnvSnapshot]) -> None:
@@ -294,7 +293,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         else:
             wanted = {index_of(key, self.num_envs): one for key, one in snapshot.items()}
             ended = tuple((self._ended & [i not in wanted for i in self._all]).tolist())
-        self.crew.restore(wanted)
+        self.executor.restore(wanted)
         self._begun[list(wanted)] = True
         self._ended = np.array(ended)
 
@@ -315,13 +314,13 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         number = index_of(source, self.num_envs)
         chosen = self._all if into is None else chosen_of(into, self.num_envs)
         others = [index for index in chosen if index != number]
-        (snapshot,) = self.crew.snapshot([number])
-        self.crew.restore(dict.fromkeys(others, snapshot))
+        (snapshot,) = self.executor.snapshot([number])
+        self.executor.restore(dict.fromkeys(others, snapshot))
         self._begun[others] = True
         self._ended[others] = self._ended[number]
 
     def _observations(self) -> Any:
-        shown = self.crew.sheet.observations
+        shown = self.executor.buffers.observations
         if not self.copy:
             return shown
         if isinstance(shown, dict):
@@ -330,11 +329,11 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _infos(self, which: NDArray[np.bool_]) -> dict[str, Any]:
         """Give the infos of some of them, in Gymnasium's form: each with a mask."""
-        sheet = self.crew.sheet
-        infos = told(sheet.infos, which)
-        if any(sheet.extras):
+        buffers = self.executor.buffers
+        infos = gymnasium_infos(buffers.infos, which)
+        if any(buffers.extras):
             for index in np.flatnonzero(which).tolist():
-                infos = self._add_info(infos, sheet.extras[index], index)
+                infos = self._add_info(infos, buffers.extras[index], index)
         return infos
 
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from crews import actions, check_same, make
+from env_executors import actions, check_same, make
 
 from scm_world.errors import InterventionError, NotReset
 
 
-@pytest.mark.parametrize("crew", ["loop", "native"])
-def test_a_closed_one_takes_no_step(crew: str) -> None:
+@pytest.mark.parametrize("executor", ["loop", "native"])
+def test_a_closed_one_takes_no_step(executor: str) -> None:
     """After closing there is no episode; a reset begins one."""
-    envs = make(crew, 2)
+    envs = make(executor, 2)
     envs.reset(seed=0)
     envs.step(actions(1, 2)[0])
     envs.close()
@@ -29,7 +29,7 @@ def test_a_closed_one_takes_no_step(crew: str) -> None:
 
 def test_what_is_done_to_a_world_itself_is_seen() -> None:
     """Noise of the sensors that begins in a world that was asked for is there in the next step."""
-    pair = [make(crew, 2, backend="mujoco") for crew in ("loop", "native")]
+    pair = [make(executor, 2, backend="mujoco") for executor in ("loop", "native")]
     for envs in pair:
         envs.reset(seed=0)
         envs.step(actions(1, 2)[0])
@@ -43,11 +43,11 @@ def test_what_belongs_to_a_structure_that_is_gone_is_freed() -> None:
     envs: Any = make("native", 1)
     envs.reset(seed=0)
     envs.step(actions(1, 1)[0])
-    crew = envs.unwrapped.crew
-    table = weakref.ref(crew._batch.table(0))
-    crew._bring([0])
-    crew._batch._tables.clear()
-    crew._batch._kinds[0], crew._batch._groups = (), None
+    executor = envs.unwrapped.executor
+    table = weakref.ref(executor._batch.table(0))
+    executor._bring([0])
+    executor._batch._tables.clear()
+    executor._batch._kinds[0], executor._batch._groups = (), None
     gc.collect()
     assert table() is None
     assert np.isfinite(envs.step(actions(2, 1)[1])[1]).all()

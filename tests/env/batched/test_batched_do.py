@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from crews import REACHING, SIZE, actions, check_alike, check_same, engine, kept, make
+from env_executors import REACHING, SIZE, actions, check_alike, check_same, engine, kept, make
 
-from scm_world.env.batched.choice import CREWS
+from scm_world.env.batched.executor import EXECUTORS
 from scm_world.errors import (
     InterventionError,
     NotReset,
@@ -20,7 +20,7 @@ from scm_world.errors import (
 )
 
 
-@pytest.fixture(params=CREWS)
+@pytest.fixture(params=EXECUTORS)
 def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
     """Give a batch, and another one in the same state that is simulated one by one."""
     both = kept(request.param), make("loop", backend=engine(request.param), max_episode_length=5)
@@ -83,11 +83,13 @@ def test_all_episodes_begin_or_none(pair: tuple[Any, Any]) -> None:
     check_alike(envs, untouched, 3)
 
 
-@pytest.mark.parametrize("crew", [crew for crew in CREWS if crew != "processes"])
-def test_worlds_of_a_batch_are_observed_alike(crew: str) -> None:
+@pytest.mark.parametrize(
+    "executor", [executor for executor in EXECUTORS if executor != "processes"]
+)
+def test_worlds_of_a_batch_are_observed_alike(executor: str) -> None:
     """What changes which bodies there are in one of them is refused; it is as it was."""
     start = {"number_of_obstacles": 1}
-    envs, untouched = (make(crew, id_=REACHING, start=start) for _ in range(2))
+    envs, untouched = (make(executor, id_=REACHING, start=start) for _ in range(2))
     for one in (envs, untouched):
         one.reset(seed=0)
     other = {"number_of_obstacles": 2}
@@ -98,7 +100,7 @@ def test_worlds_of_a_batch_are_observed_alike(crew: str) -> None:
         envs.reset(options={"do": {3: other}})
     check_same(envs.present(), untouched.present(), "present")
     check_alike(envs, untouched, 2)
-    single: Any = make(None, 1, REACHING, start=other, backend=engine(crew))
+    single: Any = make(None, 1, REACHING, start=other, backend=engine(executor))
     single.reset(seed=0)
     with pytest.raises((InterventionError, SnapshotMismatch), match="environment 1: the snapshot"):
         envs.restore({1: single.snapshot().worlds[0]})

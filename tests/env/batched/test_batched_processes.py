@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from crews import LENGTH, actions, check_alike, check_same, kept, make
+from env_executors import LENGTH, actions, check_alike, check_same, kept, make
 
-from scm_world.env.batched.choice import fastest
-from scm_world.env.batched.memory import IN_MEMORY, Bell, meeting_place, share
+from scm_world.env.batched.executor import fastest
+from scm_world.env.batched.memory import IN_MEMORY, Signal, meeting_place, share
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption, UnwritableFolder
 from scm_world.work.processes import Worker
 from scm_world.work.threads import cores
@@ -29,10 +29,10 @@ def test_how_many_processes_there_are_changes_nothing() -> None:
     pytest.importorskip("pybullet")
     options: dict[str, Any] = {"backend": "bullet", "max_episode_length": 3, "info_contacts": True}
     there = [{"workers": workers} for workers in (1, 2, 3)]
-    crews = [("loop", {}), *(("processes", how) for how in there)]
+    executors = [("loop", {}), *(("processes", how) for how in there)]
     said = []
-    for crew, how in crews:
-        envs = make(crew, 3, autoreset_mode="SameStep", **how, **options)
+    for executor, how in executors:
+        envs = make(executor, 3, autoreset_mode="SameStep", **how, **options)
         mine = [envs.reset(seed=1), *(envs.step(action) for action in actions(5, 3))]
         envs.do([None, {"floor_friction": 0.3}, {"tool_block.mass": "B"}])
         said.append([*mine, envs.present(), *(envs.step(action) for action in actions(2, 3, 1))])
@@ -41,7 +41,7 @@ def test_how_many_processes_there_are_changes_nothing() -> None:
         check_same(other, said[0])
 
 
-def test_the_fastest_crew_is_taken() -> None:
+def test_the_fastest_executor_is_taken() -> None:
     """MuJoCo steps them itself; Bullet takes processes if there are several, and several cores."""
     assert fastest("mujoco", 1, workers=None) == "native"
     assert fastest("mujoco", 2, workers=2) == "processes"
@@ -55,7 +55,7 @@ def test_a_process_that_is_killed_is_an_error() -> None:
     """The error says which environments are lost; asking again says it again."""
     envs = make("processes", 4, workers=2)
     envs.reset(seed=0)
-    worker: Worker = envs.crew._workers[1]
+    worker: Worker = envs.executor._workers[1]
     os.kill(worker._process.pid, signal.SIGKILL)
     text = r"environments 2 to 3 are lost: .* exit code -9; make the environments anew"
     for _ in range(2):
@@ -70,14 +70,14 @@ def test_a_process_that_is_killed_between_calls_is_an_error() -> None:
     """Whatever it is asked."""
     envs = make("processes", 1, workers=1)
     envs.reset(seed=0)
-    worker: Worker = envs.crew._workers[0]
+    worker: Worker = envs.executor._workers[0]
     os.kill(worker._process.pid, signal.SIGKILL)
     with pytest.raises(EngineFailure, match="environments 0 to 0 are lost"):
         envs.snapshot()
     envs.close()
 
 
-def test_an_interrupted_step_ends_the_crew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_step_ends_the_executor(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some environments may have stepped: it cannot go on, and no process stays."""
 
     def interrupted(*_: Any) -> bytes:
@@ -85,9 +85,9 @@ def test_an_interrupted_step_ends_the_crew(monkeypatch: pytest.MonkeyPatch) -> N
 
     envs = make("processes", 1, workers=1)
     envs.reset(seed=0)
-    pid = envs.crew._workers[0]._process.pid
+    pid = envs.executor._workers[0]._process.pid
     with monkeypatch.context() as patched:
-        patched.setattr(Bell, "answer", interrupted)
+        patched.setattr(Signal, "answer", interrupted)
         with pytest.raises(KeyboardInterrupt):
             envs.step(actions(1, 1)[0])
     with pytest.raises(ProcessLookupError):
@@ -108,7 +108,7 @@ def test_nothing_is_left_behind() -> None:
     assert left_behind() == []
     observations, _ = envs.reset(seed=0)
     kept = observations.copy()
-    pids = [worker._process.pid for worker in envs.crew._workers]
+    pids = [worker._process.pid for worker in envs.executor._workers]
     envs.close()
     np.testing.assert_array_equal(observations, kept)
     for pid in pids:
@@ -124,10 +124,10 @@ def test_too_little_memory_is_an_error() -> None:
         share(place, 2**50)
 
 
-def test_processes_end_with_the_crew_that_nobody_uses() -> None:
+def test_processes_end_with_the_executor_that_nobody_uses() -> None:
     """Without ``close`` too."""
     envs = make("processes", 2, workers=1)
-    pid = envs.crew._workers[0]._process.pid
+    pid = envs.executor._workers[0]._process.pid
     del envs
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from crews import actions, check_same, make, sync
+from env_executors import actions, check_same, make, sync
 from gymnasium.wrappers import vector
 
 LOW, HIGH = np.zeros(56, np.float32), np.ones(56, np.float32)

@@ -15,22 +15,22 @@ LENGTH = 5  # of episodes of those that are kept
 SIZE = 4
 
 
-def make(crew: str | None = "loop", n: int = SIZE, id_: str = PUSHING, **options: Any) -> Any:
+def make(executor: str | None = "loop", n: int = SIZE, id_: str = PUSHING, **options: Any) -> Any:
     """Make many environments, of the fake backend unless it is said."""
-    options.setdefault("backend", engine(crew))
-    return gymnasium.make_vec(id_, n, crew=crew, **options)
+    options.setdefault("backend", engine(executor))
+    return gymnasium.make_vec(id_, n, executor=executor, **options)
 
 
-def engine(crew: str | None) -> str:
-    """Name the quickest backend of a crew."""
-    return "mujoco" if crew == "native" else "fake"
+def engine(executor: str | None) -> str:
+    """Name the quickest backend of an executor."""
+    return "mujoco" if executor == "native" else "fake"
 
 
 @functools.cache
-def kept(crew: str) -> Any:
+def kept(executor: str) -> Any:
     """Make some that are not closed; processes take a second to start, so tests share them."""
-    workers = {"workers": 2} if crew == "processes" else {}
-    return make(crew, max_episode_length=LENGTH, render_mode="rgb_array", **workers)
+    workers = {"workers": 2} if executor == "processes" else {}
+    return make(executor, max_episode_length=LENGTH, render_mode="rgb_array", **workers)
 
 
 def sync(

@@ -31,7 +31,7 @@ class Doable(Protocol):
 
 
 @final
-class Turn:
+class CurriculumRunner:
     """A curriculum at work.
 
     Args:

@@ -1,4 +1,4 @@
-"""What a process of a crew holds: some of its environments, and the memory that all share."""
+"""What a process of an executor holds: some of its environments, and the memory that all share."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world.env.batched.loop import LoopCrew
-from scm_world.env.batched.memory import Carver, answer_bell, shared
-from scm_world.env.batched.sheet import Allocate, Form, Sheet
+from scm_world.env.batched.buffers import Allocate, Buffers, Form
+from scm_world.env.batched.loop import LoopExecutor
+from scm_world.env.batched.memory import Allocator, answer_signal, shared
 from scm_world.env.environment import ScmWorldEnv
 
 STEP, RESET = b"s", b"r"
@@ -21,8 +21,8 @@ Said = tuple[Any, list[dict[str, Any]] | None]
 
 
 @final
-class Desk:
-    """What lies in shared memory: the sheet, and what the environments are to do next.
+class SharedBuffers:
+    """What lies in shared memory: the buffers, and what the environments are to do next.
 
     Args:
         form: What the environments have in common.
@@ -30,61 +30,61 @@ class Desk:
         allocate: Cuts arrays out of the memory, in the same order in every process.
 
     Attributes:
-        sheet: What they said last.
+        buffers: What they said last.
         which: Those that are stepped or reset, shape (n,).
         actions: Shape (n, n_actions).
     """
 
     def __init__(self, form: Form, size: int, allocate: Allocate) -> None:
-        self.sheet = Sheet.empty(form, size, allocate)
+        self.buffers = Buffers.empty(form, size, allocate)
         self.which = allocate((size,), np.bool_)
         self.actions = allocate((size, *(form.action_space.shape or ())), np.float64)
 
 
 @final
-class Station:
-    """Some neighbors, in a process of their own.
+class EnvWorker:
+    """Environments with adjacent numbers, in a process of their own.
 
     Args:
         make: Makes one environment.
         size: How many are here.
-        first: The index of the first one in the whole crew.
+        first: The index of the first one in the whole executor.
     """
 
     def __init__(self, make: Callable[[], ScmWorldEnv], size: int, first: int) -> None:
         self._where = slice(first, first + size)
-        self._crew = LoopCrew(make, size, first=first)
+        self._executor = LoopExecutor(make, size, first=first)
         self._none = [None] * size
         self._error: BaseException | None = None
 
     def form(self) -> Said:
         """Tell what the environments have in common."""
-        return self._crew.form, None
+        return self._executor.form, None
 
-    def attach(self, place: Path, bell: str, total: int) -> Said:
-        """Write into shared memory from now on, and answer a bell.
+    def attach(self, place: Path, signal: str, total: int) -> Said:
+        """Write into shared memory from now on, and answer a signal.
 
         Args:
             place: Where they are.
-            bell: Its name.
+            signal: Its name.
             total: How many environments there are in all processes.
         """
-        desk = Desk(self._crew.form, total, Carver(shared(place)))
-        self._crew.sheet = desk.sheet.part(self._where)
-        self._which, self._actions = desk.which[self._where], desk.actions[self._where]
-        answer_bell(place, bell, self._serve)
+        mine = SharedBuffers(self._executor.form, total, Allocator(shared(place)))
+        self._executor.buffers = mine.buffers.part(self._where)
+        self._which, self._actions = mine.which[self._where], mine.actions[self._where]
+        answer_signal(place, signal, self._serve)
         return None, None
 
     def _serve(self, asked: bytes) -> bytes:
-        """Step or reset what the desk says; what goes wrong is raised by ``more``."""
+        """Step or reset what the shared buffers say; what goes wrong is raised by ``more``."""
         try:
             if asked == STEP:
-                self._crew.step(self._which, self._actions)
+                self._executor.step(self._which, self._actions)
             else:
-                self._crew.reset(self._which, self._none, self._none)
+                self._executor.reset(self._which, self._none, self._none)
         except BaseException as error:  # else nobody would answer
             self._error = error
-        return DONE if self._error is None and not any(self._crew.sheet.extras) else MORE
+        return DONE if self._error is None and not any(self._executor.buffers.extras) else MORE
 
     def more(self) -> Said:
         """Tell what a byte cannot."""
@@ -94,9 +94,9 @@ class Station:
         return None, self._extras()
 
     def tell(self, method: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Said:
-        """Call a method of the crew that is here."""
-        return getattr(self._crew, method)(*args, **kwargs), self._extras()
+        """Call a method of the executor that is here."""
+        return getattr(self._executor, method)(*args, **kwargs), self._extras()
 
     def _extras(self) -> list[dict[str, Any]] | None:
-        extras = self._crew.sheet.extras
+        extras = self._executor.buffers.extras
         return extras if any(extras) else None

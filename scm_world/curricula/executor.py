@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.curricula.curriculum import Curriculum
+from scm_world.curricula.runner import CurriculumRunner
 from scm_world.curricula.situations import Memory
-from scm_world.curricula.turns import Turn
 from scm_world.curricula.wrapper import is_checked
-from scm_world.env.batched.crew import located
-from scm_world.env.batched.native import NativeCrew
-from scm_world.env.batched.sheet import TERMS
+from scm_world.env.batched.buffers import TERMS
+from scm_world.env.batched.executor import located
+from scm_world.env.batched.native import NativeExecutor
 from scm_world.env.copies import EnvSnapshot
 from scm_world.errors import ScmWorldError
 from scm_world.graph import flatten
@@ -26,15 +26,15 @@ OWN = ("curriculum", "memory", "turn", "where")
 
 
 @final
-class CurriculumCrew:
-    """Environments of which each is intervened on as in a ``CurriculumEnv``. See ``Crew``.
+class CurriculumExecutor:
+    """Environments of which each is intervened on as in a ``CurriculumEnv``. See ``EnvExecutor``.
 
     An environment is used by itself at its resets, and after those control steps at which the
     curriculum may act; all others are stepped in one call. The numbers of the episodes, and the
     stages, come from ``CurriculumVectorEnv``.
 
     Args:
-        crew: The environments.
+        executor: The environments.
         curriculum: What is done in each of them.
 
     Raises:
@@ -43,15 +43,15 @@ class CurriculumCrew:
     Attributes:
         num_envs: How many there are.
         form: What they have in common.
-        sheet: What they said last.
+        buffers: What they said last.
     """
 
-    def __init__(self, crew: NativeCrew, curriculum: Curriculum) -> None:
-        self._crew, self._curriculum = crew, curriculum
-        self.num_envs, self.form, self.sheet = crew.num_envs, crew.form, crew.sheet
-        (world,) = crew.attribute([0], "world")
+    def __init__(self, executor: NativeExecutor, curriculum: Curriculum) -> None:
+        self._executor, self._curriculum = executor, curriculum
+        self.num_envs, self.form, self.buffers = executor.num_envs, executor.form, executor.buffers
+        (world,) = executor.attribute([0], "world")
         self._checked = is_checked(curriculum, world)
-        self._turns = [Turn(curriculum) for _ in range(self.num_envs)]
+        self._turns = [CurriculumRunner(curriculum) for _ in range(self.num_envs)]
         self._next: list[tuple[int, Memory] | None] = [None] * self.num_envs
         self._places: list[tuple[int, int] | None] = [None] * self.num_envs
         self._begun = np.zeros(self.num_envs, bool)
@@ -76,12 +76,12 @@ class CurriculumCrew:
                 chosen[index] = place[0]
                 given[index] = {"episode": place[1], **(given[index] or {})}
         self._running[which] = False
-        self._crew.reset(which, chosen, given)
+        self._executor.reset(which, chosen, given)
         try:
             for index in indices:
                 self._begin(index, (given[index] or {}).get("do") or {})
         except BaseException:
-            self._crew.undo()
+            self._executor.undo()
             raise
         for index in indices:
             self._next[index] = self._places[index] = None
@@ -93,7 +93,7 @@ class CurriculumCrew:
         if told is not None:
             turn.memory = Memory(told[0], told[1].stages)
         try:
-            with self._crew.alone(index) as env:
+            with self._executor.alone(index) as env:
                 if not self._checked:
                     self._curriculum.check(env.world)
                     self._checked = True
@@ -104,9 +104,9 @@ class CurriculumCrew:
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step, then do what is due."""
-        self._crew.step(which, actions)
+        self._executor.step(which, actions)
         self._steps[which] += 1
-        over = which & (self.sheet.terminations | self.sheet.truncations)
+        over = which & (self.buffers.terminations | self.buffers.truncations)
         self._running[over] = False
         if self._waits:
             for index in np.flatnonzero(which & ~over).tolist():
@@ -114,10 +114,10 @@ class CurriculumCrew:
                     self._act(index)
 
     def _act(self, index: int) -> None:
-        columns: Any = self.sheet.infos[TERMS]
+        columns: Any = self.buffers.infos[TERMS]
         terms = {name: column[index] for name, column in columns.items()}
         try:
-            with self._crew.alone(index) as env:
+            with self._executor.alone(index) as env:
                 self._turns[index].step(env)
         except ScmWorldError as error:
             located(error, index)
@@ -131,7 +131,7 @@ class CurriculumCrew:
         """Call a method of some of them; what cannot be called is given as it is."""
         if name in OWN:
             return self.attribute(indices, name)
-        return self._crew.call(indices, name, *args, **kwargs)
+        return self._executor.call(indices, name, *args, **kwargs)
 
     def attribute(self, indices: Sequence[int], name: str) -> list[Any]:
         """Look an attribute of some of them up."""
@@ -144,7 +144,7 @@ class CurriculumCrew:
                 return [self._next[index] for index in indices]
             case "where":
                 return [self._where(index) for index in indices]
-        return self._crew.attribute(indices, name)
+        return self._executor.attribute(indices, name)
 
     def assign(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute of some of them; see ``CurriculumEnv.turn`` and ``where``."""
@@ -154,13 +154,13 @@ class CurriculumCrew:
             elif name == "where":
                 self._places[index], self._running[index] = value, False
         if name not in OWN:
-            self._crew.assign(name, values)
+            self._executor.assign(name, values)
 
     def _where(self, index: int) -> tuple[int, int] | None:
         place = self._places[index]
         if place is not None or not self._begun[index]:
             return place
-        (world,) = self._crew.attribute([index], "world")
+        (world,) = self._executor.attribute([index], "world")
         return world.noise.seed, world.episode + int(not self._running[index])
 
     # --- the same as without a curriculum ---------------------------------------------------------
@@ -169,18 +169,18 @@ class CurriculumCrew:
         self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
     ) -> dict[int, Audit]:
         """Intervene in some of them."""
-        return self._crew.do(requests, space)
+        return self._executor.do(requests, space)
 
     def snapshot(self, indices: Sequence[int]) -> list[EnvSnapshot]:
         """Save some of them; what the curriculum remembers is not a part of that."""
-        return self._crew.snapshot(indices)
+        return self._executor.snapshot(indices)
 
     def restore(self, snapshots: Mapping[int, EnvSnapshot]) -> None:
         """Take some of them to a snapshot."""
-        self._crew.restore(snapshots)
+        self._executor.restore(snapshots)
         for index, snapshot in snapshots.items():
             self._steps[index] = snapshot.world.index
 
     def close(self) -> None:
         """Free everything they hold."""
-        self._crew.close()
+        self._executor.close()

@@ -30,7 +30,7 @@ TERMS = "reward_terms"
 @final
 @dataclass(frozen=True)
 class Form:
-    """What the environments of a crew have in common.
+    """What the environments of an executor have in common.
 
     Attributes:
         observation_space: Of one of them.
@@ -102,7 +102,7 @@ def _shape(space: gymnasium.Space[Any]) -> str:
 
 @final
 @dataclass
-class Sheet:
+class Buffers:
     """What n environments said last.
 
     Attributes:
@@ -122,7 +122,7 @@ class Sheet:
     extras: list[dict[str, Any]]
 
     @classmethod
-    def empty(cls, form: Form, size: int, allocate: Allocate = np.zeros) -> Sheet:
+    def empty(cls, form: Form, size: int, allocate: Allocate = np.zeros) -> Buffers:
         """Make one for environments of a form.
 
         Args:
@@ -148,9 +148,9 @@ class Sheet:
             extras=[{} for _ in range(size)],
         )
 
-    def part(self, where: slice) -> Sheet:
+    def part(self, where: slice) -> Buffers:
         """Give some rows: what is written there is written here, but for the extras."""
-        return Sheet(
+        return Buffers(
             _part(self.observations, where),
             self.rewards[where],
             self.terminations[where],
@@ -195,7 +195,7 @@ def _part(column: Any, where: slice) -> Any:
     return column[where]
 
 
-def told(columns: Mapping[str, Column], which: NDArray[np.bool_]) -> dict[str, Any]:
+def gymnasium_infos(columns: Mapping[str, Column], which: NDArray[np.bool_]) -> dict[str, Any]:
     """Copy what some environments said, in Gymnasium's form.
 
     Args:
@@ -206,14 +206,14 @@ def told(columns: Mapping[str, Column], which: NDArray[np.bool_]) -> dict[str, A
         Every column, zeros elsewhere; and beside each, after a ``_``, which ones are meant.
 
     Example:
-        >>> told({"x": np.array([1.0, 2.0])}, np.array([False, True]))
+        >>> gymnasium_infos({"x": np.array([1.0, 2.0])}, np.array([False, True]))
         {'x': array([0., 2.]), '_x': array([False,  True])}
     """
     found: dict[str, Any] = {}
     everyone = bool(which.all())
     for name, column in columns.items():
         if isinstance(column, dict):
-            found[name] = told(column, which)
+            found[name] = gymnasium_infos(column, which)
         elif everyone:
             found[name] = column.copy()
         else:
