@@ -134,7 +134,7 @@ class LearnerConformance:
         assert "still" in found.names
         assert "still" not in touched
 
-    def test_sureness_tells_edges_from_others(self) -> None:
+    def test_edge_scores_tell_edges_from_others(self) -> None:
         """What it is sure of is what it found: the mean over edges exceeds that over others."""
         found = self.found(self.data)
         edges = found.edges.any(axis=0)

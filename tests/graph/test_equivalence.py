@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations, product
 
 import numpy as np
@@ -27,6 +28,7 @@ from scm_world.graph.equivalence import (
 )
 
 
+@cache
 def all_dags(n: int) -> list[Bools]:
     """List all acyclic graphs on n nodes."""
     pairs = list(combinations(range(n), 2))
