@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,12 @@ class Rows:
     def alive(self) -> Bools:
         """Whether each column varies, shape (p,)."""
         return np.asarray(self.x.any(axis=0))
+
+    @property
+    def block_of(self) -> Ints:
+        """The block of each column, shape (p,)."""
+        numbers = np.repeat(np.arange(len(self.blocks)), list(map(len, self.blocks)))
+        return np.asarray(numbers[np.argsort(np.concatenate(self.blocks))])
 
     def summed(self) -> Rows:
         """Return fewer rows with the same sums of products, for each set of targets.
@@ -297,7 +303,7 @@ def do_order(
     chosen = np.zeros(p_values.shape, bool)
     chosen[tested] = false_discovery_control(p_values[tested], method="by") <= q
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
-    matrix, sure = _columns(rows, chosen), _columns(rows, weight)
+    matrix, sure = chosen[rows.block_of], weight[rows.block_of]
     notes = (*_notes(data, rows, causes, told), *_bent(rows, matrix, form))
     settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}
     return EstimatedGraph.of(data.names, matrix, edge_scores=sure, settings=settings, notes=notes)
@@ -441,14 +447,6 @@ def _bent(rows: Rows, matrix: Bools, form: _Form) -> tuple[str, ...]:
     )
 
 
-def _columns(rows: Rows, by_block: Any) -> Any:
-    p = rows.x.shape[1]
-    made = np.zeros((p, p), by_block.dtype)
-    for b, where in enumerate(rows.blocks):
-        made[where] = by_block[b]
-    return made
-
-
 def _told(rows: Rows) -> Bools:
     """Return where a column was set while another was free, shape (p, p).
 
@@ -465,10 +463,8 @@ def _notes(data: Dataset, rows: Rows, causes: Bools, told: Bools) -> tuple[str, 
     if still:
         found.append(f"never varied, no edges: {', '.join(still)}")
     chosen = np.flatnonzero(causes & ~rows.past)
-    block = np.zeros(len(causes))
-    for number, where in enumerate(rows.blocks):
-        block[where] = number
-    between = told[np.ix_(chosen, chosen)] | (block[chosen, None] == block[chosen])
+    block = rows.block_of[chosen]
+    between = told[np.ix_(chosen, chosen)] | (block[:, None] == block)
     if not between.all():
         together = ", ".join(data.names[i] for i in chosen[~between.all(axis=0)])
         found.append(f"always set where another one is, so some edges are not told: {together}")

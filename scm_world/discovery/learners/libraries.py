@@ -223,15 +223,12 @@ def _static(
 
 
 def edges_of_marks(marks: Any) -> Bools:
-    """Read the end marks of causal-learn.
+    """Read the end marks of causal-learn: return where i may act on j, shape (p, p).
 
     Args:
         marks: Shape (p, p): at [i, j] the mark at i of the edge between i and j; 1 is an arrow
-            head, -1 a tail, 2 a circle, 0 no edge.
-
-    Returns:
-        Shape (p, p): where i may act on j. Two heads, which PC puts where its tests contradict each
-        other, and two circles are an edge without direction.
+            head, -1 a tail, 2 a circle, 0 no edge. Two heads, which PC puts where its tests
+            contradict each other, and two circles are an edge without direction.
 
     Example:
         >>> edges_of_marks([[0, -1], [1, 0]]).tolist()
@@ -385,19 +382,11 @@ def runs(data: Dataset) -> list[Floats]:
 
 
 def edges_of_links(graph: Any) -> Bools:
-    """Read the links of tigramite.
+    """Read the links of tigramite: return where i may act on j, shape (lags + 1, p, p).
 
     Args:
         graph: Shape (p, p, lags + 1): ``"-->"`` at [i, j, lag] if i acts on j, ``"<--"`` if j acts
             on i; ``"o-o"`` and ``"x-x"`` have no direction, and neither has ``"<->"``.
-
-    Returns:
-        Shape (lags + 1, p, p): where i may act on j.
-
-    Example:
-        >>> graph = np.array([[["", ""], ["x-x", "-->"]], [["x-x", ""], ["", ""]]])
-        >>> edges_of_links(graph).tolist()
-        [[[False, True], [True, False]], [[False, True], [False, False]]]
     """
     words = np.moveaxis(np.array(graph, dtype=str), 2, 0)
     return np.asarray((words != "") & (~np.char.startswith(words, "<") | (words == "<->")))
