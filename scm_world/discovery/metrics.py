@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, final
 
 import numpy as np
@@ -187,8 +187,8 @@ def evaluate(
     true = matrices(keys, kept.names, lags)
     counts = _counting(pairs, true.shape)
     later = ((0, lags + 1 - len(kept.edges)), (0, 0), (0, 0))
-    kept = kept.told(
-        edges=np.pad(kept.edges, later) & counts, edge_scores=np.pad(kept.edge_scores, later)
+    kept = replace(
+        kept, edges=np.pad(kept.edges, later) & counts, edge_scores=np.pad(kept.edge_scores, later)
     )
     true = true & counts
     declared_keys = _keys(kept.names, true)

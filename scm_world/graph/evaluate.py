@@ -52,7 +52,7 @@ class NoiseKey:
     attempt: int = 0
     kept: frozenset[str] = frozenset()
 
-    def nature(
+    def natural(
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
     ) -> Value:
         """Draw what a variable has by itself, without intervention."""
@@ -208,7 +208,7 @@ class Evaluator:
                     return values[variable.name]
                 if key is None or variable.distribution is None:
                     return variable.array(variable.default)
-                return key.nature(variable.distribution, variable.name, variable.shape, values)
+                return key.natural(variable.distribution, variable.name, variable.shape, values)
             case Fixed():
                 return variable.array(variable.value)
             case Derived():
@@ -230,7 +230,7 @@ class Evaluator:
         if variable.noise is not None:
             given["noise"] = np.zeros(variable.shape)
             if key is not None:
-                given["noise"] = key.nature(variable.noise, variable.name, variable.shape, values)
+                given["noise"] = key.natural(variable.noise, variable.name, variable.shape, values)
         function = self._bound(variable)
         try:
             value = np.asarray(function(*arguments, **given))

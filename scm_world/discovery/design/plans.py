@@ -275,8 +275,8 @@ def culprit(candidates: Sequence[Cause], moves: Callable[[tuple[Cause, ...]], bo
     while True:
         try:
             asked = next(questions) if answer is None else questions.send(answer)
-        except StopIteration as told:
-            found: Cause = told.value
+        except StopIteration as ended:
+            found: Cause = ended.value
             return found
         answer = moves(asked)
 
@@ -385,8 +385,8 @@ def adaptive_search(graph: Bools, answer: Answer) -> AdaptiveSearch:
             if not (known[node] & known[:, node]).any():
                 continue  # all its edges follow from earlier answers
             targets.append(node)
-            told = [(int(cause), int(effect)) for cause, effect in answer(node)]
-            known, refused = _learned(known, told)
+            answered = [(int(cause), int(effect)) for cause, effect in answer(node)]
+            known, refused = _learned(known, answered)
             contradictions += refused
     return AdaptiveSearch(known, tuple(targets), largest, tuple(contradictions))
 
@@ -443,13 +443,13 @@ def _worth_asking(known: Bools, asked: list[int]) -> Iterator[tuple[int, ...]]:
             yield chosen or tuple(new[:1])
 
 
-def _learned(known: Bools, told: list[tuple[int, int]]) -> tuple[Bools, list[tuple[int, int]]]:
+def _learned(known: Bools, answered: list[tuple[int, int]]) -> tuple[Bools, list[tuple[int, int]]]:
     """Add directions and what follows; return those that contradict what is known."""
-    together = _directed(known, told)
+    together = _directed(known, answered)
     if together is not None:
         return together, []
     refused = []
-    for edge in told:
+    for edge in answered:
         more = _directed(known, [edge])
         if more is None:
             refused.append(edge)
@@ -458,10 +458,10 @@ def _learned(known: Bools, told: list[tuple[int, int]]) -> tuple[Bools, list[tup
     return known, refused
 
 
-def _directed(known: Bools, told: list[tuple[int, int]]) -> Bools | None:
+def _directed(known: Bools, answered: list[tuple[int, int]]) -> Bools | None:
     """Add directions and what follows; None if no member of the class has them."""
     directed = known.copy()
-    for cause, effect in told:
+    for cause, effect in answered:
         if not directed[cause, effect]:
             return None
         directed[effect, cause] = False

@@ -230,16 +230,16 @@ def _changes(rest: Floats, one: Floats, targeted: Bools) -> Floats:
     sums = [(given @ power, power.sum(axis=0)) for power in (one * one, one * rest, rest * rest)]
     (n1, n), (m1, m), (q1, q) = sums
     n0, m0, q0 = n - n1, m - m1, q - q1
-    told = (n1 > 1.5) & (n0 > 1.5)
-    np.fill_diagonal(told, False)
+    separable = (n1 > 1.5) & (n0 > 1.5)
+    np.fill_diagonal(separable, False)
 
     def cost(count: Floats, first: Floats, second: Floats) -> Floats:
-        safe = np.where(told, count, 1.0)
+        safe = np.where(separable, count, 1.0)
         variance = np.maximum(second / safe - (first / safe) ** 2, EXACT)
         return np.asarray(count * np.log(variance))
 
     whole = cost(n1 + n0, m1 + m0, q1 + q0)
-    return np.where(told, whole - cost(n1, m1, q1) - cost(n0, m0, q0), 0.0)
+    return np.where(separable, whole - cost(n1, m1, q1) - cost(n0, m0, q0), 0.0)
 
 
 POWERS = (1, 2, 3, 4)
@@ -297,14 +297,14 @@ def do_order(
         _, first = np.unique(data.episode, return_index=True)
         begins = _rows(data.rows(first), blocks)
         p_values[:, still] = _tested(begins, still, causes & still, form)[:, still]
-    told = _told(rows)
-    p_values[~np.array([told[where].any(axis=0) for where in rows.blocks])] = 2.0
+    separable = _separable(rows)
+    p_values[~np.array([separable[where].any(axis=0) for where in rows.blocks])] = 2.0
     tested = p_values <= 1.0
     chosen = np.zeros(p_values.shape, bool)
     chosen[tested] = false_discovery_control(p_values[tested], method="by") <= q
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = chosen[rows.block_of], weight[rows.block_of]
-    notes = (*_notes(data, rows, causes, told), *_bent(rows, matrix, form))
+    notes = (*_notes(data, rows, causes, separable), *_bent(rows, matrix, form))
     settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}
     return EstimatedGraph.of(data.names, matrix, edge_scores=sure, settings=settings, notes=notes)
 
@@ -447,24 +447,24 @@ def _bent(rows: Rows, matrix: Bools, form: _Form) -> tuple[str, ...]:
     )
 
 
-def _told(rows: Rows) -> Bools:
+def _separable(rows: Rows) -> Bools:
     """Return where a column was set while another was free, shape (p, p).
 
     Of two that were only ever set together, no row says which one acts on the other.
     """
-    told = (rows.targeted.T.astype(np.float64) @ ~rows.targeted) > 0.0
-    told[rows.past] = True
-    return np.asarray(told)
+    separable = (rows.targeted.T.astype(np.float64) @ ~rows.targeted) > 0.0
+    separable[rows.past] = True
+    return np.asarray(separable)
 
 
-def _notes(data: Dataset, rows: Rows, causes: Bools, told: Bools) -> tuple[str, ...]:
+def _notes(data: Dataset, rows: Rows, causes: Bools, separable: Bools) -> tuple[str, ...]:
     found = []
     still = [name for name, lives in zip(data.names, rows.alive, strict=True) if not lives]
     if still:
         found.append(f"never varied, no edges: {', '.join(still)}")
     chosen = np.flatnonzero(causes & ~rows.past)
     block = rows.block_of[chosen]
-    between = told[np.ix_(chosen, chosen)] | (block[:, None] == block)
+    between = separable[np.ix_(chosen, chosen)] | (block[:, None] == block)
     if not between.all():
         together = ", ".join(data.names[i] for i in chosen[~between.all(axis=0)])
         found.append(f"always set where another one is, so some edges are not told: {together}")

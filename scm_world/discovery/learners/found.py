@@ -133,10 +133,6 @@ class EstimatedGraph:
         both = np.triu(self.edges[0] & self.edges[0].T)
         return tuple((self.names[i], self.names[j]) for i, j in np.argwhere(both).tolist())
 
-    def told(self, **others: Any) -> EstimatedGraph:
-        """Return it with other attributes."""
-        return replace(self, **others)
-
     def restricted(self, names: Sequence[str]) -> EstimatedGraph:
         """Return the part on some variables; those that it lacks have no edges."""
         at = {name: i for i, name in enumerate(self.names)}

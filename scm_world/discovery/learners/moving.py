@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -199,7 +200,7 @@ def verified(
     ]
     if not account.looked.all():
         notes.append(f"{int((~account.looked).sum())} pairs hid behind declared causes")
-    return made.told(experiments=simulator.used, bound=degree, notes=tuple(notes))
+    return replace(made, experiments=simulator.used, bound=degree, notes=tuple(notes))
 
 
 def _moves(together: Iterable[str], rng: np.random.Generator) -> dict[str, float]:

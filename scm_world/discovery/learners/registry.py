@@ -6,7 +6,7 @@ import importlib.metadata
 import inspect
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Literal, final
 
@@ -149,7 +149,8 @@ def learn(
     if isinstance(table, Dataset):
         found = _folded(found, table, level)
     version = {chosen.package: chosen.version or ""} if chosen.package else {}
-    return found.told(
+    return replace(
+        found,
         learner=chosen.name,
         settings={**found.settings, **settings},
         seconds=seconds,
@@ -216,7 +217,7 @@ def _folded(found: EstimatedGraph, table: Dataset, level: Level) -> EstimatedGra
         np.maximum.at(edge_scores[total, at[row]], at[now], sure[lag, row, now])
     np.fill_diagonal(edges[0], False)
     np.fill_diagonal(edge_scores[0], 0.0)
-    return found.told(names=names, edges=edges, edge_scores=edge_scores)
+    return replace(found, names=names, edges=edges, edge_scores=edge_scores)
 
 
 def _version(package: str) -> str | None:
