@@ -37,6 +37,7 @@ from scm_world.variables import (
     Mechanism,
     Natural,
     Noise,
+    Parent,
     Variable,
     divided,
     whole_of,
@@ -126,7 +127,8 @@ class SCM:
 
     def __init__(self, variables: Iterable[Variable]) -> None:
         self._declared = checked(variables)
-        self._structure: EdgeIndex | None = EdgeIndex(self._declared)
+        parents = {name: variable.all_parents for name, variable in self._declared.items()}
+        self._structure: EdgeIndex | None = EdgeIndex(parents)
         self._order: tuple[str, ...] = self._structure.order
         self._evaluator = Evaluator(self._declared)
         self._temporal: frozenset[str] | None = None
@@ -210,8 +212,17 @@ class SCM:
     def structure(self) -> EdgeIndex:
         """The edges of this model; those into a cut variable are gone."""
         if self._structure is None:
-            self._structure = EdgeIndex({name: self[name] for name in self._declared})
+            self._structure = EdgeIndex({name: self._parents(name) for name in self._declared})
         return self._structure
+
+    def _parents(self, name: str) -> tuple[Parent, ...]:
+        """Give the edges into a variable, as ``self[name].all_parents`` does."""
+        act = self._acts.get(name)
+        if act is None or isinstance(act.intervention, SOFT):
+            return self._declared[name].all_parents
+        if isinstance(act.intervention, Draw):
+            return tuple(map(Parent, sorted(source_of(act).parents())))
+        return () if isinstance(act.intervention, Hard) else self[name].all_parents
 
     @property
     def edges(self) -> tuple[Edge, ...]:

@@ -43,15 +43,15 @@ class EdgeIndex:
     """The edges among some variables, without what they mean.
 
     Args:
-        variables: By name, in the order of declaration.
+        parents: Of each variable by name, in the order of declaration.
 
     Raises:
         ModelError: Contemporaneous edges form a cycle.
     """
 
-    def __init__(self, variables: Mapping[str, Variable]) -> None:
-        self._parents = {name: variable.all_parents for name, variable in variables.items()}
-        self._names = tuple(variables)
+    def __init__(self, parents: Mapping[str, tuple[Parent, ...]]) -> None:
+        self._parents = dict(parents)
+        self._names = tuple(parents)
         self._instant = _instant(self._parents)
         self.order = _topological(self._names, self._instant)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property, lru_cache
+from math import prod
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
 
 import numpy as np
@@ -244,7 +245,7 @@ class Box(_Space):
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes."""
-        return int(np.prod(shape))
+        return prod(shape)
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers, shape ``(..., n)``, into uniform points, ``(..., *shape)``."""
@@ -296,7 +297,7 @@ class Integers(_Space):
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes."""
-        return int(np.prod(shape))
+        return prod(shape)
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into equally likely whole numbers."""
@@ -339,7 +340,7 @@ class Categories(_Space):
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
         """Count the uniform numbers that one draw takes."""
-        return int(np.prod(shape))
+        return prod(shape)
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into equally likely members."""
