@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.geometry.penetration import (
@@ -143,7 +144,7 @@ def _select(table: Floats, tolerance: float) -> tuple[Integers, Floats]:
 
 
 @njit(cache=True)
-def sweep_kernel(
+def _depths(
     sizes: Floats,
     positions: Floats,
     orientations: Floats,
@@ -153,9 +154,8 @@ def sweep_kernel(
     frame_orientations: Floats,
     n_fixed: int,
     wall: tuple[float, float],
-    tolerance: float,
-) -> tuple[Integers, Floats]:
-    """Find all intersections; see ``sweep``, which names the result."""
+) -> Floats:
+    """Compute how deep bodies lie in one another, shape (bodies, bodies); see ``sweep``."""
     n_boxes, n_bodies = len(sizes), 0
     n_movable = n_boxes - n_fixed
     for c in range(len(members)):
@@ -177,7 +177,75 @@ def sweep_kernel(
                 halves[i], positions[i], rotations[i], ends[c, 0], ends[c, 1], capsules[c, 6]
             )
             _deepen(table, number, n_movable + members[c, 1], depth)
-    return _select(table, tolerance)
+    return table
+
+
+@njit(cache=True)
+def sweep_kernel(
+    sizes: Floats,
+    positions: Floats,
+    orientations: Floats,
+    capsules: Floats,
+    members: Integers,
+    frame_origins: Floats,
+    frame_orientations: Floats,
+    n_fixed: int,
+    wall: tuple[float, float],
+    tolerance: float,
+) -> tuple[Integers, Floats]:
+    """Find all intersections; see ``sweep``, which names the result."""
+    bodies = sizes, positions, orientations, capsules, members, frame_origins, frame_orientations
+    return _select(_depths(*bodies, n_fixed, wall), tolerance)
+
+
+@njit(cache=True)
+def apart_in_rows(
+    sizes: Floats,
+    positions: Floats,
+    orientations: Floats,
+    capsules: Floats,
+    members: Integers,
+    frame_origins: Floats,
+    frame_orientations: Floats,
+    n_fixed: int,
+    wall: tuple[float, float],
+    allowed: Floats,
+) -> NDArray[np.bool_]:
+    """Tell of many scenes whether no two bodies lie too deep in one another; see ``sweep``.
+
+    Args:
+        sizes: Shape (n or 1, boxes, 3) [m], where 1 is for boxes that are alike in all scenes.
+        positions: Shape (n or 1, boxes, 3) [m].
+        orientations: Shape (n or 1, boxes, 4).
+        capsules: See ``sweep``.
+        members: See ``sweep``.
+        frame_origins: Shape (n, k, 3) [m].
+        frame_orientations: Shape (n, k, 4).
+        n_fixed: How many boxes cannot move.
+        wall: Inner radius and height [m].
+        allowed: How deep each two may lie in one another, shape (bodies, bodies) [m].
+
+    Returns:
+        Shape (n,).
+    """
+    found = np.ones(len(frame_origins), dtype=np.bool_)
+    for row in range(len(found)):
+        table = _depths(
+            sizes[min(row, len(sizes) - 1)],
+            positions[min(row, len(positions) - 1)],
+            orientations[min(row, len(orientations) - 1)],
+            capsules,
+            members,
+            frame_origins[row],
+            frame_orientations[row],
+            n_fixed,
+            wall,
+        )
+        for i in range(len(table)):
+            for j in range(i + 1, len(table)):
+                if table[i, j] > allowed[i, j]:
+                    found[row] = False
+    return found
 
 
 def sweep(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 from numba import njit
 
@@ -249,6 +249,16 @@ class Composition(ABC):
         None stands for what the task allows after an intervention.
         """
         return ()
+
+    def thin(  # noqa: B027 # a composition that knows nothing of bodies leaves all
+        self, candidates: Any, before: Iterable[Overlap]
+    ) -> None:
+        """Leave out candidates that put two bodies in one place; it may leave in such.
+
+        Args:
+            candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
+            before: The bodies that lie in one another already, and may go on doing so.
+        """
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals, of some, that lie in something that never moves: nothing can fill them."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -16,6 +16,7 @@ from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard
 from scm_world.variables.checks import coerce
 from scm_world.variables.subsets import AnyRegion
+from scm_world.world.candidates import promising
 from scm_world.world.compiled_task import CompiledTask, StepBase
 from scm_world.world.plan import InterventionPlan, plan_intervention
 from scm_world.world.solver import same
@@ -131,7 +132,9 @@ def feasible_plan(
     """
     draws = any(isinstance(act, Draw) for act in request.values())
     last: InterventionPlan | None = None
-    for attempt in range(ATTEMPTS if draws else 1):
+    attempts: Iterator[int] = iter((0,))
+    tried = ""
+    while (attempt := next(attempts, None)) is not None:
         key = replace(key, attempt=attempt)
         last = plan = plan_intervention(structures, base, request, space, key, last, found)
         change = present.difference(plan)
@@ -146,8 +149,11 @@ def feasible_plan(
                 tried = "whatever is drawn, "
                 break
             key = replace(key, kept=kept)
-    else:
-        tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
+            tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
+            attempts = iter(range(1, ATTEMPTS))
+            drawn = {name for name, act in request.items() if isinstance(act, Draw)}
+            if drawn.isdisjoint(structures.head):  # which bodies there are is not drawn
+                attempts = promising(base, plan, key, ATTEMPTS)
     raise refusal(structures, base, present, plan, request, problems, key, tried)
 
 

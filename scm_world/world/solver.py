@@ -55,6 +55,8 @@ class Solver:
         index: The control step.
         model: With the interventions that would hold, draws among them.
         problems: What is wrong with the request.
+        acts: The interventions on what there is, by target.
+        order: What is computed, causes before effects.
     """
 
     def __init__(
@@ -67,10 +69,10 @@ class Solver:
     ) -> None:
         self.base, self.asked, self.pending = base, asked, pending
         self._task, self._key = base.compiled, key
-        self._pending = {t: named for t, named in pending.items() if t in base.compiled.model}
+        self.acts = {t: named for t, named in pending.items() if t in base.compiled.model}
         self._earlier = earlier
         self._draws: list[str] = []
-        self._order: tuple[str, ...] = ()
+        self.order: tuple[str, ...] = ()
         self._unchanged: frozenset[str] | None = None
         self.static: dict[str, Value] = dict(base.static)
         self.model = base.model
@@ -103,7 +105,7 @@ class Solver:
 
     def _solve_parameters(self) -> None:
         """Mutilate the model and recompute the descendants of the targets."""
-        acts = {t: na for t, na in self._pending.items() if not self._is_state(t)}
+        acts = {t: na for t, na in self.acts.items() if not self._is_state(t)}
         if not acts:
             return
         targets = tuple(target for target in acts if target in self.static)
@@ -116,19 +118,21 @@ class Solver:
             self._impossible = {*moving, *chain(*(problem.cycle for problem in cycles))}
             targets = tuple(target for target in targets if target not in self._impossible)
             draws = [target for target in draws if target in targets]
-            self._order = tuple(self._following(targets))
+            self.order = tuple(self._following(targets))
             if any(self._follows_others(*acts[target]) for target in draws):
-                follow = frozenset(self._order)
-                self._order = tuple(n for n in self.model.structure.order if n in follow)
+                follow = frozenset(self.order)
+                self.order = tuple(n for n in self.model.structure.order if n in follow)
         else:
-            self.model, self._order = self._earlier.model, self._earlier._order
-            self._unchanged = self._same_again(self._earlier)
+            self.model, self.order = self._earlier.model, self._earlier.order
+            if self._earlier._unchanged is None:
+                self._earlier._unchanged = self._earlier.same_at(self._key)
+            self._unchanged = self._earlier._unchanged
         known = dict(self.static)
         for target in targets:
             del known[target]
         if draws:  # and states among them
             known |= self._task.states(self.base.state)
-        self._solve(self._order, known)
+        self._solve(self.order, known)
         self._draws = draws
         self._earlier = None  # attempts are no chain
 
@@ -149,21 +153,19 @@ class Solver:
         found = requested.space(source) if isinstance(source, str) else source
         return found is not None and bool(found.parents())
 
-    def _same_again(self, earlier: Solver) -> frozenset[str]:
-        """Name what does not follow from anything that is drawn anew."""
-        if earlier._unchanged is not None:
-            return earlier._unchanged
+    def same_at(self, key: Moment) -> frozenset[str]:
+        """Name what was computed and does not follow from anything that is drawn anew."""
         anew = {
             target
-            for target, (name, act) in self._pending.items()
-            if isinstance(act, Draw) and whole_of(act, name) not in self._key.kept
+            for target, (name, act) in self.acts.items()
+            if isinstance(act, Draw) and whole_of(act, name) not in key.kept
         }
-        for name in self._order:
+        for name in self.order:
             bounds = self._task.model.declared(name).bounds
             is_bound = bounds is not None and bounds.parents()
-            if is_bound or not anew.isdisjoint(earlier.model.structure.parents(name)):
+            if is_bound or not anew.isdisjoint(self.model.structure.parents(name)):
                 anew.add(name)
-        return frozenset(self._order) - anew
+        return frozenset(self.order) - anew
 
     @cached_property
     def fixed(self) -> dict[str, Hard]:
@@ -221,12 +223,12 @@ class Solver:
         """
         self.state = self.base.state.copy()
         followed = {variable.name for variable in self._task.carried}
-        acts = [t for t in self._pending if self._is_state(t)]
+        acts = [t for t in self.acts if self._is_state(t)]
         for target in sorted(acts, key=lambda name: name in followed):
             if target not in followed:
                 self._set(target)
         for variable in self._task.carried:
-            name, act = self._pending.get(variable.name, (None, None))
+            name, act = self.acts.get(variable.name, (None, None))
             if name is None or isinstance(act, SOFT):
                 self._carry(variable)
             if name is not None:
@@ -235,7 +237,7 @@ class Solver:
     def _set(self, target: str) -> None:
         variable, where = self._task.model.declared(target), self._task.slices.get(target)
         try:
-            value = self._wish(target, *self._pending[target])
+            value = self._wish(target, *self.acts[target])
             if where is not None and same(value, self._task.view(target, self.base.state)):
                 self.state.vector[where] = self.base.state.vector[where]
                 return
@@ -301,15 +303,16 @@ class Solver:
             if variable.start is not None:
                 self.state.vector[where] = np.ravel(variable.start.bind()(*new))
             return
-        old = [self._before(parent) for parent in parents]
+        old = [self.before(parent) for parent in parents]
         moved = {p for p, a, b in zip(parents, old, new, strict=True) if not same(a, b)}
         if moved:
             again = self.base.at_start or not moved.isdisjoint(variable.restart)
-            self.state.vector[where] = np.ravel(self._moved(variable, old, new, again=again))
+            self.state.vector[where] = np.ravel(self.moved(variable, old, new, again=again))
 
-    def _moved(
+    def moved(
         self, variable: Measured, old: list[Value], new: list[Value], *, again: bool
     ) -> Value:
+        """Give a state after what it follows was set; ``again``: as at the start."""
         if again and variable.start is not None:
             return np.asarray(variable.start.bind()(*new))
         present = self._task.view(variable.name, self.base.state)
@@ -317,7 +320,8 @@ class Solver:
             return present
         return np.asarray(variable.carry.bind()(present, *old, *new))
 
-    def _before(self, name: str) -> Value:
+    def before(self, name: str) -> Value:
+        """Give the value that a parameter or a state has before the intervention."""
         if name in self._task.slices:
             return self._task.view(name, self.base.state)
         return self.base.static[name]
@@ -379,7 +383,7 @@ class Solver:
 
     def _held(self, name: str) -> Value:
         """Give the action that is to be taken from now on."""
-        acts = [self._pending[target][1] for target in self._task.model.targets(name)]
+        acts = [self.acts[target][1] for target in self._task.model.targets(name)]
         if all(isinstance(act, Hard) for act in acts):
             values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
             return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])

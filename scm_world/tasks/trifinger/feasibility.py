@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,11 @@ from scm_world.geometry.convex import Convex, placed, sides_depth
 from scm_world.geometry.hulls import box_hull
 from scm_world.geometry.penetration import box_capsule
 from scm_world.geometry.rotations import rotation_matrix
-from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, sweep
+from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, apart_in_rows, sweep
 from scm_world.models.scene import TOLERANCE, Goal, Overlap, Scene
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, link_frames
+from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, frames_of_rows, link_frames
+from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.tasks.trifinger.structure import WALL_HEIGHT, WALL_RADIUS
 
 _LINK = {"upper": 1, "middle": 2, "lower": 3, "tip": 3}
@@ -46,6 +48,7 @@ def _capsules() -> tuple[Floats, Integers]:
 
 _CAPSULES, _MEMBERS = _capsules()
 _WALL = (WALL_RADIUS, WALL_HEIGHT)
+_CENTER, _TURN = slice(0, 3), slice(3, 7)  # of a pose
 
 
 def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
@@ -94,6 +97,77 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     pairs = zip(found.pairs.tolist(), found.depths.tolist(), strict=True)
     result = (Overlap((names[i], names[j]), depth) for (i, j), depth in pairs)
     return tuple(_sharper(scene, result, tolerance) if structure.hulls else result)
+
+
+def thin(
+    candidates: Any,
+    blocks: tuple[str, ...],
+    obstacles: tuple[str, ...],
+    before: Iterable[Overlap],
+    tolerances: tuple[float, float],
+) -> None:
+    """Leave out candidates with bodies that lie too deep in one another: first fingers, then all.
+
+    Args:
+        candidates: Draws of an intervention.
+        blocks: Names of the blocks, all of them boxes.
+        obstacles: Names of the obstacles.
+        before: What lies in one another already may do so as deep as it does.
+        tolerances: How deep is too deep where a link takes part, and elsewhere [m].
+    """
+    names = (*blocks, *hardware.LINK_NAMES, *obstacles, "floor", "stage")
+    links = slice(len(blocks), len(blocks) + len(hardware.LINK_NAMES))
+    allowed = np.full((len(names), len(names)), tolerances[1])
+    allowed[links] = allowed[:, links] = tolerances[0]
+    for overlap in before:
+        if not set(names).issuperset(overlap.bodies):
+            continue  # it is taken away
+        pair = names.index(overlap.bodies[0]), names.index(overlap.bodies[1])
+        allowed[pair] = max(allowed[pair], overlap.depth + 1e-6)
+    robot = [*range(*links.indices(len(names))), len(names) - 2, len(names) - 1]
+    stages = [((), (), allowed[np.ix_(robot, robot)]), (blocks, obstacles, allowed)]
+    for some, fixed, depths in stages:
+        joints = candidates.state(slice(0, hardware.N_JOINTS))
+        heights = candidates.parameter(("robot", "height"))
+        n = len(candidates.attempts)
+        frames = np.empty((n, len(hardware.FINGERS) * FRAMES_PER_FINGER, 3))
+        turns = np.empty((*frames.shape[:2], 4))
+        frames_of_rows(np.ascontiguousarray(joints), np.ascontiguousarray(heights), frames, turns)
+        boxes = [*some, *fixed]
+        sizes = _together([candidates.parameter((name, "size")) for name in boxes], 3)
+        poses = [candidates.state(_pose(index)) for index in range(len(some))]
+        centers, orientations = ([pose[:, at] for pose in poses] for at in (_CENTER, _TURN))
+        centers += [candidates.parameter((name, "position")) for name in fixed]
+        orientations += [candidates.parameter((name, "orientation")) for name in fixed]
+        apart = apart_in_rows(
+            sizes,
+            _together(centers, 3),
+            _together(orientations, 4),
+            _CAPSULES,
+            _MEMBERS,
+            frames,
+            turns,
+            len(fixed),
+            _WALL,
+            depths,
+        )
+        candidates.keep(apart)
+        if not len(candidates.attempts):
+            return
+
+
+def _pose(block: int) -> slice:
+    first = ROBOT_SIZE + BLOCK_SIZE * block
+    return slice(first, first + 7)
+
+
+def _together(parts: list[Floats], size: int) -> Floats:
+    """Put values of bodies together, shape (n or 1, bodies, size)."""
+    n = max(map(len, parts), default=1)
+    found = np.empty((n, len(parts), size))
+    for index, part in enumerate(parts):
+        found[:, index] = part
+    return found
 
 
 def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:

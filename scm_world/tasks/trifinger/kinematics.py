@@ -228,6 +228,17 @@ def link_frames_kernel(
         _orient(orientations, frame + 4, finger, q0, q1 + q2)
 
 
+@njit(cache=True)
+def frames_of_rows(
+    joint_positions: Floats, heights: Floats, positions: Floats, orientations: Floats
+) -> None:
+    """Write what ``link_frames`` returns for each row, shapes (n, 15, 3) and (n, 15, 4)."""
+    for row in range(len(positions)):
+        joints = joint_positions[min(row, len(joint_positions) - 1)]
+        height = heights[min(row, len(heights) - 1)]
+        link_frames_kernel(joints, height, positions[row], orientations[row])
+
+
 def forward(joint_positions: ArrayLike, height: float, out: Floats | None = None) -> Floats:
     """Compute where the fingertips are.
 

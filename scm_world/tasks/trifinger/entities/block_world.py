@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import final
+from typing import Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
@@ -13,7 +13,7 @@ from scm_world.models import ControlMode, Goal, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity, Mover
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
-from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps
+from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     LINK_NAMES,
@@ -101,6 +101,12 @@ class BlockWorld(Composition):
             for overlap in overlaps(scene, tolerance=min(robot, others))
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
+
+    def thin(self, candidates: Any, before: Iterable[Overlap]) -> None:
+        """Leave out candidates in which fingers, blocks or obstacles lie in one another."""
+        if not self.hulls:
+            tolerances = self.conventions.robot_tolerance, self.conventions.tolerance
+            thin(candidates, self.blocks, self.obstacles, before, tolerances)
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""

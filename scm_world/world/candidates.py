@@ -1,0 +1,200 @@
+"""Draws of an intervention that bodies rule out, found without planning each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._types import Integers, Value
+from scm_world.graph import Moment
+from scm_world.models import ParameterKey
+from scm_world.variables import Draw, Hard, Natural, Rotations, Variable, whole_of
+from scm_world.world.compiled_task import StepBase
+from scm_world.world.plan import InterventionPlan
+from scm_world.world.solver import Solver, same
+
+CHUNK = 64
+"""How many draws are looked at together at first, and then four times as many."""
+
+
+class Unknown(Exception):  # no error: such draws are planned one after another
+    """What a draw would give cannot be told without planning it."""
+
+
+@final
+class Candidates:
+    """Values of variables in several draws of one intervention, computed when they are asked for.
+
+    The first axis of a value is that of the draws; it has length 1 where all have the same value.
+
+    Args:
+        solver: Of an earlier draw.
+        key: Where to draw.
+        attempts: Numbers of the draws.
+
+    Attributes:
+        attempts: Those that are left, shape (n,).
+    """
+
+    def __init__(self, solver: Solver, key: Moment, attempts: Integers) -> None:
+        self.attempts = attempts
+        self._solver, self._key, self._task = solver, key, solver.base.compiled
+        self._known = solver.same_at(key)
+        self._carried = {variable.name: variable for variable in self._task.carried}
+        self._keys = {key: name for name, key in self._task.parameter_keys.items()}
+        self._found: dict[str, Value] = {}
+        self._varying: set[str] = set()
+
+    def keep(self, which: Value) -> None:
+        """Leave out draws; ``which`` tells of each whether it stays, shape (n,)."""
+        self.attempts = self.attempts[which]
+        for name in self._varying:
+            self._found[name] = self._found[name][which]
+
+    def parameter(self, key: ParameterKey) -> Value:
+        """Give a physical parameter, shape (n or 1, *shape).
+
+        Raises:
+            Unknown: It is no variable.
+        """
+        if key not in self._keys:
+            raise Unknown
+        return self._value(self._keys[key])
+
+    def state(self, where: slice) -> Value:
+        """Give some numbers of the state vector, shape (n or 1, size)."""
+        bundles, parts = self._task.bundles, []
+        for name, own in self._task.slices.items():
+            if where.start <= own.start and own.stop <= where.stop and name not in bundles:
+                value = self._value(name)
+                parts.append(value.reshape(len(value), -1))
+        n = max(map(len, parts))
+        return np.hstack([np.broadcast_to(part, (n, part.shape[1])) for part in parts])
+
+    def _value(self, name: str) -> Value:
+        if name not in self._found:
+            is_state = name in self._task.slices
+            value, varies = self._state(name) if is_state else self._static(name)
+            self._found[name] = value
+            self._varying |= {name} if varies else set()
+        return self._found[name]
+
+    def _static(self, name: str) -> tuple[Value, bool]:
+        """Give the values of a parameter, and whether they differ."""
+        solver = self._solver
+        if name in self._known or name not in solver.order:
+            return np.asarray(solver.static[name])[None], False
+        asked, act = solver.acts.get(name, (name, None))
+        if isinstance(act, Draw):
+            if whole_of(act, asked) != name:
+                raise Unknown
+            return self._drawn(self._task.model.declared(name), act), True
+        model, declared = solver.model, self._task.model.declared
+        parents = model.structure.parents(name)
+        shape = declared(name).shape
+        values = [*map(self._value, parents)]
+
+        def computed(*given: Value) -> Value:
+            return model.evaluate(name, dict(zip(parents, given, strict=True)), self._key)
+
+        varies = not self._varying.isdisjoint(parents)
+        return self._rows(computed, values, shape, varies=varies), varies
+
+    def _state(self, name: str) -> tuple[Value, bool]:
+        """Give the values of a state, and whether they differ."""
+        solver, declared = self._solver, self._task.model.declared
+        asked, act = solver.acts.get(name, (name, None))
+        if act is None and name in self._carried:
+            return self._moved(name)
+        if act is None or isinstance(act, Hard | Natural):
+            return self._as_planned(name), False
+        if not isinstance(act, Draw):
+            raise Unknown
+        whole: Any = declared(whole_of(act, asked))
+        value = self._drawn(whole, act)
+        if whole.name != asked:
+            value = whole.mechanism.split(value)[whole.parts.index(asked)]
+        elif asked != name:
+            value = self._rows(whole.inverse.bind(), [value], declared(name).shape, varies=True)
+        bounds = declared(name).bounds
+        return np.asarray(bounds.nearest(value) if isinstance(bounds, Rotations) else value), True
+
+    def _moved(self, name: str) -> tuple[Value, bool]:
+        """Carry a state along with what acts on it when set, as the solver does."""
+        solver, parents = self._solver, self._task.set_parents[name]
+        new = [*map(self._value, parents)]
+        if self._varying.isdisjoint(parents):
+            return self._as_planned(name), False
+        if name in solver.base.fresh:
+            raise Unknown
+        variable, old = self._carried[name], [solver.before(parent) for parent in parents]
+        present = self._task.view(name, solver.base.state)
+
+        def moved(*given: Value) -> Value:
+            both = zip(parents, old, given, strict=True)
+            which = {parent for parent, a, b in both if not same(a, b)}
+            again = solver.base.at_start or not which.isdisjoint(variable.restart)
+            return solver.moved(variable, old, [*given], again=again) if which else present
+
+        return self._rows(moved, new, present.shape, varies=True), True
+
+    def _as_planned(self, name: str) -> Value:
+        """Give a state that no draw moves."""
+        return self._task.view(name, self._solver.state)[None]
+
+    def _drawn(self, variable: Variable, act: Draw) -> Value:
+        source: Any = variable.space(act.source) if isinstance(act.source, str) else act.source
+        parents = source.parents()
+        if not parents.isdisjoint(self._task.slices):
+            raise Unknown
+        values = {parent: self._value(parent) for parent in parents}
+        return self._key.draws(
+            self.attempts, source, variable.name, variable.shape, values, act.stream
+        )
+
+    def _rows(
+        self,
+        function: Callable[..., Any],
+        values: list[Value],
+        shape: tuple[int, ...],
+        *,
+        varies: bool,
+    ) -> Value:
+        """Compute a function for each draw; functions of users need not take many at once."""
+        found = np.empty((len(self.attempts) if varies else 1, *shape))
+        for i in range(len(found)):
+            found[i] = function(*(value[i if len(value) > 1 else 0] for value in values))
+        return found
+
+
+def promising(base: StepBase, plan: InterventionPlan, key: Moment, count: int) -> Iterator[int]:
+    """Yield the numbers of further draws that may be feasible, and that of the last one.
+
+    A draw that is left out puts two bodies in one place. Where that cannot be told, all are
+    yielded.
+
+    Args:
+        base: The world as physics left it.
+        plan: Of an earlier draw.
+        key: Where to draw.
+        count: How many draws there are; the first one was number 0.
+    """
+    compiled, solver = plan.compiled, plan.solver
+    before = base.compiled.composition.overlaps(
+        base.compiled.describe(base.static, base.state), 0.0
+    )
+    first, size = 1, CHUNK
+    while first < count and solver is not None:
+        attempts = np.arange(first, min(first + size, count))
+        candidates = Candidates(solver, replace(key, attempt=1), attempts)
+        try:
+            with np.errstate(all="ignore"):
+                compiled.composition.thin(candidates, before)
+        except Exception:  # planning says what is wrong
+            candidates.attempts = attempts
+        yield from candidates.attempts[candidates.attempts < count - 1].tolist()
+        first, size = first + size, 4 * CHUNK
+    yield count - 1
