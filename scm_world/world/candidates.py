@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Integers, Value
-from scm_world.graph import Moment
+from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
 from scm_world.variables import Draw, Hard, Natural, Rotations, Variable, whole_of
 from scm_world.world.compiled_task import StepBase
@@ -39,7 +39,7 @@ class Candidates:
         attempts: Those that are left, shape (n,).
     """
 
-    def __init__(self, solver: Solver, key: Moment, attempts: Integers) -> None:
+    def __init__(self, solver: Solver, key: NoiseKey, attempts: Integers) -> None:
         self.attempts = attempts
         self._solver, self._key, self._task = solver, key, solver.base.compiled
         self._known = solver.same_at(key)
@@ -170,7 +170,7 @@ class Candidates:
         return found
 
 
-def promising(base: StepBase, plan: InterventionPlan, key: Moment, count: int) -> Iterator[int]:
+def promising(base: StepBase, plan: InterventionPlan, key: NoiseKey, count: int) -> Iterator[int]:
     """Yield the numbers of further draws that may be feasible, and that of the last one.
 
     A draw that is left out puts two bodies in one place. Where that cannot be told, all are

@@ -153,7 +153,7 @@ class Solver:
         found = requested.space(source) if isinstance(source, str) else source
         return found is not None and bool(found.parents())
 
-    def same_at(self, key: Moment) -> frozenset[str]:
+    def same_at(self, key: NoiseKey) -> frozenset[str]:
         """Name what was computed and does not follow from anything that is drawn anew."""
         anew = {
             target
