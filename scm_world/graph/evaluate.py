@@ -82,21 +82,6 @@ class NoiseKey:
         )
         return drawn if self.count is not None else drawn[0]
 
-    def draws(
-        self,
-        attempts: Iterable[int],
-        source: Distribution,
-        name: str,
-        shape: tuple[int, ...],
-        values: Values,
-        stream: str | None = None,
-    ) -> Value:
-        """Draw a value of a variable in several attempts, shape (n, *shape)."""
-        own = name if stream is None else f"{stream}/{name}"
-        names = [f"{own}#{attempt}" for attempt in attempts]
-        n, where = source.n_uniforms(shape), {"episode": self.episode, "step": self.step}
-        return source.transform(self.noise.streams(names, n=n, **where)[:, 0], shape, values)
-
 
 @final
 @dataclass(frozen=True)

@@ -3,12 +3,14 @@
 The streams are counter-based (Philox), so a draw does not depend on what else was drawn before
 it, on the number of worlds or workers, or on the order of calls. Nothing touches a global
 generator.
+
+Source:
+    Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC 2011.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
 from functools import lru_cache
 from typing import final
 
@@ -17,9 +19,12 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.variables.distributions import Distribution
 
+_WORDS = 4  # 64-bit words that one increment of the Philox counter yields
+
 
 @lru_cache(maxsize=2**16)
-def _word(text: str) -> int:
+def word_of(text: str) -> int:
+    """Return the 64 bits by which a name selects a stream."""
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
@@ -30,6 +35,9 @@ class Noise:
     Args:
         seed: Any whole number that is not negative.
 
+    Attributes:
+        key: The 64 bits by which the seed selects its streams.
+
     Example:
         >>> noise = Noise(7)
         >>> both = noise.uniforms("mass", episode=0, n=2, count=2)
@@ -39,7 +47,7 @@ class Noise:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self._key = _word(f"seed {seed}")
+        self.key = word_of(f"seed {seed}")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Noise) and self.seed == other.seed
@@ -65,23 +73,17 @@ class Noise:
         Returns:
             Numbers in [0, 1), shape ``(count, n)``.
         """
-        found: Floats = self.streams([variable], n=n, episode=episode, step=step, count=count)[0]
-        return found
-
-    def streams(
-        self, variables: Iterable[str], *, n: int, episode: int = 0, step: int = 0, count: int = 1
-    ) -> Floats:
-        """Draw the uniform numbers of several variables; see ``uniforms``.
-
-        Returns:
-            Numbers in [0, 1), shape ``(len(variables), count, n)``.
-        """
-        from scm_world.variables.philox import philox  # takes a while, and only draws need it
-
-        keys = np.array([_word(name) for name in variables], dtype=np.uint64)
-        found = np.empty((keys.size, count, n))
-        philox(np.uint64(self._key), keys, np.uint64(episode), np.uint64(step), found)
-        return found
+        if n == 0:
+            return np.empty((count, 0))
+        blocks = -(-n // _WORDS)
+        generator = np.random.Philox(
+            key=np.array([self.key, word_of(variable)], dtype=np.uint64),
+            counter=np.array([episode * blocks, step, 0, 0], dtype=np.uint64),
+        )
+        raw = generator.random_raw(count * blocks * _WORDS)
+        words = np.asarray(raw, dtype=np.uint64).reshape(count, blocks * _WORDS)[:, :n]
+        uniform: Floats = np.multiply(words >> np.uint64(11), 2.0**-53, dtype=np.float64)
+        return uniform
 
     def draw(
         self,

@@ -12,7 +12,9 @@ from scm_world._types import Integers, Value
 from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
 from scm_world.variables import Draw, Hard, Natural, Rotations, Variable, whole_of
+from scm_world.variables.noise import word_of
 from scm_world.world.compiled_task import StepBase
+from scm_world.world.philox import philox
 from scm_world.world.plan import InterventionPlan
 from scm_world.world.solver import Solver, same
 
@@ -151,9 +153,13 @@ class Candidates:
         if not parents.isdisjoint(self._task.slices):
             raise Unknown
         values = {parent: self._value(parent) for parent in parents}
-        return self._key.draws(
-            self.attempts, source, variable.name, variable.shape, values, act.stream
-        )
+        own = variable.name if act.stream is None else f"{act.stream}/{variable.name}"
+        keys = [word_of(f"{own}#{attempt}") for attempt in self.attempts.tolist()]
+        uniforms = np.empty((len(keys), source.n_uniforms(variable.shape)))
+        where = np.array([self._key.noise.key, self._key.episode, self._key.step], dtype=np.uint64)
+        philox(where, np.array(keys, dtype=np.uint64), uniforms)
+        drawn: Value = source.transform(uniforms, variable.shape, values)
+        return drawn
 
     def _rows(
         self,

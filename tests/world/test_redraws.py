@@ -11,7 +11,9 @@ import pytest
 from scm_world import Draw, Mechanism, Shift, World
 from scm_world.errors import Infeasible
 from scm_world.variables import Box, Function
+from scm_world.variables.noise import Noise, word_of
 from scm_world.world import feasibility
+from scm_world.world.philox import philox
 from scm_world.world.plan import InterventionPlan, plan_intervention
 
 
@@ -172,3 +174,17 @@ def test_draws_are_looked_at_together_and_the_same_one_is_taken(
             found.append({name: value.tobytes() for name, value in world.values().items()})
     assert found[0] == found[1]
     assert isinstance(found[0], dict) == is_feasible
+
+
+@pytest.mark.parametrize("episode", [0, 7, 2**40])
+def test_draws_that_are_looked_at_together_have_the_numbers_of_their_streams(episode: int) -> None:
+    """The compiled generator gives what that of numpy gives, bit for bit."""
+    for n in range(14):
+        noise, step = Noise(2**61 + n), 2**32 + n
+        names = [f"joints#{attempt}" for attempt in range(20)]
+        where = np.array([noise.key, episode, step], dtype=np.uint64)
+        found = np.empty((len(names), n))
+        philox(where, np.array([*map(word_of, names)], dtype=np.uint64), found)
+        for name, row in zip(names, found, strict=True):
+            expected = noise.uniforms(name, n=n, episode=episode, step=step)
+            np.testing.assert_array_equal(row, expected[0])

@@ -1,0 +1,53 @@
+"""The counter-based generator Philox 4x64-10, compiled.
+
+Source:
+    Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC 2011.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from scm_world._types import Floats
+
+_MULTIPLIERS = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
+_INCREMENTS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
+_LOW, _HALF, _LAST, _ONE = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11), np.uint64(1)
+
+
+@njit(cache=True)
+def _high(a: Any, b: Any) -> Any:
+    """Multiply two words of 64 bits; return the upper 64 bits of the product."""
+    a0, a1, b0, b1 = a & _LOW, a >> _HALF, b & _LOW, b >> _HALF
+    middle = a1 * b0 + (a0 * b0 >> _HALF)
+    return a1 * b1 + (middle >> _HALF) + ((a0 * b1 + (middle & _LOW)) >> _HALF)
+
+
+@njit("void(u8[::1], u8[::1], f8[:, ::1])", cache=True)
+def philox(where: Any, keys: Any, out: Floats) -> None:
+    """Write the numbers of several streams: those that ``Noise.uniforms`` gives for one episode.
+
+    Args:
+        where: Key of the seed, episode and control step, shape (3,).
+        keys: Of the streams, shape (m,).
+        out: Written, shape (m, n).
+    """
+    n = out.shape[1]
+    blocks = np.uint64((n + 3) // 4)
+    for row in range(out.shape[0]):
+        counter = where[1] * blocks
+        for block in range((n + 3) // 4):
+            counter += _ONE
+            c0, c1, c2, c3 = counter, where[2], np.uint64(0), np.uint64(0)
+            k0, k1 = where[0], keys[row]
+            for _ in range(10):
+                h0, l0 = _high(_MULTIPLIERS[0], c0), _MULTIPLIERS[0] * c0
+                h1, l1 = _high(_MULTIPLIERS[1], c2), _MULTIPLIERS[1] * c2
+                c0, c1, c2, c3 = h1 ^ c1 ^ k0, l1, h0 ^ c3 ^ k1, l0
+                k0, k1 = k0 + _INCREMENTS[0], k1 + _INCREMENTS[1]
+            words = (c0, c1, c2, c3)
+            for i in range(min(4, n - 4 * block)):
+                out[row, 4 * block + i] = np.float64(words[i] >> _LAST) * 2.0**-53
