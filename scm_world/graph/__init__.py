@@ -1,7 +1,7 @@
 """Structural causal models over typed variables. Nothing here knows any physics."""
 
 from scm_world.graph.evaluate import NoiseKey
-from scm_world.graph.files import from_dict, from_json, to_dict, to_dot, to_json
+from scm_world.graph.files import from_dict, from_json, to_dict, to_json
 from scm_world.graph.scm import SCM, flatten
 from scm_world.graph.structure import Edge, EdgeIndex
 from scm_world.graph.views import d_separated, episode_outcome, unrolled
@@ -17,7 +17,6 @@ __all__ = [
     "from_dict",
     "from_json",
     "to_dict",
-    "to_dot",
     "to_json",
     "unrolled",
 ]

@@ -1,4 +1,4 @@
-"""Models in and out: JSON and DOT."""
+"""Models in and out as JSON."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from scm_world.errors import DAMAGED, InterventionError, ModelError
-from scm_world.graph.exchange.formats import to_dot as written
-from scm_world.graph.exchange.model import causal_graph
 from scm_world.graph.scm import SCM
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
 from scm_world.variables.mechanisms import OWN_MECHANISMS
@@ -119,11 +117,3 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     except DAMAGED as error:
         raise ModelError([f"not a model: {error}"]) from None
     return from_dict(data, trusted=trusted)
-
-
-def to_dot(model: SCM) -> str:
-    """Write the summary graph in the DOT language; lagged edges are dashed.
-
-    ``scm_world.graph.exchange`` writes DOT that can be read back.
-    """
-    return written(causal_graph(model), attributes=False)

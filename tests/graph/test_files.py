@@ -16,9 +16,9 @@ from scm_world.graph import (
     from_dict,
     from_json,
     to_dict,
-    to_dot,
     to_json,
 )
+from scm_world.graph.exchange import write_graph
 from scm_world.tasks import TASKS
 from scm_world.variables import (
     Affine,
@@ -184,10 +184,10 @@ def test_what_is_no_model_is_refused(text: str) -> None:
 
 def test_dot_shows_kinds_units_lags_and_conditions() -> None:
     """One line per node and edge; lagged edges are dashed."""
-    dot = to_dot(model())
+    dot = write_graph(model(), format="dot")
     assert dot.startswith("digraph scm {")
-    assert '"a" [shape=ellipse, label="a\\n[1]"];' in dot
-    assert '"a" -> "c" [style=solid];' in dot
-    assert '"b" -> "c" [style=dashed];' in dot
-    assert '"a" -> "e" [style=dashed, label="contact"];' in dot
+    assert '"a" [shape=ellipse, label="a\\n[1]"' in dot
+    assert '"a" -> "c" [style=solid' in dot
+    assert '"b" -> "c" [style=dashed' in dot
+    assert '"a" -> "e" [style=dashed, label="contact"' in dot
     assert dot.count("->") == len(model().edges)

@@ -276,12 +276,9 @@ class EpisodeSimulator:
         for name, now, before in zip(last, after, end, strict=True):
             found.see(self._named[cause], name, 0, now, before)
 
-    def _setting_of(self, unit: int) -> Setting:
-        return self._settings[unit % len(self._settings)]
-
     def _begun(self, unit: int, do: Mapping[str, Any], found: Effects) -> dict[str, Value]:
         found.rollouts += 1
-        short = replace(self._setting_of(unit), steps=1)
+        short = replace(self._settings[unit % len(self._settings)], steps=1)
         episode = short.episode(self._twins, self._world, do, unit, self._read)
         return {name: np.array(episode[name][0]) for name in self._read}
 
@@ -292,5 +289,6 @@ class EpisodeSimulator:
     def _ended(self, unit: int, do: Mapping[str, Any], found: Effects) -> list[Value]:
         found.rollouts += 1
         names = tuple(outcome.name for outcome in self._outcomes)
-        episode = self._setting_of(unit).episode(self._twins, self._world, do, unit, names)
+        setting = self._settings[unit % len(self._settings)]
+        episode = setting.episode(self._twins, self._world, do, unit, names)
         return [read(outcome, episode) for outcome in self._outcomes]

@@ -45,18 +45,19 @@ def _quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def to_dot(graph: CausalGraph, *, attributes: bool = True) -> str:
-    """Write a graph in the DOT language, with ``attributes`` if it is to be read back."""
+def to_dot(graph: CausalGraph) -> str:
+    """Write a graph in the DOT language; lagged edges are dashed."""
     lines = ["digraph scm {", "  rankdir=LR;"]
     for node in graph.nodes:
-        more = node.attributes if attributes else {}
-        about = _listed({"shape": _SHAPES.get(node.kind, "ellipse"), "label": _label(node)}, more)
+        about = _listed(
+            {"shape": _SHAPES.get(node.kind, "ellipse"), "label": _label(node)}, node.attributes
+        )
         lines.append(f"  {_quoted(node.name)} [{about}];")
     for edge in graph.edges:
         look = {"style": "dashed" if edge.lag else "solid"}
         if edge.when:
             look["label"] = _quoted(edge.when)
-        about = _listed(look, edge_attributes(edge) if attributes else {})
+        about = _listed(look, edge_attributes(edge))
         lines.append(f"  {_quoted(edge.cause)} -> {_quoted(edge.effect)} [{about}];")
     return "\n".join([*lines, "}"])
 
