@@ -11,7 +11,7 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
-from scm_world.cli.console import INTERRUPTED, console
+from scm_world.cli import console
 from scm_world.cli.datasets import collect, sweep
 from scm_world.cli.discovery import discover, verify
 from scm_world.cli.evaluation import evaluate, explain
@@ -33,8 +33,8 @@ class Commands(TyperGroup):
         except (ScmWorldError, OSError) as error:
             said, code = "\n".join((str(error), *getattr(error, "__notes__", ()))), 2
         except KeyboardInterrupt:
-            said, code = "interrupted before there was a result", INTERRUPTED
-        console(stderr=True).print(
+            said, code = "interrupted before there was a result", console.INTERRUPTED
+        console.terminal(stderr=True).print(
             Text.assemble(("error:", "bold red"), f" {said}"), soft_wrap=True
         )
         raise typer.Exit(code) from None

@@ -28,18 +28,18 @@ RESULTS = Path("scm-world-results")
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 
-def console(*, stderr: bool = False, file: IO[str] | None = None, width: int = WIDTH) -> Console:
+def terminal(*, stderr: bool = False, file: IO[str] | None = None, width: int = WIDTH) -> Console:
     """Return the terminal, or plain text of a fixed width where there is none."""
-    terminal = Console(stderr=stderr, file=file, highlight=False)
-    if terminal.is_terminal:
-        return terminal
+    found = Console(stderr=stderr, file=file, highlight=False)
+    if found.is_terminal:
+        return found
     return Console(stderr=stderr, file=file, highlight=False, width=width)
 
 
 def say(*lines: object, stderr: bool = False) -> None:
     """Print lines as they are: no markup, no wrapping."""
     for line in lines:
-        console(stderr=stderr).print(Text(str(line)), soft_wrap=True)
+        terminal(stderr=stderr).print(Text(str(line)), soft_wrap=True)
 
 
 def written(*paths: Location) -> None:
@@ -66,7 +66,7 @@ def table(*headers: str, title: str = "", caption: str = "", whole: tuple[int, .
         title_style="bold",
         pad_edge=False,
     )
-    wide = console().width >= WIDTH
+    wide = terminal().width >= WIDTH
     for number, header in enumerate(headers):
         begun.add_column(header, overflow="fold", no_wrap=wide and number in whole)
     return begun
@@ -120,8 +120,8 @@ def progress(what: str, *, lines: int = 0, about: str = "") -> Iterator[Callable
         lines: How many lines there are where there is no terminal.
         about: Said before.
     """
-    terminal = console(stderr=True)
-    if not terminal.is_terminal:
+    stderr = terminal(stderr=True)
+    if not stderr.is_terminal:
         last = 0
 
         def tell(done: int, planned: int) -> None:
@@ -135,9 +135,20 @@ def progress(what: str, *, lines: int = 0, about: str = "") -> Iterator[Callable
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     columns = (f"{about}{what}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=terminal, transient=True) as bar:
+    with Progress(*columns, console=stderr, transient=True) as bar:
         row = bar.add_task("", total=None)
         yield lambda done, planned: bar.update(row, completed=done, total=planned)
+
+
+@contextmanager
+def resumable(folder: Location, pattern: str, what: str) -> Iterator[None]:
+    """After Ctrl-C, say how many files of a pattern are safe in a folder; exit with code 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        safe = len(list(folder.glob(pattern)))
+        say(f"interrupted: {safe} {what} are safe in {folder}; the same command resumes")
+        raise typer.Exit(INTERRUPTED) from None
 
 
 def check_writable(path: Location, *, folder: bool) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from scm_world.cli import options
+from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
     load_task,
@@ -20,15 +20,6 @@ from scm_world.cli.arguments import (
     policy_of,
     refused,
     tag,
-)
-from scm_world.cli.console import (
-    INTERRUPTED,
-    console,
-    results_folder,
-    say,
-    show,
-    table,
-    written,
 )
 from scm_world.errors import UnknownOption
 from scm_world.output.locations import Location
@@ -45,13 +36,6 @@ def check_parquet(form: str) -> None:
     if form == "parquet" and find_spec("pyarrow") is None:
         allowed = ("csv", "parquet after: pip install 'scm-world[data]'")
         raise UnknownOption("format", "parquet", allowed)
-
-
-def _interrupted(folder: Location, episodes: int, shard: int) -> typer.Exit:
-    """Print what an interruption has left of episodes in shards."""
-    safe, whole = len(list(folder.glob("shard-*.*"))), -(-episodes // shard)
-    say(f"interrupted: {safe} of {whole} files are safe in {folder}; the same command resumes")
-    return typer.Exit(INTERRUPTED)
 
 
 def collect(
@@ -130,7 +114,7 @@ def collect(
     asked = {name: value for name, value in asked.items() if value}
     with open_system(task, option, backend=backend, preset=preset) as system:
         used = backend_of(system)
-        folder = results_folder(
+        folder = console.results_folder(
             out, f"collect-{design}", tag(task), used, f"seed{seed}", option=option
         )
         if not isinstance(system, SCM):
@@ -141,24 +125,24 @@ def collect(
         if design != "observational":
             patterns = target or cause
             targets = settable(system, patterns) if patterns else default_causes(system)
-        try:
-            with options.open_executor(executor, workers, address, "episodes") as (pool, tell):
-                found = collected(
-                    system,
-                    Design(design, tuple(targets), values, observational_fraction),
-                    n,
-                    seed=seed,
-                    out=folder,
-                    shard=shard,
-                    format=format_,
-                    progress=tell,
-                    engine=pool,
-                    **asked,
-                )
-        except KeyboardInterrupt:
-            raise _interrupted(folder, n, shard) from None
+        with (
+            console.resumable(folder, "shard-*.*", f"of {-(-n // shard)} files"),
+            options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+        ):
+            found = collected(
+                system,
+                Design(design, tuple(targets), values, observational_fraction),
+                n,
+                seed=seed,
+                out=folder,
+                shard=shard,
+                format=format_,
+                progress=tell,
+                engine=pool,
+                **asked,
+            )
     title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
-    made = table("", "episodes", "rows", title=title)
+    made = console.table("", "episodes", "rows", title=title)
     _, first = np.unique(found.episode, return_index=True)
     made.add_row("all", str(len(first)), str(len(found)))
     rows = [found.regimes[number].targets for number in found.regime]
@@ -173,9 +157,9 @@ def collect(
     made.add_row("columns", "", str(len(found.columns)))
     if impossible := found.about.get("refused"):
         made.add_row("refused", str(len(impossible)), f"see {SIDECAR}")
-    console().print(made)
+    console.terminal().print(made)
     shards = list[Location](folder.glob("shard-*.*"))
-    written(folder / SIDECAR, *sorted(shards, key=str)[:1])
+    console.written(folder / SIDECAR, *sorted(shards, key=str)[:1])
 
 
 def sweep(
@@ -230,45 +214,45 @@ def sweep(
         plain.given(held) as world,
     ):
         words = "-".join(("sweep", *grid)).replace(".", "_")
-        folder = results_folder(
+        folder = console.results_folder(
             out, words, tag(task), backend_of(world), f"seed{seed}", option=option
         )
-        try:
-            with options.open_executor(executor, workers, address, "episodes") as (pool, tell):
-                found = swept(
-                    world,
-                    grid,
-                    measured,
-                    n=n,
-                    steps=steps,
-                    policy=policy_of(policy, world),
-                    nature=parse_assignments(nature, "'--nature'"),
-                    seed=seed,
-                    out=folder,
-                    shard=shard,
-                    format=format_,
-                    engine=pool,
-                    progress=tell,
-                )
-        except KeyboardInterrupt:
-            episodes = n * len(points_of(grid, world.model))
-            raise _interrupted(folder, episodes, shard) from None
+        whole = -(-n * len(points_of(grid, world.model)) // shard)
+        with (
+            console.resumable(folder, "shard-*.*", f"of {whole} files"),
+            options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+        ):
+            found = swept(
+                world,
+                grid,
+                measured,
+                n=n,
+                steps=steps,
+                policy=policy_of(policy, world),
+                nature=parse_assignments(nature, "'--nature'"),
+                seed=seed,
+                out=folder,
+                shard=shard,
+                format=format_,
+                engine=pool,
+                progress=tell,
+            )
     rows, names = found.rows(), [column.name for column in found.measured]
     results = {name + end for base in names for name in (base, f"{base}.change") for end in ENDS}
     columns = [key for key in rows[0] if key not in results and key not in ("n", "refused")]
     title = f"Sweep of {tag(task)} on {found.data.about['engine']}, seed {seed}"
-    made = table(*columns, "n", *names, title=f"{title}, with 95 % intervals")
+    made = console.table(*columns, "n", *names, title=f"{title}, with 95 % intervals")
     for row in rows[:POINTS]:
         cells = []
         for name in names:
             ends = (row[name + end] for end in ENDS)
-            mean, low, high = ("-" if number is None else show(number) for number in ends)
+            mean, low, high = ("-" if number is None else console.show(number) for number in ends)
             cells.append(f"{mean} ({low} … {high})")
-        made.add_row(*(show(row[key]) for key in columns), str(row["n"]), *cells)
+        made.add_row(*(console.show(row[key]) for key in columns), str(row["n"]), *cells)
     if len(rows) > POINTS:
         made.caption = f"and {len(rows) - POINTS} more points, see {TABLE}"
-    console().print(made)
-    written(folder / TABLE, folder / SUMMARY)
+    console.terminal().print(made)
+    console.written(folder / TABLE, folder / SUMMARY)
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from scm_world.cli import options
+from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
     load_system,
@@ -22,17 +22,6 @@ from scm_world.cli.arguments import (
     open_system,
     split,
     tag,
-)
-from scm_world.cli.console import (
-    INTERRUPTED,
-    console,
-    facts,
-    progress,
-    results_folder,
-    say,
-    staged,
-    table,
-    written,
 )
 from scm_world.errors import UnknownOption
 from scm_world.output.locations import Location
@@ -156,8 +145,10 @@ def discover(
     settings = {"backend": backend, "preset": preset, "resolution": resolution}
     with open_system(task, option, **settings) as system:
         about = (tag(task), backend_of(system), f"seed{seed}")
-        folder = results_folder(out, "discover", *about, option=(*(option or ()), resolution or ""))
-        with progress("probe states", lines=4) as tell:
+        folder = console.results_folder(
+            out, "discover", *about, option=(*(option or ()), resolution or "")
+        )
+        with console.progress("probe states", lines=4) as tell:
             report = discovered(
                 system,
                 probes=probes,
@@ -167,7 +158,7 @@ def discover(
             )
         names = tuple(system.graph)
     report = replace(report, arguments=tuple(option or ()))
-    terminal = console()
+    terminal = console.terminal()
     terminal.print(_edge_table(report, names))
     used = {name for edge in (*report.found, *report.declared) for name in edge[:2]}
     if lonely := [name for name in names if name not in used]:
@@ -175,13 +166,13 @@ def discover(
 
         terminal.print(Text.assemble(("no edge at all: ", "bold"), ", ".join(by_entity(lonely))))
         terminal.print()
-    terminal.print(facts(_numbers(report)))
-    with staged(folder) as draft:
+    terminal.print(console.facts(_numbers(report)))
+    with console.staged(folder) as draft:
         report.save(draft / "report.json")
         draw_graphs(report, draft / "graphs.png")
-    written(folder / "report.json", folder / "graphs.png")
+    console.written(folder / "report.json", folder / "graphs.png")
     if report.probes < report.planned:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(strict and report.score.shd > 0))
 
 
@@ -189,7 +180,7 @@ def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> Table:
     """Return one row per effect; a long list of causes is written out once."""
     from scm_world.discovery.names import by_entity
 
-    made = table(
+    made = console.table(
         *("effect", "causes at once", "causes one step earlier", "edges"),
         title=f"Recovered graph of {report.task} ({len(report.found)} edges)",
         caption="[+] found but not declared   [-] declared but not found",
@@ -285,41 +276,41 @@ def _benchmark(
     if not all(word.isdecimal() for word in split(budget)):
         raise UnknownOption("budget", budget, ("whole numbers with commas between them",))
     words = [*map(slug, (*problems, *learners)), "" if all(drawn) else view.view]
-    folder = results_folder(out, "benchmark", *words, option=option)
-    try:
-        with options.open_executor(**where, what="runs", lines=10, usual="process") as (pool, tell):
-            result = benchmark(
-                learners,
-                problems,
-                [int(word) for word in split(budget)],
-                seeds,
-                data=split(data),
-                view=view,
-                timeout=timeout or None,
-                out=folder,
-                engine=pool,
-                progress=tell,
-            )
-    except KeyboardInterrupt:
-        done = len(list(folder.glob("runs/*/*.json")))
-        say(f"interrupted: {done} runs are safe in {folder}; the same command resumes")
-        raise typer.Exit(INTERRUPTED) from None
+    folder = console.results_folder(out, "benchmark", *words, option=option)
+    with (
+        console.resumable(folder, "runs/*/*.json", "runs"),
+        options.open_executor(**where, what="runs", lines=10, usual="process") as (pool, tell),
+    ):
+        result = benchmark(
+            learners,
+            problems,
+            [int(word) for word in split(budget)],
+            seeds,
+            data=split(data),
+            view=view,
+            timeout=timeout or None,
+            out=folder,
+            engine=pool,
+            progress=tell,
+        )
     columns = [column for column in COLUMNS if column.key in BRIEF]
     for name, rows in summary(result).items():
         truth = result.problems[name]
         title = f"{truth.name}: {len(truth.names)} variables, {len(truth.edges)} true edges"
-        made = table(*HEADS[1:], *(column.title for column in columns), title=title)
+        made = console.table(*HEADS[1:], *(column.title for column in columns), title=title)
         for row in rows:  # the means over seeds; the ranges are in results.md
             means = (
                 Text(row.text(c).partition(" [")[0], "bold" if c.key in row.best else "")
                 for c in columns
             )
             made.add_row(*row.heads[1:], *means)
-        console().print(made)
+        console.terminal().print(made)
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
-        say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
-    written(*(folder / name for name in ("report.html", "results.md", "results.csv", "budget.png")))
+        console.say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
+    console.written(
+        *(folder / name for name in ("report.html", "results.md", "results.csv", "budget.png"))
+    )
 
 
 def verify(
@@ -354,8 +345,8 @@ def verify(
     first = load_system(*next(iter(systems.items())))
     used = "both" if both else backend or getattr(first, "backend", "equations")
     words = (*(option or ()), resolution or "")
-    folder = results_folder(out, "verify", tag(task), used, f"seed{seed}", option=words)
-    terminal, interrupted = console(), False
+    folder = console.results_folder(out, "verify", tag(task), used, f"seed{seed}", option=words)
+    terminal, interrupted = console.terminal(), False
     found: list[Verification | Agreement] = []
     for name, given in systems.items():
         system = load_system(name, given)
@@ -364,7 +355,7 @@ def verify(
             settings |= {"preset": preset, "resolution": resolution}
         one: Verification | Agreement
         try:
-            with progress("probe states", lines=4, about=f"{tag(name)}: ") as tell:
+            with console.progress("probe states", lines=4, about=f"{tag(name)}: ") as tell:
                 if both and not isinstance(system, SCM):
 
                     def told(_: str, tell: Any = tell) -> Any:
@@ -390,21 +381,21 @@ def verify(
         found.append(one)
         for report in reports:
             terminal.print(Text(f"Verification of {report.task} on {report.backend}", style="bold"))
-            terminal.print(facts(report.rows()), "")
+            terminal.print(console.facts(report.rows()), "")
         if isinstance(one, Agreement):
             title = f"Agreement of {' and '.join(one.backends)} on {one.task}"
             terminal.print(Text(title, style="bold"))
-            terminal.print(facts(one.rows()), "")
+            terminal.print(console.facts(one.rows()), "")
         place = folder / name if every else folder
-        with staged(place) as draft:
+        with console.staged(place) as draft:
             (draft / "report.json").write_text(one.to_json())
             draw_verification(one, draft / "verify.png")
-        written(place / "report.json", place / "verify.png")
+        console.written(place / "report.json", place / "verify.png")
         if one.interrupted:
             interrupted = True
             break
     if len(found) > 1:
-        made = table(
+        made = console.table(
             *("task", "backend", "probe states", "seen", "undeclared", "noise floor", "seconds"),
             "passed",
             title="All verifications",
@@ -428,5 +419,5 @@ def verify(
                 made.add_row(*cells, good[one.passed])
         terminal.print("", made)
     if interrupted:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(not all(one.passed for one in found)))

@@ -11,18 +11,8 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from scm_world.cli import options
+from scm_world.cli import console, options
 from scm_world.cli.arguments import load_task, parse_assignments
-from scm_world.cli.console import (
-    INTERRUPTED,
-    console,
-    progress,
-    results_folder,
-    say,
-    show,
-    table,
-    written,
-)
 from scm_world.cli.datasets import check_parquet
 from scm_world.errors import UnknownOption
 
@@ -118,13 +108,13 @@ def evaluate(
         results = evaluation.Evaluation.load(check)
         wrong = list(false_scores(check, results))
         again = None if policy is None else policies_of(policy)
-        with progress("episodes") as tell:
+        with console.progress("episodes") as tell:
             repeated = evaluation.check(
                 results, episodes=part, policy=again, trusted=tuple(trust or ()), progress=tell
             )
         said = "the same bits in all of them" if repeated else f"{len(repeated.wrong)} differ"
         chosen = f"{repeated.episodes} of {len(results)} episodes, chosen with seed {repeated.seed}"
-        say(*wrong, *repeated.wrong, f"played again: {chosen}: {said}")
+        console.say(*wrong, *repeated.wrong, f"played again: {chosen}: {said}")
         raise typer.Exit(0 if repeated and not wrong else 1)
 
     if policy is None:
@@ -148,33 +138,33 @@ def evaluate(
     settings = {k: WORDS.get(v, v) if isinstance(v, str) else v for k, v in given.items()}
     if option:
         settings["task_options"] = dict(made.given)
-    folder = results_folder(out, "evaluate", *agents, task, option=(*(option or ()), *(env or ())))
-    try:
-        with options.open_executor(executor, workers, address, "episodes") as (pool, tell):
-            found = evaluation.evaluate(
-                agents,
-                protocols,
-                task=task,
-                n=n,
-                seeds=tuple(map(int, words)),
-                backend=backend or made.backend,
-                env=settings,
-                engine=pool,
-                out=folder,
-                progress=tell,
-            )
-    except KeyboardInterrupt:
-        safe = len(list((folder / FOLDER).glob("*.json")))
-        say(f"interrupted: {safe} files are safe in {folder}; the same command resumes")
-        raise typer.Exit(INTERRUPTED) from None
+    folder = console.results_folder(
+        out, "evaluate", *agents, task, option=(*(option or ()), *(env or ()))
+    )
+    with (
+        console.resumable(folder, f"{FOLDER}/*.json", "files"),
+        options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+    ):
+        found = evaluation.evaluate(
+            agents,
+            protocols,
+            task=task,
+            n=n,
+            seeds=tuple(map(int, words)),
+            backend=backend or made.backend,
+            env=settings,
+            engine=pool,
+            out=folder,
+            progress=tell,
+        )
     metric = metric or next(name for name in METRICS if name in found.metrics)
     files = found.save(folder, kind=format_)
-    with progress("control steps") as tell:
+    with console.progress("control steps") as tell:
         more = write_outputs(found, folder, metric=metric, videos=videos, progress=tell)
 
     who = [(agent, engine) for engine in found.engines for agent in found.agents]
     heads = [agent if len(found.engines) == 1 else f"{agent}, {engine}" for agent, engine in who]
-    scores = table(
+    scores = console.table(
         *("protocol", "varied", *map(escape, heads)),
         title=f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals",
         whole=(0,),
@@ -184,16 +174,16 @@ def evaluate(
         cells = (found.score(protocol, metric, agent=agent, engine=name) for agent, name in who)
         varied = docs.get(protocol, "")
         scores.add_row(*(Text(str(cell)) for cell in (protocol, varied, *cells)))
-    console().print(scores)
+    console.terminal().print(scores)
     if len(found.engines) == 2:
         one, other = found.engines
         title = f"{one} minus {other}, the same draws on both"
-        gaps = table("protocol", *map(escape, found.agents), title=title, whole=(0,))
+        gaps = console.table("protocol", *map(escape, found.agents), title=title, whole=(0,))
         for protocol in found.protocols:
             cells = (found.gap(one, other, protocol, metric, agent=name) for name in found.agents)
             gaps.add_row(protocol, *(Text(str(cell)) for cell in cells))
-        console().print(gaps)
-    written(*files, *more)
+        console.terminal().print(gaps)
+    console.written(*files, *more)
 
 
 def policies_of(text: str) -> dict[str, list[str]]:
@@ -288,9 +278,9 @@ def explain(
             title = f"{name}: {agent} on {engine}, {metric.replace('_', ' ')} {score}"
             if not causes.causes:
                 if protocol is not None:
-                    say(title, causes if causes.left_out else "nothing is varied in it")
+                    console.say(title, causes if causes.left_out else "nothing is varied in it")
                 continue
-            made = table(
+            made = console.table(
                 *("variable", "share of variance", "p (Holm)", "upper - lower third"),
                 title=title,
                 whole=(0,),
@@ -303,22 +293,22 @@ def explain(
                 made.add_row(cause.variable, share, f"{cause.p_holm:.3g}", contrast)
             if len(causes.causes) > SHOWN:
                 made.add_row(f"and {len(causes.causes) - SHOWN} more", "", "", "")
-            console().print(made)
+            console.terminal().print(made)
         return
     if protocol is None:
         raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
     asked: dict[str, Any] = {"agent": agent, "engine": engine, "metric": metric, "versus": versus}
-    with progress("counterfactuals") as tell:
+    with console.progress("counterfactuals") as tell:
         reasons = why(found, protocol, episode, **asked, trusted=tuple(trust or ()), progress=tell)
     title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
-    made = table("had it been", "instead of", "score", "success", title=title)
+    made = console.table("had it been", "instead of", "score", "success", title=title)
     for other in reasons.others:
         made.add_row(
-            Text(f"{other.variable} = {show(other.would_be)}"),
-            show(other.was),
+            Text(f"{other.variable} = {console.show(other.would_be)}"),
+            console.show(other.was),
             f"{other.would_score:.3g} ({other.gain:+.3g})",
             "yes" if other.would_succeed else "no",
         )
     for name, reason in reasons.left_out.items():
         made.add_row(Text(name), "", "left out", Text(reason))
-    console().print(made)
+    console.terminal().print(made)

@@ -14,9 +14,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from scm_world.cli import options
+from scm_world.cli import console, options
 from scm_world.cli.arguments import load_system, suffix, tag
-from scm_world.cli.console import PAGE, check_writable, console, say, show, table
 
 if TYPE_CHECKING:
     from scm_world.graph import SCM
@@ -85,7 +84,7 @@ def graph(
     if format_ is Format.PNG and out is None:
         out = Path(f"{tag(task)}{suffix(option or ())}-graph.png")
     if out is not None:
-        check_writable(out, folder=False)
+        console.check_writable(out, folder=False)
     model = _model(task, option, action_mode=action_mode, resolution=resolution)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -97,7 +96,9 @@ def graph(
 
             draw_model(model, out, title=title)
         case Format.TABLE:
-            console(file=None if out is None else page, width=PAGE).print(_parents_table(model))
+            console.terminal(file=None if out is None else page, width=console.PAGE).print(
+                _parents_table(model)
+            )
         case Format.JSON:
             page.write(to_json(model) + "\n")
         case Format.HTML:
@@ -109,7 +110,7 @@ def graph(
         return
     if format_ is not Format.PNG:
         out.write_text(page.getvalue(), encoding="utf-8")
-    say(f"written: {out}", stderr=True)
+    console.say(f"written: {out}", stderr=True)
 
 
 def _parents_table(model: SCM) -> Table:
@@ -117,7 +118,7 @@ def _parents_table(model: SCM) -> Table:
     from scm_world.discovery.names import braces, by_entity
     from scm_world.graph.exchange import space_lines
 
-    made = table(
+    made = console.table(
         *("variable", "kind", "unit", "shape", "default", "A", "B", "parents"),
         title=f"{len(model)} variables, {len(model.edges)} edges",
         whole=(0,),
@@ -135,7 +136,7 @@ def _parents_table(model: SCM) -> Table:
         if given.kind == "measured" and given.start is not None:
             text = "follows lag 0"
         else:
-            text = "" if default is None else show(default)
+            text = "" if default is None else console.show(default)
         cells = (
             given.kind if given.kind == variable.role else f"{given.kind}\n{variable.role}",
             variable.unit,
@@ -178,10 +179,10 @@ def variables(
         typer.echo(variables_page(), nl=False)
         return
     for title, rows in _sections(tuple(TASKS) if task == "all" else (task,), option):
-        made = table(*HEADINGS[:5], "A", "B", title=title)
+        made = console.table(*HEADINGS[:5], "A", "B", title=title)
         for name, unit, shape, role, default, _, a, b, *_ in rows:
             made.add_row(Text(name), unit, shape, role, default, a, b)
-        console().print(made)
+        console.terminal().print(made)
 
 
 def variables_page() -> str:
@@ -289,13 +290,13 @@ def list_(
     from scm_world.tasks.trifinger.presets import PRESETS
 
     if zoo:
-        made = table("name", "task", "seed", "scores", "command", title="trained policies")
+        made = console.table("name", "task", "seed", "scores", "command", title="trained policies")
         for name, about in policies.zoo().items():
             seed, command = about.card.get("seed", ""), about.card.get("command", "")
             cells = (name, about.task, seed, policies.best_known(about), command)
             made.add_row(*(Text(str(cell)) for cell in cells))
         nothing = "there are no trained policies in this installation"
-        console().print(made if made.row_count else nothing)
+        console.terminal().print(made if made.row_count else nothing)
         return
 
     def first_line(text: str | None) -> str:
@@ -335,11 +336,11 @@ def list_(
         "families": {f"{name}:N": first_line(draw.__doc__) for name, draw in FAMILIES.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }
-    shown = table("", "name", "")
+    shown = console.table("", "name", "")
     shown.show_header = False
     for title, rows in sections.items():
         for number, (name, about) in enumerate(rows.items()):
             cell = about if isinstance(about, Text) else Text(about)
             shown.add_row(Text("" if number else title, style="bold"), name, cell)
         shown.add_section()
-    console().print(shown)
+    console.terminal().print(shown)

@@ -12,7 +12,7 @@ import numpy as np
 import typer
 from rich.text import Text
 
-from scm_world.cli import options
+from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
     load_task,
@@ -21,18 +21,6 @@ from scm_world.cli.arguments import (
     parse_outcome,
     policy_of,
     tag,
-)
-from scm_world.cli.console import (
-    PAGE,
-    console,
-    progress,
-    results_folder,
-    say,
-    show,
-    staged,
-    table,
-    write_json,
-    written,
 )
 from scm_world.errors import UnknownOption
 
@@ -76,7 +64,7 @@ def do(
     request = parse_assignments(assignments)
     with World(load_task(task, option), backend=backend, preset=preset) as world:
         used = backend_of(world)
-        folder = results_folder(out, "do", tag(task), used, f"seed{seed}", option=option)
+        folder = console.results_folder(out, "do", tag(task), used, f"seed{seed}", option=option)
         world.reset(seed=seed)
         start, before, scenes = world.snapshot(), world.values(), [world.scene()]
         action = world.task.idle(world)
@@ -146,29 +134,29 @@ def do(
         "moved_without_a_path": astray,
         "versions": versions(engine),
     }
-    with staged(folder) as draft:
+    with console.staged(folder) as draft:
         shown = _pictures(scenes)
         if shown:
             _write_pictures(
                 draft, dict(zip(PICTURES, ([shown[0]], [shown[1]], shown), strict=True))
             )
-        write_json(draft / "result.json", result)
+        console.write_json(draft / "result.json", result)
 
-    terminal = console(width=PAGE)
+    terminal = console.terminal(width=console.PAGE)
     title = f"do() in {tag(task)} on {engine}, seed {seed}"
-    made = table("target", "requested", "applied", "backend reports", title=title)
+    made = console.table("target", "requested", "applied", "backend reports", title=title)
     for name, entry in audit.targets.items():
         match entry.requested:
             case Shift() | Scale():
-                words = f"{entry.requested.kind} by {show(entry.requested.by)}"
+                words = f"{entry.requested.kind} by {console.show(entry.requested.by)}"
             case Draw():
                 words = f"draw from {entry.requested.source}"
             case Hard():
-                words = show(entry.requested.value)
+                words = console.show(entry.requested.value)
             case _:
-                words = show(entry.requested)
-        applied = "at every step" if entry.applied is None else show(entry.applied)
-        back = "-" if entry.read_back is None else show(entry.read_back)
+                words = console.show(entry.requested)
+        applied = "at every step" if entry.applied is None else console.show(entry.applied)
+        back = "-" if entry.read_back is None else console.show(entry.read_back)
         made.add_row(Text(name, style="bold"), words, applied, back)
     terminal.print(made)
     for label, pairs in (
@@ -176,13 +164,13 @@ def do(
         ("backend, inertia [kg m²]", audit.engine),
     ):
         for name, (old, new) in pairs.items():
-            change = f"{show(old, per_line=9)} -> {show(new, per_line=9)}"
+            change = f"{console.show(old, per_line=9)} -> {console.show(new, per_line=9)}"
             terminal.print(Text.assemble((f"{label}: ", "bold"), f"{name} {change}"))
     for label, names in (("new", audit.came), ("gone", audit.went)):
         if names:
             terminal.print(Text.assemble((f"{label}: ", "bold"), ", ".join(names)))
     terminal.print()
-    made = table(
+    made = console.table(
         *("descendant", "unit", "before", "right after", f"after {steps} steps"),
         *("without the do()", "difference"),
         title="What followed",
@@ -196,10 +184,10 @@ def do(
             made.add_row(
                 Text(name, style="bold"),
                 Text(row["unit"]),
-                show(row["before"]),
-                SAME if same else show(row["at_once"]),
-                show(row["after"]),
-                SAME if alike else show(row["without"]),
+                console.show(row["before"]),
+                SAME if same else console.show(row["at_once"]),
+                console.show(row["after"]),
+                SAME if alike else console.show(row["without"]),
                 Text(f"{row['difference']:.3g}", style="bold" if row["difference"] else "dim"),
             )
     terminal.print(made)
@@ -213,7 +201,7 @@ def do(
         wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
         terminal.print(Text(f"{wrong} The graph is wrong.", style="bold white on red"))
     there = [name for name in PICTURES if (folder / name).exists()]
-    written(*(folder / name for name in (*there, "result.json")))
+    console.written(*(folder / name for name in (*there, "result.json")))
     raise typer.Exit(int(bool(astray)))
 
 
@@ -270,8 +258,10 @@ def effect(
     measured = parse_outcome(outcome, how)
     with open_system(task, option, backend=backend, preset=preset) as system:
         used = backend_of(system)
-        folder = results_folder(out, "effect", tag(task), used, f"seed{seed}", option=option)
-        with progress("episodes") as tell:
+        folder = console.results_folder(
+            out, "effect", tag(task), used, f"seed{seed}", option=option
+        )
+        with console.progress("episodes") as tell:
             found = system.effect(
                 measured,
                 do=request,
@@ -284,20 +274,24 @@ def effect(
                 seed=seed,
                 policy=policy_of(policy, system),
             )
-    made = table(
+    made = console.table(
         *("", "mean", "95 % interval"),
         title=f"{found.outcome}, {tag(task)} on {found.engine}, seed {seed}",
     )
-    made.add_row("effect", show(found.mean), f"{show(found.low)} … {show(found.high)}")
-    made.add_row("with it", show(found.treated), "")
-    made.add_row("without", show(found.control), "")
+    made.add_row(
+        "effect",
+        console.show(found.mean),
+        f"{console.show(found.low)} … {console.show(found.high)}",
+    )
+    made.add_row("with it", console.show(found.treated), "")
+    made.add_row("without", console.show(found.control), "")
     made.add_row("episodes", str(found.rollouts), "paired" if found.paired else "unpaired")
     if found.paired:
-        made.add_row("variance unpaired : paired", show(found.variance_ratio), "")
-    console().print(made)
-    with staged(folder) as draft:
+        made.add_row("variance unpaired : paired", console.show(found.variance_ratio), "")
+    console.terminal().print(made)
+    with console.staged(folder) as draft:
         (draft / "effect.json").write_text(found.to_json() + "\n")
-    written(folder / "effect.json")
+    console.written(folder / "effect.json")
 
 
 def counterfactual(
@@ -322,27 +316,29 @@ def counterfactual(
     request = parse_assignments(assignments)
     with open_system(task, option, backend=backend, preset=preset) as system:
         used = backend_of(system)
-        folder = results_folder(
+        folder = console.results_folder(
             out, "counterfactual", tag(task), used, f"seed{seed}", option=option
         )
         acts, length = policy_of(policy, system), steps if system.graph.is_temporal else 0
         episode = system.rollout(acts, seed=seed, steps=length)
         other = episode.counterfactual(request, at=at)
         apart = compare(episode, other)
-    made = table(
+    made = console.table(
         *("variable", "differs from", "most, and when", "at the end"),
         title=f"{tag(task)} on {used}, seed {seed}: intervention at control step {at}",
     )
     for name, found in apart.variables.items():
-        most = f"{show(found.largest)} at {found.at}"
-        made.add_row(name, str(found.first), most, show(np.abs(found.final).max(initial=0.0)))
+        most = f"{console.show(found.largest)} at {found.at}"
+        made.add_row(
+            name, str(found.first), most, console.show(np.abs(found.final).max(initial=0.0))
+        )
     if not apart.variables:
         made.add_row("nothing", "", "", "")
-    console().print(made)
+    console.terminal().print(made)
     if apart.contacts:
         step, pair, which = apart.contacts[0]
         episode_name = ("the factual", "the counterfactual")[which]
-        say(
+        console.say(
             f"{len(apart.contacts)} contacts in one of the two only, first {pair[0]} and {pair[1]} "
             f"at {step}, in {episode_name} episode"
         )
@@ -364,13 +360,13 @@ def counterfactual(
             for name, which in apart.noise
         ],
     }
-    with staged(folder) as draft:
+    with console.staged(folder) as draft:
         if not isinstance(system, SCM):
             save_episode(episode, draft / "episode.npz")
             save_episode(other, draft / "counterfactual.npz")
-        write_json(draft / "difference.json", result)
+        console.write_json(draft / "difference.json", result)
         names = [name for name in ("episode.npz", "counterfactual.npz") if (draft / name).exists()]
-    written(*(folder / name for name in (*names, "difference.json")))
+    console.written(*(folder / name for name in (*names, "difference.json")))
 
 
 def plan(
@@ -438,10 +434,10 @@ def plan(
     milliseconds: list[float] = []
     with World(load_task(task, option), backend=backend, preset=preset) as world:
         used, engine = backend_of(world), world.engine
-        folder = results_folder(out, "plan", tag(task), used, f"seed{seed}", option=option)
+        folder = console.results_folder(out, "plan", tag(task), used, f"seed{seed}", option=option)
         length = steps or world.max_episode_length
         names = [n for n in ("fractional_success", "success", "reward") if n in world.model]
-        with progress("control steps") as tell:
+        with console.progress("control steps") as tell:
 
             def act(seen: Any) -> Any:
                 if seen.index in {0, length // 2, length - 1}:
@@ -465,12 +461,12 @@ def plan(
         found["return"] = float(values["reward"][1:].sum())
     found["time per action, median [ms]"] = float(np.median(milliseconds))
     found["time per action, mean [ms]"] = float(np.mean(milliseconds))
-    made = table("what", "value", title=f"{tag(task)} on {engine}, seed {seed}, planned")
+    made = console.table("what", "value", title=f"{tag(task)} on {engine}, seed {seed}, planned")
     for name, number in found.items():
-        made.add_row(Text(name), show(number))  # not markup: there are brackets in it
+        made.add_row(Text(name), console.show(number))  # not markup: there are brackets in it
     for name, value in believed.items():
         made.add_row(f"in the planner's model: {name}", Text(str(value)))
-    console().print(made)
+    console.terminal().print(made)
     result = {
         "format": "scm_world/planned/1",
         "task": task,
@@ -486,10 +482,10 @@ def plan(
         "found": found,
         "versions": versions(engine),
     }
-    with staged(folder) as draft:
+    with console.staged(folder) as draft:
         save_episode(episode, draft / "episode.npz")
         if shown := _pictures(scenes):
             _write_pictures(draft, {"scenes.png": shown})
-        write_json(draft / "result.json", result)
+        console.write_json(draft / "result.json", result)
         files = sorted(path.name for path in draft.iterdir())
-    written(*(folder / name for name in files))
+    console.written(*(folder / name for name in files))

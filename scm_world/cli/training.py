@@ -11,9 +11,8 @@ from typing import Annotated, Any
 import typer
 from rich.text import Text
 
-from scm_world.cli import options
+from scm_world.cli import console, options
 from scm_world.cli.arguments import load_task, parse_assignments, parse_json, split, tag
-from scm_world.cli.console import INTERRUPTED, console, progress, results_folder, say, table
 from scm_world.errors import ConflictingTargets, UnknownOption
 
 OF_TASK = "what works for the task"
@@ -105,7 +104,7 @@ def train(
     from scm_world.training import loop
 
     used = backend or load_task(task).backend
-    folder: Any = results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
+    folder: Any = console.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
     if not quiet:
         _about(
             f"Training {made.algo.upper()} on {made.task}",
@@ -120,26 +119,21 @@ def train(
                 "folder": folder,
             },
         )
-    try:
-        with nullcontext() if quiet else progress("steps", lines=10) as tell:
-            found = loop.train(
-                made,
-                out=folder,
-                seed=seed,
-                backend=used,
-                start=start,
-                device=device,
-                threads=threads,
-                progress=tell,
-                tell=None if quiet else partial(say, stderr=True),
-            )
-    except KeyboardInterrupt:
-        safe = max((int(path.stem) for path in folder.glob("checkpoints/*.pt")), default=None)
-        kept = "nothing was kept yet" if safe is None else f"{safe:,} steps are safe in {folder}"
-        say(f"interrupted: {kept}; the same command resumes")
-        raise typer.Exit(INTERRUPTED) from None
+    bar = nullcontext() if quiet else console.progress("steps", lines=10)
+    with console.resumable(folder, "checkpoints/*.pt", "checkpoints"), bar as tell:
+        found = loop.train(
+            made,
+            out=folder,
+            seed=seed,
+            backend=used,
+            start=start,
+            device=device,
+            threads=threads,
+            progress=tell,
+            tell=None if quiet else partial(console.say, stderr=True),
+        )
     score = "" if found.score is None else f", {found.score:.3f} in the evaluations while training"
-    say(
+    console.say(
         f"policy:   {found.policy} after {found.steps:,} steps",
         f"best:     {found.best}{score}",
         f"evaluate: scm-world evaluate {found.best} {made.task}",
@@ -147,7 +141,7 @@ def train(
     if onnx:
         from scm_world.training.onnx import to_onnx
 
-        say(f"ONNX:     {to_onnx(found.best, found.best.with_suffix('.onnx'))}")
+        console.say(f"ONNX:     {to_onnx(found.best, found.best.with_suffix('.onnx'))}")
 
 
 def clone(
@@ -209,7 +203,7 @@ def clone(
         raise UnknownOption("--from", source, (*NAMED, "a recording or a folder of some"))
     used = backend or load_task(task).backend
     teacher = made.teacher if path is None else path.stem
-    folder: Any = results_folder(out, "clone", tag(made.task), teacher, seed)
+    folder: Any = console.results_folder(out, "clone", tag(made.task), teacher, seed)
     if not quiet:
         rows = {"from": source or made.teacher}
         if path is None:
@@ -218,22 +212,19 @@ def clone(
             rows["rounds"] = f"{made.rounds} more, of {made.more} episodes"
         rows |= {"observations": made.observations, "seed": str(seed), "folder": str(folder)}
         _about(f"Learning {made.task} by imitation", rows)
-    try:
-        with nullcontext() if quiet else progress("episodes") as tell:
-            found = imitation.clone(
-                path,
-                made,
-                out=folder,
-                seed=seed,
-                backend=used,
-                progress=tell,
-                tell=None if quiet else partial(say, stderr=True),
-            )
-    except KeyboardInterrupt:
-        say(f"interrupted: finished episodes are safe in {folder}; the same command resumes")
-        raise typer.Exit(INTERRUPTED) from None
+    bar = nullcontext() if quiet else console.progress("episodes")
+    with console.resumable(folder, "demonstrations/*.npz", "files of episodes"), bar as tell:
+        found = imitation.clone(
+            path,
+            made,
+            out=folder,
+            seed=seed,
+            backend=used,
+            progress=tell,
+            tell=None if quiet else partial(console.say, stderr=True),
+        )
     score = "" if found.score is None else f", {found.score:.3f} in the evaluations between rounds"
-    say(
+    console.say(
         f"policy:   {found.policy}",
         f"best:     {found.best}{score}",
         f"evaluate: scm-world evaluate {found.best} {task}",
@@ -243,7 +234,7 @@ def clone(
     same = all(usual.options.get(k) == learned.options.get(k) for k in (*FORM, *COMMON))
     if same and usual.network.activation == learned.network.activation:
         more = "" if observations is None else f" --observations {observations}"
-        say(f"go on:    scm-world train {task}{more} --start {found.best}")
+        console.say(f"go on:    scm-world train {task}{more} --start {found.best}")
 
 
 def _fields(changes: list[str] | None, **given: Any) -> dict[str, Any]:
@@ -262,8 +253,8 @@ def _fields(changes: list[str] | None, **given: Any) -> dict[str, Any]:
 
 def _about(title: str, rows: dict[str, Any]) -> None:
     """Print what will be done."""
-    shown = table("", "", title=title)
+    shown = console.table("", "", title=title)
     shown.show_header = False
     for name, value in rows.items():
         shown.add_row(name, Text(str(value)))
-    console().print(shown)
+    console.terminal().print(shown)

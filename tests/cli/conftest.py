@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,3 +16,16 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path])
     for name in ("FORCE_COLOR", "COLUMNS", "TTY_COMPATIBLE", "GITHUB_ACTIONS"):
         monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw nothing, where a test is about something else."""
+    from scm_world.discovery import plots
+    from scm_world.evaluation import reporting
+
+    def nothing(*_: Any, **__: Any) -> tuple[()]:
+        return ()
+
+    monkeypatch.setattr(plots, "draw_graphs", nothing)
+    monkeypatch.setattr(reporting, "write_outputs", nothing)

@@ -79,15 +79,19 @@ def test_discover_writes_a_report_and_a_picture() -> None:
     assert imread("here/graphs.png").shape[1] == 1600
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_missing_edges_are_marked_and_strict_fails() -> None:
     """Without physics edges are missing: each has a symbol, and --strict exits 1."""
-    result = call("discover", "reaching", "--backend", "fake", "--probes", "1", "--strict")
+    given = ("--backend", "fake", "--probes", "1", "--option", "default_goal_60=0,0,0.2")
+    result = call("discover", "reaching", *given, "--strict")
 
     assert result.exit_code == 1
     assert "[-]robot_height" in result.stdout
-    folder = "scm-world-results/discover-reaching-fake-seed0"
+    folder = "scm-world-results/discover-reaching-fake-seed0-default_goal_60=0_0_0.2"
     assert f"{folder}/report.json" in result.stdout
-    assert read(f"{folder}/report.json")["shd"] > 0
+    report = read(f"{folder}/report.json")
+    assert report["shd"] > 0
+    assert report["arguments"] == ["default_goal_60=0,0,0.2"]
     assert not CONTROL.search(result.output)
     assert "…" not in result.output
 
@@ -156,10 +160,11 @@ def test_graph_goes_to_a_file(form: str) -> None:
 
 def test_graph_as_picture_has_a_default_name() -> None:
     """The picture of the declared graph is a PNG 1600 pixels wide."""
-    result = call("graph", "reaching", "--format", "png")
+    Path("chain.py").write_text(CHAIN)
+    result = call("graph", "chain.py:chain", "--format", "png")
 
     assert result.exit_code == 0, result.output
-    assert imread("reaching-graph.png").shape[1] == 1600
+    assert imread("chain-chain-graph.png").shape[1] == 1600
 
 
 # --- do ------------------------------------------------------------------------------------------

@@ -79,6 +79,7 @@ def test_evaluate_writes_everything_and_prints_a_table() -> None:
     assert all(name in " ".join(done.stdout.split()) for name in names - {"parts"})
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_two_engines_show_the_gap() -> None:
     """A second table has one minus the other."""
     done = call("evaluate", "still", "--protocols=P8", "-n1", *QUICK, "--backend=fake,mujoco")
@@ -86,6 +87,7 @@ def test_two_engines_show_the_gap() -> None:
     assert "fake minus mujoco, the same draws on both" in " ".join(done.stdout.split())
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_a_policy_beside_where_it_is_called(tmp_path: Path) -> None:
     """``module:function`` is found in the present folder, and again for the check."""
     Path("policies_of_a_test.py").write_text("def lazy(observation):\n    return [0.0] * 9\n")
@@ -198,6 +200,7 @@ def test_what_is_wrong_is_told(
     assert not [path for path in tmp_path.rglob("*.json") if saved not in path.parents]
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_ctrl_c_keeps_what_is_finished(
     results: Evaluation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -244,6 +247,7 @@ def test_list_shows_protocols() -> None:
         assert protocol.doc in done.stdout
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_the_file_of_a_policy_says_the_task_and_the_environment(tmp_path: Path) -> None:
     """The task need not be typed; an option that contradicts the file is refused."""
     layers = {

@@ -27,6 +27,7 @@ def call(*arguments: str) -> Result:
     return CliRunner().invoke(app, [*arguments])
 
 
+@pytest.mark.usefixtures("_undrawn")
 @pytest.mark.parametrize("command", ["collect", "evaluate", "sweep"])
 def test_commands_say_where_they_run(command: str) -> None:
     """In a line, with the executor that was asked for."""

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 import typer
-from matplotlib.image import imread
 from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
-from scm_world.cli.arguments import load_task, suffix
+from scm_world.cli.arguments import load_task
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.evaluation import Evaluation
 from scm_world.graph import from_json
@@ -41,20 +40,6 @@ def make():
 def call(*arguments: str) -> Result:
     """Run a command in this process."""
     return CliRunner().invoke(app, [*arguments])
-
-
-def test_a_variant_is_discovered_in_a_folder_of_its_own() -> None:
-    """The folder is named after the options, and the report has them and the variant's edges."""
-    done = call("discover", "general", *SMALL, "--backend", "fake", "--probes", "1")
-
-    assert done.exit_code == 0, done.output
-    folder = Path("scm-world-results/discover-general-fake-seed0-nums_objects=2")
-    report = json.loads((folder / "report.json").read_text())
-    assert (report["task"], report["arguments"]) == ("general", ["nums_objects=2"])
-    small = load_task("general", ["nums_objects=2"])
-    assert len(report["declared"]) == len(World(small, backend="fake").model.edges)
-    assert imread(folder / "graphs.png").shape[:2] == (900, 1600)
-    assert suffix(()) == ""
 
 
 def test_graph_and_variables_take_options() -> None:
@@ -105,6 +90,7 @@ def test_a_factory_that_fails_is_named(text: str, message: str) -> None:
     assert "Traceback" not in result.output
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_a_step_function_needs_no_backend() -> None:
     """Its own backend is the default, also of an evaluation."""
     Path("own.py").write_text(STEP)
