@@ -13,7 +13,7 @@ from scm_world.tasks import ModelTask, Task, make_task
 
 MODEL_ID = "scm_world/Model-v0"
 
-OF_TASK = ("name", *(name for name in ModelTask.__annotations__ if name != "model"))
+OF_TASK = ModelTask.options()
 """Options of a model; where the environment has one of the same name, the model's is meant."""
 
 OF_ENV = tuple(name for name in signature(ScmWorldEnv).parameters if name != "task")

@@ -78,7 +78,56 @@ class ModelComposition(Composition):
         return self._model.layout.slices
 
 
-class ModelTask(Task):
+class DeclaredTask(Task):
+    """What tasks of any model and of any step function have in common: what counts in them.
+
+    Every argument can also be an attribute of a class of your own.
+
+    Args:
+        kind: Whose options there are besides those of this class.
+        settings: Values of options.
+
+    Raises:
+        UnknownOption: An argument does not exist.
+    """
+
+    system: Any
+
+    outcomes: Iterable[Any] = ()
+    reward: Any = None
+    success: Any = None
+    terminated: Any = None
+    start: Mapping[str, Any] = {}  # a constant
+    observe: Iterable[str] | None = None
+
+    def __init__(self, kind: type[DeclaredTask], settings: Mapping[str, Any]) -> None:
+        allowed = kind.options()
+        for option, value in settings.items():
+            if option not in allowed:
+                raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
+            if value is not None:
+                setattr(self, option, value)
+        self.weights = {REWARD: 1.0} if self.reward is not None else {}
+
+    @classmethod
+    def options(cls) -> tuple[str, ...]:
+        """Name the options, without the first argument."""
+        _, *own = cls.__annotations__
+        _, *shared = DeclaredTask.__annotations__
+        return (*own, *shared, "name")
+
+    def counted(self) -> list[Variable]:
+        """Declare reward, success and the end, as far as they are given."""
+        given = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
+        return [declared(name, one) for name, one in given.items() if one is not None]
+
+    def observed(self) -> Iterable[Observed]:
+        """List what a policy observes."""
+        names = self.system.layout.names if self.observe is None else tuple(self.observe)
+        return [Observed(name, (-np.inf, np.inf)) for name in names]
+
+
+class ModelTask(DeclaredTask):
     """A model from a file, and what counts in it.
 
     Every argument can also be an attribute of a class of your own, so that a task is a short
@@ -132,24 +181,13 @@ class ModelTask(Task):
     expose: Iterable[str] | str | None = None
     spaces: Mapping[str, Mapping[str, Any]] = {}  # a constant
     ties: Iterable[Variable] = ()
-    outcomes: Iterable[str | Measured] = ()
-    reward: Any = None
-    success: Any = None
-    terminated: Any = None
-    start: Mapping[str, Any] = {}  # a constant
-    observe: Iterable[str] | None = None
     seconds: float = 10.0
     control_dt: float | None = None
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
     fixed_base: bool = True
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
-        allowed = [n for n in ModelTask.__annotations__ if n != "model"] + ["name"]
-        for option, value in settings.items():
-            if option not in allowed:
-                raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
-            if value is not None:
-                setattr(self, option, value)
+        super().__init__(ModelTask, settings)
         self._check_options()
         source = self.model if model is None else model
         if source is None:
@@ -162,7 +200,6 @@ class ModelTask(Task):
         self.time_unit = self.system.timestep
         self.frame_skip = self._steps()
         self._check_names()
-        self.weights = {REWARD: 1.0} if self.reward is not None else {}
 
     def _check_options(self) -> None:
         """Check what was given as lists and dictionaries; a text alone is a list of one."""
@@ -257,14 +294,9 @@ class ModelTask(Task):
         clock = next(iter(Clock(timing.steps, timing.control_period).variables()))
         readouts = [_readout(row) for row in system.readouts]
         own = [one for one in self.outcomes if not isinstance(one, str)]
-        counted = [
-            declared(name, getattr(self, name))
-            for name in (REWARD, SUCCESS, TERMINATED)
-            if getattr(self, name) is not None
-        ]
         variables = [
             *ties.values(), *parameters, *actions, *together, *states, clock, *readouts, *own,
-            *counted,
+            *self.counted(),
         ]  # fmt: skip
         check_observed(self.observe, variables)
         return ModelComposition(system), variables
@@ -327,12 +359,6 @@ class ModelTask(Task):
             settable_state=True,
         )
         return beginning(state, self.start.get(row.name))
-
-    def observed(self) -> Iterable[Observed]:
-        """List what a policy observes."""
-        names = self.system.layout.names if self.observe is None else tuple(self.observe)
-        for name in names:
-            yield Observed(name, (-np.inf, np.inf))
 
 
 def _causes(model: Model) -> list[tuple[Parent, ...]]:

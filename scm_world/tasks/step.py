@@ -13,18 +13,9 @@ from scm_world.backends.step import Quantity, StepModel
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
-from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Clock, Commands, Composition
-from scm_world.tasks.model import (
-    REWARD,
-    TERMINATED,
-    _numbers,
-    beginning,
-    check_observed,
-    declared,
-)
-from scm_world.tasks.observed import Observed
-from scm_world.tasks.rewards import SUCCESS
+from scm_world.tasks.model import DeclaredTask, _numbers, beginning, check_observed
 from scm_world.variables import (
     Action,
     Box,
@@ -93,7 +84,7 @@ class StepComposition(Composition):
         return self._system.layout.slices
 
 
-class StepTask(Task):
+class StepTask(DeclaredTask):
     """A system that a function moves, and what counts in it.
 
     Every argument can also be an attribute of a class of your own::
@@ -148,23 +139,12 @@ class StepTask(Task):
     actions: Iterable[Action] = ()
     control_dt: float = 0.1
     noise: Mapping[str, Distribution] = {}  # a constant
-    outcomes: Iterable[Variable] = ()
-    reward: Any = None
-    success: Any = None
-    terminated: Any = None
-    start: Mapping[str, Any] = {}  # a constant
-    observe: Iterable[str] | None = None
     seconds: float = None  # type: ignore[assignment] # a property of the base; filled in below
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
     def __init__(self, step: Callable[..., Any] | None = None, **settings: Any) -> None:
-        allowed = [name for name in StepTask.__annotations__ if name != "step"] + ["name"]
-        for option, value in settings.items():
-            if option not in allowed:
-                raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
-            if value is not None:
-                setattr(self, option, value)
+        super().__init__(StepTask, settings)
         function = type(self).step if step is None else step
         self.parameters, self.actions = tuple(self.parameters), tuple(self.actions)
         self.states, self.outcomes = tuple(self.states), tuple(self.outcomes)
@@ -178,7 +158,6 @@ class StepTask(Task):
         shapes = {name: shapes.get(name, _shape(given)) for name, given in self.noise.items()}
         self._drawn = ProcessNoise(self.noise, shapes) if self.noise else None
         self.generated_graph = any(not _lagged(state) for state in self.states)
-        self.weights = {REWARD: 1.0} if self.reward is not None else {}
         self.system = StepModel(
             self.name,
             function,  # type: ignore[arg-type] # it is callable, see above
@@ -283,14 +262,9 @@ class StepTask(Task):
         clock: Variable = next(iter(Clock(timing.steps, timing.control_period).variables()))
         if self._drawn is not None:  # noise goes by the control step: setting that is no cause
             clock = clock.model_copy(update={"settable_state": False, "parents": ()})
-        counted = [
-            declared(name, getattr(self, name))
-            for name in (REWARD, SUCCESS, TERMINATED)
-            if getattr(self, name) is not None
-        ]
         composition = StepComposition(self.system, self._drawn)
         variables = [
-            *self.parameters, *self.actions, *states, clock, *self.outcomes, *counted,
+            *self.parameters, *self.actions, *states, clock, *self.outcomes, *self.counted(),
         ]  # fmt: skip
         check_observed(self.observe, variables)
         return composition, variables
@@ -304,11 +278,6 @@ class StepTask(Task):
         default = _numbers(state.name, 0.0 if state.default is None else state.default, state.shape)
         fields = {"parents": causes, "settable_state": True, "default": default}
         return beginning(state.model_copy(update=fields), self.start.get(state.name))
-
-    def observed(self) -> Iterable[Observed]:
-        """List what a policy observes."""
-        names = self.system.layout.names if self.observe is None else tuple(self.observe)
-        return [Observed(name, (-np.inf, np.inf)) for name in names]
 
 
 def _lagged(state: Measured) -> tuple[Parent, ...]:
