@@ -14,7 +14,7 @@ from scm_world._types import Values
 from scm_world.env.bounds import bounds, spread
 from scm_world.env.goals import Goals
 from scm_world.env.keypoints import CORNERS, KEYPOINTS, Keypoints
-from scm_world.env.vector import Layouts, Part, Vector
+from scm_world.env.vector import Layouts, ObservedPart, Vector
 from scm_world.errors import UnknownOption
 from scm_world.models.camera import Camera
 from scm_world.tasks import TIME, Observed
@@ -82,7 +82,7 @@ class Observing:
 
 
 @final
-class Together:
+class DictObserver:
     """Several observations in a dictionary.
 
     Args:
@@ -137,7 +137,7 @@ def observer(
         about = _quiet(_parts(world, declaration, context(declaration)))
         parts["context"] = Vector(world, declaration, about, normalize=how.normalize)
     return (
-        Together(world, parts, goals if how.goals else None)
+        DictObserver(world, parts, goals if how.goals else None)
         if len(parts) > 1 or how.goals
         else main
     )
@@ -167,14 +167,14 @@ def _vector(world: World, declaration: CompiledTask, how: Observing) -> Vector:
     parts = _parts(world, declaration, names)
     corners = _keypoints(declaration) if how.keypoints else None
     if corners is not None:
-        parts.append(Part(KEYPOINTS, -np.ones(corners.size), np.ones(corners.size)))  # [m]
+        parts.append(ObservedPart(KEYPOINTS, -np.ones(corners.size), np.ones(corners.size)))  # [m]
     if how.context == "observation":
         rest = [name for name in context(declaration) if name not in names]
         parts += _quiet(_parts(world, declaration, rest))
     return Vector(world, declaration, parts, normalize=how.normalize, keypoints=corners)
 
 
-def _parts(world: World, declaration: CompiledTask, names: Iterable[str]) -> list[Part]:
+def _parts(world: World, declaration: CompiledTask, names: Iterable[str]) -> list[ObservedPart]:
     """Give variables the bounds of the structured observation, or those they declare.
 
     States of a model scale by the bounds they declare, and do not saturate: joint limits are soft.
@@ -193,11 +193,11 @@ def _parts(world: World, declaration: CompiledTask, names: Iterable[str]) -> lis
             low, high = (spread(side, shape) for side in observed.published)
         elif observed is not None and observed.low is not None:
             low, high = spread(observed.low, shape), spread(observed.high, shape)
-        parts.append(Part(name, low, high, saturates=saturates))
+        parts.append(ObservedPart(name, low, high, saturates=saturates))
     return parts
 
 
-def _quiet(parts: Iterable[Part]) -> list[Part]:
+def _quiet(parts: Iterable[ObservedPart]) -> list[ObservedPart]:
     return [replace(part, sensed=False) for part in parts]
 
 

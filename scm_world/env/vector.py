@@ -33,7 +33,7 @@ STREAM = "observation"
 
 @final
 @dataclass(frozen=True)
-class Part:
+class ObservedPart:
     """Some numbers of an observation that belong together.
 
     Attributes:
@@ -72,7 +72,7 @@ class Vector:
         self,
         world: World,
         declaration: CompiledTask,
-        parts: Sequence[Part],
+        parts: Sequence[ObservedPart],
         *,
         normalize: bool,
         keypoints: Keypoints | None = None,
@@ -160,7 +160,7 @@ def box(low: Floats, high: Floats) -> gymnasium.Space[NDArray[np.float32]]:
     return gymnasium.spaces.Box(*bounds, dtype=np.float32)
 
 
-def _places(parts: Sequence[Part]) -> dict[str, slice]:
+def _places(parts: Sequence[ObservedPart]) -> dict[str, slice]:
     ends = np.cumsum([part.low.size for part in parts])
     pairs = zip(parts, ends, strict=True)
     return {part.name: slice(int(end) - part.low.size, int(end)) for part, end in pairs}

@@ -19,7 +19,7 @@ from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.setups import Place, Setup
+from scm_world.evaluation.setups import EvaluationPlace, Setup
 from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -91,7 +91,7 @@ def shard_runner_of(
 
 def _place(
     about: Mapping[str, Any], task: Task | str | None, trusted: Sequence[str], *, known: bool
-) -> Place:
+) -> EvaluationPlace:
     """Make the task and the options of the environment again.
 
     Args:
@@ -106,7 +106,7 @@ def _place(
     """
     options = _acts(about["env"], trusted)
     if task is not None:
-        place = Place(task, options)
+        place = EvaluationPlace(task, options)
         now = place.about()
         if any(now.get(key) != about.get(key) for key in _TASK):
             made = about.get("class", about["task"])
@@ -119,7 +119,7 @@ def _place(
         raise UnknownOption("task", about.get("class", about["task"]), allowed)
     if about["arguments"]:
         options["task_options"] = about["arguments"]
-    place = Place(about["task"], options)
+    place = EvaluationPlace(about["task"], options)
     if place.about().get("model") != about.get("model"):
         content = f"the file that was evaluated, whose content has the sum {about.get('model')}"
         raise UnknownOption("task", about["task"], (content,))
@@ -173,7 +173,7 @@ def _acts(options: Any, trusted: Sequence[str]) -> Any:
     return {name: _acts(value, trusted) for name, value in options.items()}
 
 
-def _same_versions(place: Place, made: Mapping[str, Mapping[str, str]]) -> None:
+def _same_versions(place: EvaluationPlace, made: Mapping[str, Mapping[str, str]]) -> None:
     for engine, then in made.items():
         runner = EpisodeRunner(place.env(engine))
         now = versions(runner.env.world.engine)

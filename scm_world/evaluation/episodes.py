@@ -41,7 +41,7 @@ Watch = Callable[[ScmWorldEnv], Any]
 
 @final
 @dataclass(frozen=True)
-class Row:
+class EpisodeRow:
     """What is kept of an episode.
 
     Attributes:
@@ -180,10 +180,10 @@ class RunningEpisode:
         return True
 
     @property
-    def row(self) -> Row:
+    def row(self) -> EpisodeRow:
         """What is kept in the end."""
         scores = scored(self._fractions, success=self._success, total=float(self._total))
-        return Row(*self._place, self._steps, scores, self._drawn, str(self.mark))
+        return EpisodeRow(*self._place, self._steps, scores, self._drawn, str(self.mark))
 
 
 class Envs(typing.Protocol):
@@ -292,7 +292,7 @@ class EpisodeRunner:
         episode: int,
         who: tuple[str, int] = ("", 0),
         watch: Watch | None = None,
-    ) -> Row:
+    ) -> EpisodeRow:
         """Run an episode.
 
         Args:

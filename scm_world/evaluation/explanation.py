@@ -14,7 +14,7 @@ from scm_world.curricula.situations import Situation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.checking import shard_runner_of
-from scm_world.evaluation.episodes import EpisodeRunner, Row
+from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
@@ -194,7 +194,7 @@ def why(
 def _others(
     shard_runner: ShardRunner,
     shard: Shard,
-    row: Row,
+    row: EpisodeRow,
     metric: str,
     versus: str | None,
     progress: Progress | None,
@@ -233,7 +233,9 @@ def _others(
     return Explanation(row.scores[metric], best_first, left_out)
 
 
-def _no_answer(one: Otherwise, row: Row, then: Row, found: set[str], world: World) -> str:
+def _no_answer(
+    one: Otherwise, row: EpisodeRow, then: EpisodeRow, found: set[str], world: World
+) -> str:
     """Say why what would have been says nothing about a variable; empty if it does."""
     if one.variable not in found:
         return "the protocol does not set it"
@@ -282,13 +284,13 @@ class _Look:
             self.value = tuple(np.ravel(world[self.name]).astype(float).tolist())
 
 
-def _natural(runner: EpisodeRunner, shard: Shard, row: Row) -> dict[str, Any]:
+def _natural(runner: EpisodeRunner, shard: Shard, row: EpisodeRow) -> dict[str, Any]:
     """Give the values of an episode in which nobody intervenes."""
     runner.env.reset(seed=shard.seed, options={"episode": row.episode})
     return runner.env.world.values()
 
 
-def _versus(runner: EpisodeRunner, usual: Mapping[str, Any], name: str, row: Row) -> str:
+def _versus(runner: EpisodeRunner, usual: Mapping[str, Any], name: str, row: EpisodeRow) -> str:
     """Say what a variable is held against: A, unless it lies there already."""
     model = runner.env.world.model
     if name not in model:

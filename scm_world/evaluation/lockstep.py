@@ -12,7 +12,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.env.batched.buffers import FLAGS, FRACTION
 from scm_world.env.batched.native import NativeExecutor
 from scm_world.env.batched.reader import EnvLayout
-from scm_world.evaluation.episodes import EpisodeRunner, Row, RunningEpisode, Stepped, play
+from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, RunningEpisode, Stepped, play
 from scm_world.evaluation.players import Actions, Player
 from scm_world.evaluation.protocols import Protocol
 
@@ -88,7 +88,7 @@ class Lockstep:
         seed: int,
         episodes: range,
         who: tuple[str, int],
-    ) -> list[Row] | None:
+    ) -> list[EpisodeRow] | None:
         """Play some episodes.
 
         Args:

@@ -11,7 +11,7 @@ from typing import Any, final
 
 from scm_world.errors import UnreadableFile
 from scm_world.evaluation.agents import AgentRun
-from scm_world.evaluation.episodes import EpisodeRunner, Row
+from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
 from scm_world.evaluation.lockstep import Lockstep
 from scm_world.evaluation.players import Player, as_player
 from scm_world.evaluation.results import Evaluation
@@ -44,7 +44,7 @@ class ShardRunner:
     locksteps: dict[str, Lockstep] = field(default_factory=dict)
     players: dict[int, Player] = field(default_factory=dict)
 
-    def __call__(self, shard: Shard) -> list[Row]:
+    def __call__(self, shard: Shard) -> list[EpisodeRow]:
         """Play all episodes of a shard, side by side where that is faster."""
         agent_run, numbers = self.setup.agents[shard.agent], range(shard.first, shard.stop)
         rows = self.lockstep(shard).play(
@@ -56,7 +56,7 @@ class ShardRunner:
         )
         return rows or [self.play(shard, episode) for episode in numbers]
 
-    def play(self, shard: Shard, episode: int, watch: Any = None) -> Row:
+    def play(self, shard: Shard, episode: int, watch: Any = None) -> EpisodeRow:
         """Play one episode of it."""
         agent_run = self.setup.agents[shard.agent]
         return self.runner(shard).play(
@@ -204,7 +204,7 @@ def played(
     folder: Location | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
-) -> list[Row]:
+) -> list[EpisodeRow]:
     """Play what has not been played, and give all rows in their order.
 
     Args:
@@ -216,7 +216,7 @@ def played(
     """
     shards = setup.shards()
     keys = [setup.key(shard) if folder is not None else "" for shard in shards]
-    found: dict[int, list[Row]] = {}
+    found: dict[int, list[EpisodeRow]] = {}
     for place, (shard, key) in enumerate(zip(shards, keys, strict=True)):
         noisy = setup.agents[shard.agent].about.get("repeats") == "no"  # who may be another by now
         count = shard.stop - shard.first
@@ -243,7 +243,7 @@ def played(
 
 
 def _teller(progress: Progress | None, total: int) -> Any:
-    def tell(found: Mapping[int, list[Row]]) -> None:
+    def tell(found: Mapping[int, list[EpisodeRow]]) -> None:
         if progress is not None:
             progress(sum(map(len, found.values())), total)
 

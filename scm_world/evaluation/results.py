@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.episodes import FRACTIONS, Row
+from scm_world.evaluation.episodes import FRACTIONS, EpisodeRow
 from scm_world.evaluation.statistics import (
     LEVEL,
     Causes,
@@ -52,7 +52,7 @@ class Evaluation:
     policies: Mapping[tuple[str, int], Any] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, about: Mapping[str, Any], rows: Sequence[Row]) -> Evaluation:
+    def of(cls, about: Mapping[str, Any], rows: Sequence[EpisodeRow]) -> Evaluation:
         """Make the table of some rows."""
         return cls(about, columns_of(rows))
 

@@ -36,7 +36,7 @@ _MINE = ("task", "backend", "render_mode")
 
 @final
 @dataclass(frozen=True)
-class Place:
+class EvaluationPlace:
     """Where episodes happen.
 
     Attributes:
@@ -156,7 +156,7 @@ class Setup:
         versions: Of everything that decides the results, by engine.
     """
 
-    place: Place
+    place: EvaluationPlace
     agents: tuple[AgentRun, ...]
     engines: tuple[str, ...]
     protocols: tuple[Protocol, ...]
@@ -296,7 +296,7 @@ def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
 
 
 def _tried_out(
-    loaded: Sequence[LoadedAgent], place: Place, shared: ScmWorldEnv
+    loaded: Sequence[LoadedAgent], place: EvaluationPlace, shared: ScmWorldEnv
 ) -> Iterator[AgentRun]:
     """Try everybody out, each in an environment of its own form if it has one."""
     engine = shared.world.backend.name
@@ -312,7 +312,7 @@ def _tried_out(
 
 def _place(
     task: Task | str | None, env: Any, loaded: Sequence[LoadedAgent], trusted: Sequence[str]
-) -> Place:
+) -> EvaluationPlace:
     agents = [(agent.agent, agent.made_for) for agent in loaded]
     task = task_for(task, agents, trusted)
     if not isinstance(task, Task | str):
@@ -323,7 +323,7 @@ def _place(
     for name in env or {}:
         if name not in allowed:
             raise UnknownOption("option of the environment", name, allowed)
-    place = Place(task, shared_options(env, agents))
+    place = EvaluationPlace(task, shared_options(env, agents))
     place.made  # noqa: B018 # refuses a task that is not there
     return place
 

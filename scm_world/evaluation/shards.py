@@ -9,7 +9,7 @@ from hashlib import blake2b
 from typing import Any
 
 from scm_world.errors import DAMAGED, UnreadableFile
-from scm_world.evaluation.episodes import Row
+from scm_world.evaluation.episodes import EpisodeRow
 from scm_world.output.durable import made, write_whole
 from scm_world.output.locations import Location
 from scm_world.output.reading import read_text
@@ -28,7 +28,7 @@ def part_path(folder: Location, key: str) -> Location:
     return folder / FOLDER / f"{key}.json"
 
 
-def write_part(folder: Location, key: str, rows: Sequence[Row]) -> None:
+def write_part(folder: Location, key: str, rows: Sequence[EpisodeRow]) -> None:
     """Write the episodes of a shard.
 
     Raises:
@@ -41,7 +41,7 @@ def write_part(folder: Location, key: str, rows: Sequence[Row]) -> None:
     write_whole(text + "\n", path)
 
 
-def read_part(folder: Location, key: str, count: int) -> list[Row] | None:
+def read_part(folder: Location, key: str, count: int) -> list[EpisodeRow] | None:
     """Read the episodes of a shard; None if it has not been played.
 
     Args:
@@ -59,7 +59,7 @@ def read_part(folder: Location, key: str, count: int) -> list[Row] | None:
         found = (data["format"], data["key"], data["sum"], len(data["rows"]))
         if found != (FORMAT, key, _sum(data["rows"]), count):
             raise ValueError("its content is not what was written")
-        return [Row(**row) for row in data["rows"]]
+        return [EpisodeRow(**row) for row in data["rows"]]
     except FileNotFoundError:
         return None
     except DAMAGED as error:

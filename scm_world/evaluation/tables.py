@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.episodes import METRICS, Row
+from scm_world.evaluation.episodes import METRICS, EpisodeRow
 from scm_world.evaluation.statistics import Interval, difference_interval, is_binary
 
 TEXTS = ("agent", "engine", "protocol", "hash")
@@ -24,8 +24,8 @@ DRAWN = "drawn "
 Columns = dict[str, NDArray[Any]]
 
 
-def columns_of(rows: Sequence[Row]) -> Columns:
-    """Make the table of some episodes: a column for each field of ``Row``, of shape ``(n,)``."""
+def columns_of(rows: Sequence[EpisodeRow]) -> Columns:
+    """Return the table of some episodes: a column of shape (n,) for each field of a row."""
     found: Columns = {}
     for name in (*KEYS, "steps"):
         kind: Any = str if name in TEXTS else np.int64
@@ -37,7 +37,7 @@ def columns_of(rows: Sequence[Row]) -> Columns:
     return {**found, **_drawn(rows)}
 
 
-def _drawn(rows: Sequence[Row]) -> Columns:
+def _drawn(rows: Sequence[EpisodeRow]) -> Columns:
     """Give a column for each number of each variable that was drawn; NaN where it was not."""
     sizes: dict[str, int] = {}
     for row in rows:

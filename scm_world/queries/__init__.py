@@ -7,7 +7,7 @@ from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
 from scm_world.queries.identification import (
-    Check,
+    AdjustmentCheck,
     Identification,
     check_backdoor,
     identify,
@@ -25,10 +25,10 @@ from scm_world.queries.world import World
 
 __all__ = [
     "SCM",
+    "AdjustmentCheck",
     "Agreement",
     "At",
     "ButFor",
-    "Check",
     "Clamp",
     "Contact",
     "Difference",

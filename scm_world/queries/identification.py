@@ -159,7 +159,7 @@ def _front_doors(
 
 @final
 @dataclass(frozen=True)
-class Check:
+class AdjustmentCheck:
     """An effect as watching tells it, beside the one that acting shows.
 
     Attributes:
@@ -214,7 +214,7 @@ def check_backdoor(
     n: int = 200,
     units: int = 50,
     **setting: Any,
-) -> Check:
+) -> AdjustmentCheck:
     """Estimate an effect from episodes that are only watched, and check it by acting.
 
     The estimate is standardised: a quadratic model of the outcome, given the treatment and the
@@ -261,7 +261,9 @@ def check_backdoor(
         **setting,
     )
     adjusted = _standardised(np.hstack(causes), effect[:, 0], values)
-    return Check(found, adjusted, _standardised(causes[0], effect[:, 0], values), simulated, n)
+    return AdjustmentCheck(
+        found, adjusted, _standardised(causes[0], effect[:, 0], values), simulated, n
+    )
 
 
 def _standardised(

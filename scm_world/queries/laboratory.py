@@ -37,7 +37,7 @@ FORMAT = "scm_world/laboratory/1"
 
 @final
 @dataclass(frozen=True)
-class Record:
+class Experiment:
     """One experiment.
 
     Attributes:
@@ -77,7 +77,7 @@ class Journal:
         self._path = None if path is None else Path(path)
         self._trusted = tuple(trusted)
         self._size = 0
-        self.records: list[Record] = []
+        self.records: list[Experiment] = []
         head = json.loads(json.dumps({"format": FORMAT, **terms}))
         if self._path is None:
             return
@@ -98,7 +98,7 @@ class Journal:
 
     def write(self, kind: str, samples: Samples, *, at: int = 0, row: int | None = None) -> None:
         """Add an experiment; it is on the disk when this returns."""
-        record = Record(kind, samples, at, row)
+        record = Experiment(kind, samples, at, row)
         if self._path is not None:
             self._append(
                 {
@@ -159,11 +159,11 @@ class Journal:
         self._size = path.stat().st_size
 
 
-def _record(line: dict[str, Any], trusted: Sequence[str]) -> Record:
+def _record(line: dict[str, Any], trusted: Sequence[str]) -> Experiment:
     columns = {name: np.array(values, dtype=float) for name, values in line["values"].items()}
     plan = Plan.from_dict(line["plan"], trusted=trusted)
     samples = Samples(columns, tuple(line["units"]), line["seed"], plan)
-    return Record(line["kind"], samples, line["at"], line["row"])
+    return Experiment(line["kind"], samples, line["at"], line["row"])
 
 
 QUESTIONS = ("see", "do", "counterfactual")
@@ -270,7 +270,7 @@ class Laboratory:
         return None if self.budget is None else self.budget - self.spent
 
     @property
-    def records(self) -> tuple[Record, ...]:
+    def records(self) -> tuple[Experiment, ...]:
         """All experiments, in their order."""
         return tuple(self._journal.records)
 

@@ -16,7 +16,7 @@ from typing import Any, final
 from scm_world._arguments import load, whole_number
 from scm_world.backends import backends
 from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
-from scm_world.evaluation.setups import Place
+from scm_world.evaluation.setups import EvaluationPlace
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies import file_of, load_policy
@@ -228,7 +228,7 @@ def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, An
             advice = "give a policy file to start from"
             raise UnreadableFile(str(start), str(error), advice) from None
     options = recipe.env.get("task_options")
-    about = Place(recipe.task, {"task_options": options}).about()
+    about = EvaluationPlace(recipe.task, {"task_options": options}).about()
     custom = {name: value for name, value in about.items() if name in ("class", "model")}
     return {**custom, "recipe": recipe.as_dict(), **more, "start": digest}
 

@@ -11,7 +11,7 @@ from scm_world import SCM, Box, Derived, Exogenous, Linear
 from scm_world.discovery.data import (
     Dataset,
     Design,
-    Part,
+    SourceRows,
     collect,
     default_causes,
     default_outcomes,
@@ -321,13 +321,13 @@ class Stubborn:
         self.columns = Dataset.of([[0.0]], ["x"]).columns
         self.about: dict[str, Any] = {}
 
-    def part(self, numbers: range, tell: Any) -> Part:
+    def part(self, numbers: range, tell: Any) -> SourceRows:
         """Refuse every so many episodes."""
         tell(len(numbers))
         lived = [number for number in numbers if number % self.every]
         table = Dataset.of(np.array(lived, float)[:, None], ["x"], episode=lived)
         refused = ((number, "no") for number in numbers if number % self.every == 0)
-        return Part(table, tuple(refused))
+        return SourceRows(table, tuple(refused))
 
 
 def test_refused_episodes_are_left_out_and_listed() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.evaluation import METRICS, Evaluation, evaluate
-from scm_world.evaluation.episodes import Row
+from scm_world.evaluation.episodes import EpisodeRow
 
 rng = np.random.default_rng(0)
 WEIGHTS = rng.normal(size=(56, 9)).astype(np.float32)
@@ -96,10 +96,10 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def by_hand(
     scores: Any, drawn: Any = None, *, agent: str = "a", protocol: str = "P1", run: int = 0
-) -> list[Row]:
+) -> list[EpisodeRow]:
     """Make rows with given scores of success."""
     return [
-        Row(
+        EpisodeRow(
             agent,
             run,
             "fake",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from scm_world.evaluation.benchmark import protocols_of
-from scm_world.evaluation.episodes import METRICS, Row
+from scm_world.evaluation.episodes import METRICS, EpisodeRow
 from scm_world.evaluation.results import Evaluation
 
 NAMES = ("ppo", "sac", "td3", "random", "sweep", "still", "bc", "cql", "iql")
@@ -22,7 +22,7 @@ def made(
     runs: int = 1,
     n: int = 12,
     score: float | None = None,
-    kept: Callable[[Row], bool] = lambda row: True,
+    kept: Callable[[EpisodeRow], bool] = lambda row: True,
 ) -> Evaluation:
     """Make an evaluation in which heavy blocks are pushed badly from P7 on.
 
@@ -47,7 +47,7 @@ def made(
                         scores = dict.fromkeys(METRICS[:4], value) | {"return": 40 * value - 100}
                         drawn = {"tool_block.mass": [mass], "floor_friction": [float(rng.random())]}
                         rows.append(
-                            Row(
+                            EpisodeRow(
                                 agent,
                                 run,
                                 engine,

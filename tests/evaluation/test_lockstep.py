@@ -13,7 +13,7 @@ from evaluation_samples import Waning, contents, linear
 from scm_world.errors import EvaluationError
 from scm_world.evaluation import Protocol, WorldPolicy, evaluate
 from scm_world.evaluation import pipeline as pipelines
-from scm_world.evaluation.episodes import Row
+from scm_world.evaluation.episodes import EpisodeRow
 from scm_world.evaluation.lockstep import Lockstep
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.setups import prepare
@@ -26,7 +26,7 @@ WITHIN = Protocol("late", act={"tool_block.cartesian_position": [0.2, 0.2, 0.032
 class Found(NamedTuple):
     """What a policy and some protocols gave, and whether several episodes went on at once."""
 
-    rows: list[Row]
+    rows: list[EpisodeRow]
     together: bool
 
 

@@ -18,7 +18,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.evaluation import Protocol, protocols_of
 from scm_world.evaluation.benchmark import REACHING as REACHING_ROW
 from scm_world.evaluation.benchmark import ROLES, ROWS
-from scm_world.evaluation.episodes import EpisodeRunner, Row, _drawn
+from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, _drawn
 from scm_world.evaluation.players import as_player
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.feasibility import overlaps
@@ -312,7 +312,7 @@ def test_d22_protocols_leave_no_trace(task: str) -> None:
     """The same episodes come out whichever protocols ran before."""
     names = ("P3", "P6", "P10", "P11")
 
-    def run(order: Any) -> dict[tuple[str, int], Row]:
+    def run(order: Any) -> dict[tuple[str, int], EpisodeRow]:
         env = ScmWorldEnv(task, backend="fake", max_episode_length=2)
         here, player = EpisodeRunner(env), as_player("still")
         return {

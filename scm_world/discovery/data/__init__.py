@@ -6,7 +6,7 @@ from scm_world.discovery.data.designs import DESIGNS, Design
 from scm_world.discovery.data.files import load, save
 from scm_world.discovery.data.levels import Levels
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
-from scm_world.discovery.data.sources import Part, Source
+from scm_world.discovery.data.sources import DataSource, SourceRows
 from scm_world.discovery.data.sweeps import sweep
 from scm_world.discovery.data.swept import Swept
 from scm_world.discovery.data.views import (
@@ -24,12 +24,12 @@ __all__ = [
     "DESIGNS",
     "CausalLearn",
     "Column",
+    "DataSource",
     "Dataset",
     "Design",
     "Levels",
-    "Part",
     "Regime",
-    "Source",
+    "SourceRows",
     "Swept",
     "UnwritableFolder",
     "as_causal_learn",

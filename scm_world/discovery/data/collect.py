@@ -15,9 +15,9 @@ from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.files import refusals, together
 from scm_world.discovery.data.folders import SHARD, Folder, Head
 from scm_world.discovery.data.laboratories import Experiments
-from scm_world.discovery.data.models import Model
-from scm_world.discovery.data.sources import Part, Source, Tell
-from scm_world.discovery.data.worlds import Episodes
+from scm_world.discovery.data.models import ModelSource
+from scm_world.discovery.data.sources import DataSource, SourceRows, Tell
+from scm_world.discovery.data.worlds import WorldSource
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.output.locations import Location
@@ -43,7 +43,7 @@ class Circumstances(TypedDict, total=False):
 
 
 def collect(
-    source: SCM | World | Laboratory | Source,
+    source: SCM | World | Laboratory | DataSource,
     design: Design,
     n: int,
     *,
@@ -127,13 +127,13 @@ def collect(
 
 
 def source_of(
-    source: SCM | World | Laboratory | Source,
+    source: SCM | World | Laboratory | DataSource,
     design: Design,
     n: int,
     *,
     seed: int,
     **given: Unpack[Circumstances],
-) -> Source:
+) -> DataSource:
     """Turn what can be collected from into something that has episodes.
 
     Raises:
@@ -142,7 +142,7 @@ def source_of(
     match source:
         case SCM():
             _refuse_others(given, ("steps",), "a model")
-            return Model(source, design, seed=seed, steps=given.get("steps"))
+            return ModelSource(source, design, seed=seed, steps=given.get("steps"))
         case Laboratory():
             _refuse_others(given, (), "a laboratory, which has its own")
             return Experiments(source, design, n, seed=seed)
@@ -153,7 +153,7 @@ def source_of(
                 steps=whole_number("steps", given.get("steps", STEPS), least=1),
                 seed=seed,
             )
-            return Episodes(
+            return WorldSource(
                 source,
                 design,
                 causes=given.get("causes"),
@@ -186,16 +186,16 @@ def _opened(
 
 
 def _gathered(
-    source: Source,
+    source: DataSource,
     head: Head,
     folder: Folder | None,
     executor: Executor,
     progress: Progress | None,
-) -> list[Part]:
+) -> list[SourceRows]:
     """Read or make all parts."""
     ranges = head.ranges()
     tally = _Tally(head.n, progress)
-    parts: dict[int, Part] = {}
+    parts: dict[int, SourceRows] = {}
     for index, numbers in enumerate(ranges):
         part = None if folder is None else folder.read(index, numbers)
         if part is not None:
@@ -249,10 +249,10 @@ class Maker:
         tell: Told how many further episodes are done; nobody is if None.
     """
 
-    def __init__(self, source: Source, tell: Tell | None = None) -> None:
+    def __init__(self, source: DataSource, tell: Tell | None = None) -> None:
         self._source, self._tell = source, tell or _silent
 
-    def __call__(self, numbers: range) -> Part:
+    def __call__(self, numbers: range) -> SourceRows:
         """Let the episodes of a shard happen."""
         part = self._source.part(numbers, self._tell)
         return replace(part, table=replace(part.table, about={}))  # it is the same in all of them

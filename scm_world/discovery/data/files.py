@@ -12,7 +12,7 @@ from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Dataset, Regime
 from scm_world.discovery.data.folders import SHARD, Folder, Head, head_of, read_sidecar
 from scm_world.discovery.data.shards import check_kind, content_of
-from scm_world.discovery.data.sources import Part
+from scm_world.discovery.data.sources import SourceRows
 from scm_world.errors import ModelError, UnreadableFile
 from scm_world.output.locations import Location, located
 
@@ -50,7 +50,7 @@ def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool =
     return together(head, parts)
 
 
-def together(head: Head, parts: Sequence[Part]) -> Dataset:
+def together(head: Head, parts: Sequence[SourceRows]) -> Dataset:
     """Put the parts of a dataset together, with what was refused."""
     empty = np.zeros(0, dtype=np.int64)
     nothing = np.empty((0, len(head.columns)))
@@ -62,7 +62,7 @@ def together(head: Head, parts: Sequence[Part]) -> Dataset:
     return replace(Dataset.joined(tables), about=about)
 
 
-def refusals(parts: Sequence[Part]) -> dict[str, str]:
+def refusals(parts: Sequence[SourceRows]) -> dict[str, str]:
     """Say why episodes could not be, by their number."""
     return {str(number): why for part in parts for number, why in part.refused}
 
@@ -104,7 +104,7 @@ def save(
         files.note({})
         for index, numbers in enumerate(head.ranges()):
             rows = table.rows(slice(ends[numbers.start], ends[numbers.stop]))
-            files.write(index, numbers, Part(_trimmed(rows)))
+            files.write(index, numbers, SourceRows(_trimmed(rows)))
         files.note({}, complete=True)
     return files.path
 

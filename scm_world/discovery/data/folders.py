@@ -11,8 +11,8 @@ from typing import Any, final
 
 from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Column
-from scm_world.discovery.data.shards import Place, check_kind, check_names, decoded, encoded
-from scm_world.discovery.data.sources import FORMAT, Part
+from scm_world.discovery.data.shards import ShardPlace, check_kind, check_names, decoded, encoded
+from scm_world.discovery.data.sources import FORMAT, SourceRows
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
 from scm_world.output.durable import is_draft, locked, removed, write_durably
@@ -107,7 +107,7 @@ class Folder:
         """Name a file."""
         return self.path / f"shard-{index:05d}.{self.head.kind}"
 
-    def read(self, index: int, numbers: range) -> Part | None:
+    def read(self, index: int, numbers: range) -> SourceRows | None:
         """Read a file; None where it is not there, or ends before it should.
 
         Raises:
@@ -133,7 +133,7 @@ class Folder:
         self._check_place(path, place, numbers)
         return part if place.stop >= numbers.stop else None
 
-    def _check_place(self, path: Location, place: Place, numbers: range) -> None:
+    def _check_place(self, path: Location, place: ShardPlace, numbers: range) -> None:
         reason = f"it holds the episodes from {place.first} to {place.stop - 1}"
         if place.first != numbers.start or place.stop > numbers.start + self.head.shard:
             raise UnreadableFile(str(path), reason, "put it back under its own name")
@@ -148,13 +148,13 @@ class Folder:
             return "collect again with the same settings"
         return "save the same dataset again"
 
-    def write(self, index: int, numbers: range, part: Part) -> None:
+    def write(self, index: int, numbers: range, part: SourceRows) -> None:
         """Write a file; it is there as a whole, or not at all.
 
         Raises:
             UnwritableFolder: There is no room, or no permission.
         """
-        place = Place(self._plan, numbers.start, numbers.stop)
+        place = ShardPlace(self._plan, numbers.start, numbers.stop)
         write_durably(self.shard(index), encoded(part, place, self.head.kind))
 
     # --- the sidecar --------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.recorded import columns_of_outcome, first_label, reached
-from scm_world.discovery.data.sources import FORMAT, Part, Tell, plain_options
+from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell, plain_options
 from scm_world.errors import BudgetExhausted, InterventionError
 from scm_world.graph.structure import Edge
 from scm_world.queries.laboratory import Laboratory
@@ -58,7 +58,7 @@ class Experiments:
             "design": design.as_dict(),
         }
 
-    def part(self, numbers: range, tell: Tell) -> Part:
+    def part(self, numbers: range, tell: Tell) -> SourceRows:
         """Carry out some experiments; those that are refused cost their episode."""
         rows: list[Floats] = []
         regimes: list[Regime] = []
@@ -87,7 +87,7 @@ class Experiments:
             step=np.zeros(len(rows), dtype=np.int64),
             about=self.about,
         )
-        return Part(table, tuple(refused))
+        return SourceRows(table, tuple(refused))
 
     def _named(self, regime: Regime) -> Regime:
         model = self._model

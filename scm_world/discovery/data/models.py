@@ -11,7 +11,7 @@ import numpy as np
 from scm_world.discovery.data.dataset import Column, Dataset, columns_of
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.recorded import reached
-from scm_world.discovery.data.sources import FORMAT, Part, Tell
+from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell
 from scm_world.errors import ModelError
 from scm_world.graph import SCM, to_json
 from scm_world.graph.structure import Edge
@@ -23,7 +23,7 @@ from scm_world.queries.twins import EquationTwins
 
 
 @final
-class Model:
+class ModelSource:
     """Episodes of a causal model without a backend, every variable of which is written down.
 
     Row i of a model without lagged edges is that of
@@ -61,7 +61,7 @@ class Model:
             "versions": versions(),
         }
 
-    def part(self, numbers: range, tell: Tell) -> Part:
+    def part(self, numbers: range, tell: Tell) -> SourceRows:
         """Run some episodes."""
         chosen = self._design.chosen(self._seed, numbers.start, len(numbers))
         kinds, where = np.unique(chosen, axis=0, return_inverse=True)
@@ -75,7 +75,7 @@ class Model:
         vectors = paths(self._twins, units)[:, min(self._length, 1) :]
         n, length, size = vectors.shape
         tell(n)
-        return Part(
+        return SourceRows(
             Dataset(
                 values=vectors.reshape(n * length, size),
                 columns=self.columns,

@@ -15,7 +15,7 @@ import numpy as np
 from scm_world._arguments import load as load_library
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
-from scm_world.discovery.data.sources import Part
+from scm_world.discovery.data.sources import SourceRows
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.output.reading import read_table
 from scm_world.queries.plans import FORMAT as PLAN
@@ -32,7 +32,7 @@ FORMAT = "scm_world/shard/1"
 
 @final
 @dataclass(frozen=True)
-class Place:
+class ShardPlace:
     """To which part of which dataset a file belongs.
 
     Attributes:
@@ -61,7 +61,7 @@ Encode = Callable[[Raw, Sequence[str]], bytes]
 Decode = Callable[[bytes, Sequence[str]], Raw]
 
 
-def encoded(part: Part, place: Place, kind: str) -> bytes:
+def encoded(part: SourceRows, place: ShardPlace, kind: str) -> bytes:
     """Write episodes as the bytes of a file; the same ones every time.
 
     Raises:
@@ -101,7 +101,7 @@ def decoded(
     columns: tuple[Column, ...],
     about: dict[str, Any],
     trusted: Sequence[str],
-) -> tuple[Place, Part]:
+) -> tuple[ShardPlace, SourceRows]:
     """Read what ``encoded`` wrote.
 
     Raises:
@@ -125,7 +125,7 @@ def decoded(
         **raw.numbers,
     )
     refused = tuple((int(number), str(why)) for number, why in header["refused"])
-    return Place(header["plan"], header["first"], header["stop"]), Part(table, refused)
+    return ShardPlace(header["plan"], header["first"], header["stop"]), SourceRows(table, refused)
 
 
 def _checksum(raw: Raw) -> str:

@@ -21,7 +21,7 @@ Tell = Callable[[int], None]
 
 @final
 @dataclass(frozen=True)
-class Part:
+class SourceRows:
     """The rows of some episodes.
 
     Attributes:
@@ -33,7 +33,7 @@ class Part:
     refused: tuple[tuple[int, str], ...] = ()
 
 
-class Source(Protocol):
+class DataSource(Protocol):
     """Something that has episodes; the rows of episode i depend on the seed and on i only.
 
     Attributes:
@@ -51,7 +51,7 @@ class Source(Protocol):
     at_once: bool
     uneven: bool
 
-    def part(self, numbers: range, tell: Tell) -> Part:
+    def part(self, numbers: range, tell: Tell) -> SourceRows:
         """Let some episodes happen."""
 
 

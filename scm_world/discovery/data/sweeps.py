@@ -14,9 +14,9 @@ from scm_world.discovery.data.dataset import Column, Dataset
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.folders import SHARD, FewerEpisodes
 from scm_world.discovery.data.levels import Point, points_of
-from scm_world.discovery.data.sources import Part, Tell
+from scm_world.discovery.data.sources import SourceRows, Tell
 from scm_world.discovery.data.swept import Swept
-from scm_world.discovery.data.worlds import Episodes
+from scm_world.discovery.data.worlds import WorldSource
 from scm_world.errors import UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.output.locations import Location, located
@@ -136,7 +136,7 @@ class Grid:
     ) -> None:
         measured = None if outcomes is None else tuple(outcomes)
         self._points = [
-            Episodes(
+            WorldSource(
                 world,
                 Design("all", tuple(point), point, observational_fraction=0.0),
                 causes=tuple(point),
@@ -153,7 +153,7 @@ class Grid:
         grid = [Plan(point).as_dict()["do"] for point in points]
         self.about: dict[str, Any] = {**about, "points": grid}
 
-    def part(self, numbers: range, tell: Tell) -> Part:
+    def part(self, numbers: range, tell: Tell) -> SourceRows:
         """Let some episodes happen, those of one point together."""
         tables: list[Dataset] = []
         refused: list[tuple[int, str]] = []
@@ -165,7 +165,9 @@ class Grid:
                 tables.append(replace(part.table, episode=number, about=self.about))
                 refused += [(int(self._number(unit, place)), why) for unit, why in part.refused]
         whole = Dataset.joined(tables)
-        return Part(whole.rows(np.argsort(whole.episode, kind="stable")), tuple(sorted(refused)))
+        return SourceRows(
+            whole.rows(np.argsort(whole.episode, kind="stable")), tuple(sorted(refused))
+        )
 
     def _number(self, unit: Any, place: int) -> Any:
         return unit * len(self._points) + place

@@ -21,7 +21,7 @@ from scm_world.discovery.data.recorded import (
     settable,
 )
 from scm_world.discovery.data.sensors import Sensors
-from scm_world.discovery.data.sources import FORMAT, Part, Tell, plain_options, policy_name
+from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell, plain_options, policy_name
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.queries.episodes import episode_of
@@ -37,7 +37,7 @@ from scm_world.world.plan import merged
 
 
 @final
-class Episodes:
+class WorldSource:
     """Episodes of a world, under a design.
 
     Args:
@@ -110,7 +110,7 @@ class Episodes:
             "versions": versions(self._world.engine),
         }
 
-    def part(self, numbers: range, tell: Tell) -> Part:
+    def part(self, numbers: range, tell: Tell) -> SourceRows:
         """Let some episodes happen; those that are refused are left out."""
         chosen = self._design.chosen(self._setting.seed, numbers.start, len(numbers))
         regimes = [self._design.regime_of(kind) for kind in chosen]
@@ -138,11 +138,11 @@ class Episodes:
         plan = self._setting.plan(self._world, given)
         return self._setting.unit(self._world, plan, number, self._written)
 
-    def _part(self, found: Sequence[tuple[int, Regime, Floats | str]]) -> Part:
+    def _part(self, found: Sequence[tuple[int, Regime, Floats | str]]) -> SourceRows:
         """Tell rows from refusals."""
         rows = [(number, done, rows) for number, done, rows in found if not isinstance(rows, str)]
         refused = tuple((number, why) for number, _, why in found if isinstance(why, str))
-        return Part(self._table(rows), refused)
+        return SourceRows(self._table(rows), refused)
 
     @property
     def _written(self) -> tuple[str, ...]:

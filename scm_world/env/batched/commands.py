@@ -16,7 +16,7 @@ from scm_world.world.batch import Batch, Table
 
 
 @final
-class Commands:
+class ActionScaler:
     """Scales actions, adds what they are relative to, and clips them.
 
     Args:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.env.batched.commands import Commands
+from scm_world.env.batched.commands import ActionScaler
 from scm_world.env.batched.executor import located
 from scm_world.env.batched.loop import LoopExecutor
 from scm_world.env.batched.reader import EnvLayout, ObservationReader
@@ -52,7 +52,7 @@ class NativeExecutor:
         self.form, self.buffers = self._members.form, self._members.buffers
         self._envs = self._members.envs
         lead = self._envs[0]
-        self._commands = Commands(lead, num_envs)
+        self._commands = ActionScaler(lead, num_envs)
         names = (*EnvLayout.of(lead).needed, *self._commands.names)
         self._batch = Batch([env.world for env in self._envs], threads=threads, names=names)
         self._readers: WeakKeyDictionary[Table, ObservationReader] = WeakKeyDictionary()

@@ -13,7 +13,7 @@ from scm_world.env.delta import Delta
 from scm_world.env.environment import REWARD, TERMINATED, ScmWorldEnv
 from scm_world.env.goals import Goals
 from scm_world.env.keypoints import KEYPOINTS
-from scm_world.env.observer import Together
+from scm_world.env.observer import DictObserver
 from scm_world.env.vector import Vector
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables.reserved import CONTROL_INDEX
@@ -56,7 +56,7 @@ class EnvLayout:
     def of(cls, env: ScmWorldEnv) -> EnvLayout:
         """Look into an environment, as it is in its present structure."""
         seen: Any = env._observer
-        together = isinstance(seen, Together)
+        together = isinstance(seen, DictObserver)
         parts: dict[str | None, Any] = dict(seen._parts) if together else {None: seen}
         vectors = {name: part for name, part in parts.items() if isinstance(part, Vector)}
         plain = {name: part for name, part in vectors.items() if KEYPOINTS not in part._slices}

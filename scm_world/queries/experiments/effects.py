@@ -22,7 +22,7 @@ FACTOR = 10.0
 
 @final
 @dataclass(frozen=True)
-class Setting:
+class ProbeSetting:
     """What was done when something was seen.
 
     Attributes:
@@ -71,14 +71,14 @@ class Effects:
     """
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
-    settings: dict[EdgeKey, Setting] = field(default_factory=dict)
+    settings: dict[EdgeKey, ProbeSetting] = field(default_factory=dict)
     states: dict[EdgeKey, int] = field(default_factory=dict)
     floor: float = 0.0
     exact: bool = False
     undone: set[str] = field(default_factory=set)
     rollouts: int = 0
     refused: dict[str, int] = field(default_factory=dict)
-    setting: Setting | None = None
+    setting: ProbeSetting | None = None
     responses: dict[tuple[EdgeKey, int], Response] | None = None
     _answered: set[EdgeKey] = field(default_factory=set)
 

@@ -22,8 +22,8 @@ from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import (
     EdgeKey,
     Effects,
+    ProbeSetting,
     Response,
-    Setting,
     gap,
 )
 from scm_world.queries.experiments.mechanisms import see_mechanisms
@@ -181,7 +181,7 @@ class Paired:
 
     def _doing(self, change: Floats | None) -> None:
         """Say what is being done, so that what is seen can be told where it was seen."""
-        self.effects.setting = Setting(self._number, self._probe.kind, change)
+        self.effects.setting = ProbeSetting(self._number, self._probe.kind, change)
 
     def _advanced(self, action: Floats) -> dict[str, Value]:
         """Step once; give the values that are remembered of the instant before."""
