@@ -179,7 +179,12 @@ class EngineBatch(ABC):
     """Several scenes of one engine that are stepped in one call.
 
     That is, bit for bit, the same as stepping one after another.
+
+    Attributes:
+        may_refuse: Whether a scene that fails can be as it was; if not, it has lost its state.
     """
+
+    may_refuse: ClassVar[bool] = False
 
     @abstractmethod
     def step(
@@ -197,7 +202,8 @@ class EngineBatch(ABC):
                 columns of row i, shape (n, at least layout.size).
 
         Raises:
-            EngineFailure: A scene lost its state; all others were stepped.
+            EngineFailure: A scene lost its state, or is as it was, which the error says; all
+                others were stepped.
         """
 
 

@@ -412,6 +412,8 @@ class StepBatch(EngineBatch):
         backends: All of them ``StepFunction``.
     """
 
+    may_refuse: ClassVar[bool] = True
+
     def __init__(self, backends: Sequence[Backend]) -> None:
         self._backends: tuple[Any, ...] = tuple(backends)
         self._compared: set[tuple[StepModel, int]] = set()
@@ -421,43 +423,66 @@ class StepBatch(EngineBatch):
     ) -> None:
         """Hold commands for some steps.
 
+        A vectorised function that fails is asked for each system alone, to find out which fail.
+
         Raises:
             EngineFailure: As in ``StepFunction.step``; or a row of a vectorised function depends
                 on how many there are, which is asked once for every number of rows.
         """
         _require_controls(mode)
         failed: EngineFailure | None = None
+        unmoved: list[int] = []
         together: dict[StepModel, list[int]] = {}
         for index in which.tolist():
             together.setdefault(self._backends[index].structure, []).append(index)
         for model, rows in together.items():
             members, size = [self._backends[row] for row in rows], model.layout.size
+            alone = not model.vectorized
             if model.vectorized:
-                self._together(model, members, commands[rows, : model.n_commands], substeps)
-            else:
-                for row, member in zip(rows, members, strict=True):
-                    try:
-                        member.step(mode, commands[row, : model.n_commands], substeps)
-                    except EngineFailure as error:
-                        said = f"scene {row} of the batch: {error}"
-                        failed = failed or EngineFailure(said, error.engine)
+                try:
+                    refused = self._together(model, members, commands[rows], substeps)
+                except EngineFailure:
+                    alone = True
+                else:
+                    failed = failed or refused
+                    unmoved += rows if refused else ()
+            for row, member in zip(rows, members, strict=True) if alone else ():
+                try:
+                    member.step(mode, commands[row, : model.n_commands], substeps)
+                except EngineFailure as error:
+                    said = f"scene {row} of the batch: {error}"
+                    failed = failed or EngineFailure(said, error.engine)
+                    unmoved.append(row)
             into[rows, :size] = [member.vector for member in members]
         if failed is not None:
+            failed.unmoved = tuple(unmoved)
             raise failed
 
     def _together(
         self, model: StepModel, members: list[StepFunction], commands: Floats, substeps: int
-    ) -> None:
-        """Step systems of one vectorised function."""
+    ) -> EngineFailure | None:
+        """Step systems of one vectorised function; return why none was stepped.
+
+        Raises:
+            EngineFailure: The function fails for one of them; none was stepped.
+        """
+        commands = commands[:, : model.n_commands]
         states = np.array([member.vector for member in members])
         parameters = np.array([member.numbers for member in members])
         if (model, len(members)) not in self._compared:
-            _refuse_company(model, parameters, states, commands)
+            if not _is_alone_as_among_others(model, parameters, states, commands):
+                return EngineFailure(
+                    f"the vectorised step function of {model.name!r} gives a row other numbers "
+                    f"among {len(states)} rows than alone; write it without matrix products over "
+                    "the rows (np.einsum adds up each row by itself), or set vectorized=False",
+                    StepFunction.name,
+                )
             self._compared.add((model, len(members)))
         for _ in range(substeps):
             states = model.advance(parameters, states, commands)
         for member, vector in zip(members, states, strict=True):
             member.vector[:] = vector
+        return None
 
 
 def _require_controls(mode: ControlMode) -> None:
@@ -476,16 +501,11 @@ def _refuse_memory(model: StepModel, parameters: Floats, states: Floats, command
         )
 
 
-def _refuse_company(model: StepModel, parameters: Floats, states: Floats, commands: Floats) -> None:
-    """Refuse a vectorised function that gives a row alone other numbers than among others."""
+def _is_alone_as_among_others(
+    model: StepModel, parameters: Floats, states: Floats, commands: Floats
+) -> bool:
+    """Tell whether a vectorised function gives each row the numbers that it gives it alone."""
     among = model.advance(parameters, states, commands)
-    for row in range(len(states)):
-        one = slice(row, row + 1)
-        alone = model.advance(parameters[one], states[one], commands[one])
-        if alone.tobytes() != among[one].tobytes():
-            raise EngineFailure(
-                f"the vectorised step function of {model.name!r} gives a row other numbers among "
-                f"{len(states)} rows than alone; write it without matrix products over the rows "
-                "(np.einsum adds up each row by itself), or set vectorized=False",
-                StepFunction.name,
-            )
+    rows = [slice(row, row + 1) for row in range(len(states))]
+    alone = [model.advance(parameters[one], states[one], commands[one]) for one in rows]
+    return bool(np.concatenate(alone).tobytes() == among.tobytes())

@@ -377,11 +377,17 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
         Raises:
             InterventionError: The intervention was refused; nothing has changed.
+            ModelError: A function of the reward fails where it was done; nothing has changed.
         """
         wanted = asked(request)
+        kept = self.world.snapshot()
         audit = self.world.do(wanted, space=space)
+        try:
+            self._look()
+        except BaseException:
+            self.world.restore(kept)
+            raise
         self._done.append((self.world.index, wanted))
-        self._look()
         return audit
 
     @property

@@ -50,7 +50,13 @@ class MixedInstallation(EngineError):
 
 
 class EngineFailure(EngineError):
-    """The engine produced a state that is not finite."""
+    """The engine produced a state that is not finite.
+
+    Attributes:
+        unmoved: Of a batch, the numbers of the scenes that are as they were.
+    """
+
+    unmoved: tuple[int, ...] = ()
 
 
 class SnapshotMismatch(ScmWorldError, ValueError):

@@ -15,7 +15,7 @@ from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
 from typing import Any, final
 
-from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption
+from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
 from scm_world.work.threads import children_single_threaded
 
 PROCESS = "process"  # the engine of an EngineFailure
@@ -71,7 +71,8 @@ def pickled(what: str, thing: object) -> bytes:
     try:
         return bytes(ForkingPickler.dumps(thing))
     except Exception as error:
-        raise UnknownOption(what, thing, PICKLED) from error
+        remedy = f"everything in it of such a kind ({in_one_line(error)})"
+        raise UnknownOption(what, thing, (*PICKLED, remedy)) from error
 
 
 @final

@@ -153,7 +153,8 @@ class Batch:
 
         Raises:
             NotReset: A world has no episode yet.
-            EngineFailure: The engine lost a state. All other worlds are one step further.
+            EngineFailure: The engine lost a state, or a step function failed, whose world is as it
+                was. All other worlds are one step further.
         """
         rows = self._all if which is None else np.flatnonzero(which)
         self.fill(rows)
@@ -186,6 +187,7 @@ class Batch:
         stale = rows[~self._fresh[rows]]
         if len(stale):
             mechanisms.evaluate((), matrix, stale)
+        kept, stepped = matrix[rows if self._engine.may_refuse else rows[:0]], self._stepped[rows]
         mechanisms.remember(matrix, rows)
         table.actions()[rows] = commands[rows]
         matrix[rows, table.where[CONTROL_INDEX].start] += 1.0
@@ -193,8 +195,11 @@ class Batch:
         self._stepped[rows] = self._ready[rows] = True
         try:
             self._engine.step(rows, mode, self._commands, substeps, matrix)
-        except BaseException:  # a state is lost, or somebody interrupts: the others were stepped
-            for row in rows.tolist():
+        except BaseException as error:  # or somebody interrupts: the others were stepped
+            unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
+            for place, row in enumerate(rows.tolist()):
+                if row in unmoved:
+                    matrix[row], self._stepped[row] = kept[place], stepped[place]
                 world = self.world(row)
                 world.backend.read(world.current()[1])
             raise

@@ -187,9 +187,9 @@ class Solver:
             if impossible and not impossible.isdisjoint(p.name for p in variable.all_parents):
                 impossible.add(name)
                 continue
-            known[name] = value = self.model.evaluate(name, known, self._key)
             follows = variable.bounds is not None and variable.bounds.parents()
             try:
+                known[name] = value = self.model.evaluate(name, known, self._key)
                 if np.shape(value) != variable.shape:  # of a mechanism that a user gave
                     raise WrongShape(name, value, variable.shape, np.shape(value))
                 check_bounds(variable, value, self._context() if follows else {})

@@ -59,6 +59,8 @@ class PresentValues:
         row, where = self.matrix[0], self.compiled.mechanisms.where
         for name, value in static.items():
             if value is not self.static.get(name):
+                if isinstance(value, np.ndarray):
+                    value.flags.writeable = False  # snapshots share it
                 row[where[name]] = np.ravel(value)
         self.static = static
         self.now.update(static)

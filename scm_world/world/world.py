@@ -302,6 +302,7 @@ class World(WorldAttributes):
         self._require_state()
         command = self.decided(command)
         values = self._values
+        kept = values.matrix.copy()
         values.remember()
         values.action[:] = command
         try:
@@ -310,7 +311,9 @@ class World(WorldAttributes):
         except EngineFailure as error:
             left = self.compiled.empty_state()
             self.backend.read(left)
-            if np.isfinite(left.vector).all():
+            if np.isfinite(left.vector).all():  # nothing has happened
+                values.matrix[...] = kept
+                values.be_at(self._index)
                 raise
             said = f"{error}; {self._largest()}" if left.vector.size else str(error)
             self._lost = f"the state was lost in control step {self._index}: {said}"
@@ -580,7 +583,7 @@ class World(WorldAttributes):
         base = self._base
         saved = base and WorldSnapshot(
             engine=None,
-            kept=base.static,
+            kept=dict(base.static),
             interventions=base.model.interventions,
             index=base.index,
             plan=base.compiled.plan,
@@ -591,7 +594,7 @@ class World(WorldAttributes):
         static, engine = self._values.static, self.backend.snapshot()
         found = WorldSnapshot(
             engine=engine,
-            kept=static,
+            kept=dict(static),
             interventions=self._held.interventions,
             previous=self.previous(),
             action=np.array(self._values.action),

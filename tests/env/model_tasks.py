@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from scm_world import Action, Box, Exogenous, Measured, ModelTask, StepTask
+from scm_world import Action, Box, Exogenous, Measured, ModelTask, Parent, StepTask
 
 CARTPOLE = """<mujoco model="cartpole"><option timestep="0.01"/><worldbody>
   <camera name="side" pos="0 -4 1" zaxis="0 -1 0.1"/><body name="cart">
@@ -87,3 +87,31 @@ class Decay(StepTask):
     actions = (Action(name="inflow", shape=(2,)),)
     reward = (np.abs, "level")
     step = staticmethod(decay)
+
+
+def fragile(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
+    """Do the same, and fail as a whole where anything is full."""
+    if np.any(state["level"] > parameters["size"]):
+        raise OverflowError("full")
+    return {"level": state["level"] + action["inflow"]}
+
+
+def risen(level: Any, before: Any) -> Any:
+    """Give how much there is, and how much more it is than before."""
+    return level + 10.0 * (level - before)
+
+
+class Fragile(StepTask):
+    """A function that fails in some worlds."""
+
+    parameters = (Exogenous(name="size", default=1e6, bounds=Box(0.0, 1e6)),)
+    states = (Measured(name="level", default=1.0),)
+    actions = (Action(name="inflow", bounds=Box(-1.0, 1.0)),)
+    reward = (risen, "level", Parent("level", lag=1))
+    step = staticmethod(fragile)
+
+
+class FragileTogether(Fragile):
+    """The same, called once for all worlds."""
+
+    vectorized = True

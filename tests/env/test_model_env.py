@@ -11,13 +11,25 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
-from model_tasks import ANGLE, CARTPOLE, PLACE, Balance, Decay, Falling, Scored, upright
+from model_tasks import (
+    ANGLE,
+    CARTPOLE,
+    PLACE,
+    Balance,
+    Decay,
+    Falling,
+    Fragile,
+    FragileTogether,
+    Scored,
+    upright,
+)
 from numba import njit
 
 from scm_world import World
 from scm_world.env import MODEL_ID, ScmWorldEnv
 from scm_world.errors import (
     ActionError,
+    EngineFailure,
     InterventionError,
     ModelError,
     UnknownOption,
@@ -330,3 +342,46 @@ def test_the_defaults_of_the_robot_are_what_they_were() -> None:
     made = ScmWorldEnv("pushing", backend="fake").made_with
     wanted = {"action_mode": "joint_positions", "preset": "fast", "frame_skip": 10}
     assert wanted.items() <= made.items()
+
+
+@pytest.mark.parametrize(
+    ("crew", "task"),
+    [("loop", Fragile), ("native", Fragile), ("native", FragileTogether), ("processes", Fragile)],
+)
+def test_a_function_that_fails_in_one_world_stops_no_other(crew: str, task: Any) -> None:
+    """Its world is as it was, and goes on; the others are one step further."""
+    many: Any = gymnasium.make_vec(MODEL_ID, 3, crew=crew, model=task())
+    many.reset(seed=[0, 1, 2])
+    asked = np.array([[0.5], [0.25], [-0.5]], dtype=np.float32)
+    many.step(asked)
+    many.do({1: {"size": 0.0}})
+    with pytest.raises(EngineFailure, match="full"):
+        many.step(asked)
+    np.testing.assert_array_equal(many.present()[0].ravel(), [2.0, 1.25, 0.0])
+    many.do({1: {"size": 5.0}})
+    _, rewards, *_ = many.step(asked)
+    np.testing.assert_array_equal(many.present()[0].ravel(), [2.5, 1.5, -0.5])
+    np.testing.assert_allclose(rewards, [7.5, 4.0, -5.5])
+    many.close()
+
+
+def test_an_intervention_after_which_the_reward_fails_is_not_done() -> None:
+    """The world is as it was, and the environment goes on like one without the intervention."""
+    env, other = (make(CARTPOLE, reward=(ratio, PLACE, "pole.mass")) for _ in range(2))
+    for one in (env, other):
+        one.reset(seed=0)
+        one.step(np.array([0.5], np.float32))
+        one.unwrapped.do({PLACE: 0.25})
+    before = env.unwrapped.world.values()
+    with pytest.raises(ModelError, match="ZeroDivisionError"):
+        env.unwrapped.do({"pole.mass": 2.0, PLACE: 0.5})
+    assert same(env.unwrapped.world.values(), before)
+    assert env.unwrapped.interventions == other.unwrapped.interventions
+    for one in (env, other):
+        one.unwrapped.do({ANGLE: 0.125})
+    assert same(env.step(np.array([-0.5], np.float32)), other.step(np.array([-0.5], np.float32)))
+
+
+def ratio(place: Any, mass: Any) -> float:
+    """Give a number, but where the mass is 2."""
+    return float(place) / (float(mass) - 2.0)

@@ -63,6 +63,8 @@ def test_worlds_go_on_where_another_one_is_lost(
 class _Interrupted:
     """An engine during whose step somebody presses Ctrl-C."""
 
+    may_refuse = False
+
     def __init__(self, engine: Any) -> None:
         self._engine = engine
 

@@ -40,6 +40,11 @@ def first(parent: Any) -> float:
     return float(np.ravel(parent)[0])
 
 
+def text(parent: Any) -> str:
+    """Give no number."""
+    return "red"
+
+
 Mistake = tuple[dict[str, Any], type[InterventionError], str]
 
 MISTAKES: dict[str, Mistake] = {
@@ -80,6 +85,16 @@ MISTAKES: dict[str, Mistake] = {
         {"robot_height": Mechanism(three, ["robot_finger_60_link_1.mass"])},
         WrongShape,
         "robot_height",
+    ),
+    "function of one number": (
+        {"goal_block.color": Mechanism(first, ["stage_friction"])},
+        WrongShape,
+        "goal_block.color",
+    ),
+    "function of a text": (
+        {"floor_color": Mechanism(text, ["stage_friction"])},
+        WrongType,
+        "floor_color",
     ),
     "state of wrong shape": (
         {"tool_block.angular_velocity": Mechanism(first, ["robot_finger_60_link_1.mass"])},
