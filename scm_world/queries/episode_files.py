@@ -11,7 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from scm_world.errors import DAMAGED, ModelError, SnapshotMismatch, UnknownOption, UnreadableFile
+from scm_world.errors import (
+    DAMAGED,
+    ModelError,
+    ScmWorldError,
+    SnapshotMismatch,
+    UnknownOption,
+    UnreadableFile,
+    in_one_line,
+)
 from scm_world.output.durable import write_durably
 from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
@@ -25,6 +33,7 @@ from scm_world.variables import Subset
 from scm_world.world import World
 
 FORMAT = "scm_world/episode/1"
+_ADVICE = "give a file that save_episode wrote"
 KEYS = {
     "task",
     "arguments",
@@ -153,16 +162,22 @@ def load_episode(
     """
     file = Path(path)
     about, actions, states, lengths = _read(file)
-    twins = twins_of(world) if world is not None else _twins(about)
-    model = twins.task.system.digest if isinstance(twins.task, ModelTask) else None
-    if about.get("model") != model:
-        raise SnapshotMismatch(f"{file} happened in another model, or one that was changed since")
-    layers = tuple(
-        (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
-    )
-    unit = Unit(about["seed"], about["number"], layers, Given(actions), about["steps"])
-    with twins.twin() as twin:
-        trace = unit.run(twin)
+    try:
+        twins = twins_of(world) if world is not None else _twins(about)
+        model = twins.task.system.digest if isinstance(twins.task, ModelTask) else None
+        if about.get("model") != model:
+            problem = "happened in another model, or one that was changed since"
+            raise SnapshotMismatch(f"{file} {problem}")
+        layers = tuple(
+            (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
+        )
+        unit = Unit(about["seed"], about["number"], layers, Given(actions), about["steps"])
+        with twins.twin() as twin:
+            trace = unit.run(twin)
+    except DAMAGED as error:
+        if isinstance(error, ScmWorldError):
+            raise
+        raise UnreadableFile(str(file), in_one_line(error), _ADVICE) from error
     if _digest(trace) != about["parameters"]:
         raise SnapshotMismatch(f"{file} happens with other parameters than it did")
     _compare(trace, np.split(states, np.cumsum(lengths)[:-1]), file, about["versions"])
@@ -170,24 +185,23 @@ def load_episode(
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
-    advice = "give a file that save_episode wrote"
     try:
         arrays = read_arrays(file)
         about = json.loads(str(arrays["about"]))
         found = arrays["actions"], arrays["states"], arrays["lengths"]
     except DAMAGED as error:
-        raise UnreadableFile(str(file), str(error), advice) from None
+        raise UnreadableFile(str(file), str(error), _ADVICE) from None
     if not isinstance(about, dict) or about.get("format") != FORMAT or not about.keys() >= KEYS:
-        raise UnreadableFile(str(file), "it is no episode", advice)
+        raise UnreadableFile(str(file), "it is no episode", _ADVICE)
     actions, states, lengths = found
     steps = about["steps"]
     whole = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 0
     if not (whole and lengths.shape == (steps + 1,) and states.shape == (int(lengths.sum()),)):
         reason = f"it says {steps!r} control steps, and holds states of {len(lengths) - 1}"
-        raise UnreadableFile(str(file), reason, advice)
+        raise UnreadableFile(str(file), reason, _ADVICE)
     if actions.ndim != 2 or len(actions) != steps:
         reason = f"it says {steps} control steps, and holds actions of shape {actions.shape}"
-        raise UnreadableFile(str(file), reason, advice)
+        raise UnreadableFile(str(file), reason, _ADVICE)
     return about, *found
 
 

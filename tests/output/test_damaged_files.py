@@ -21,7 +21,7 @@ from scm_world.curricula import Curriculum
 from scm_world.discovery.data.files import load as dataset_of
 from scm_world.discovery.data.folders import SIDECAR
 from scm_world.errors import ModelError, ScmWorldError, UnreadableFile
-from scm_world.evaluation import Evaluation, evaluate
+from scm_world.evaluation import Evaluation, check, evaluate
 from scm_world.evaluation.players import as_player
 from scm_world.evaluation.recording import Recording
 from scm_world.geometry.hulls import load_hull
@@ -157,6 +157,33 @@ def test_an_episode_says_no_more_steps_than_it_holds(
     np.savez_compressed(tmp_path / "other.npz", **found)
     with pytest.raises(UnreadableFile, match="control steps"):
         load_episode(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"layers": 3}, {"layers": [[0]]}, {"options": "x"}, {"task": {}}, {"arguments": [1]}],
+)
+def test_an_episode_that_says_something_else_is_refused(
+    episode_file: Path, tmp_path: Path, changed: dict[str, Any]
+) -> None:
+    """Whatever stands where something else should."""
+    with np.load(episode_file) as arrays:
+        found = dict(arrays)
+    about = {**json.loads(str(found["about"])), **changed}
+    np.savez(tmp_path / "other.npz", **{**found, "about": np.array(json.dumps(about))})
+    with pytest.raises(UnreadableFile):
+        load_episode(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    "changed", [{"agents": [3]}, {"env": {"start": {"kind": "x"}}}, {"seeds": 3}]
+)
+def test_results_that_say_something_else_are_not_checked(changed: dict[str, Any]) -> None:
+    """With an error of this package."""
+    short = {"max_episode_length": 1}
+    found = evaluate("still", "P0", task="reaching", n=1, backend="fake", env=short)
+    with pytest.raises(ScmWorldError):
+        check(Evaluation({**found.about, **changed}, found.columns))
 
 
 def test_damaged_episodes_are_told(episode_file: Path, tmp_path: Path) -> None:
