@@ -20,8 +20,9 @@ from scm_world.errors import (
     UnknownOption,
     in_one_line,
 )
-from scm_world.evaluation.arena import Arena
-from scm_world.evaluation.pipeline import Bench
+from scm_world.evaluation.agents import AgentRun, listed
+from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
@@ -80,41 +81,25 @@ def shard_runner_of(
         UnreadableFile: The file of a policy has changed.
     """
     about = evaluation.about
-<<<<<<< HEAD
-    place = _place(about, task, trusted, known=bool(evaluation.policies))
-    _same_versions(place, about["versions"])
-    protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
-    setup = Setup(
-        place,
-        tuple(_agent_runs(evaluation, policy, trusted)),
-        tuple(about["engines"]),
-        tuple(protocols),
-        tuple(about["seeds"]),
-        about["n"],
-        about["versions"],
-    )
-    return ShardRunner(setup, trusted)
-=======
     try:
         place = _place(about, task, trusted, known=bool(evaluation.policies))
         _same_versions(place, about["versions"])
         protocols = [Protocol.from_dict(one, trusted=trusted) for one in about["protocols"]]
         setup = Setup(
             place,
-            tuple(_seats(evaluation, policy, trusted)),
+            tuple(_agent_runs(evaluation, policy, trusted)),
             tuple(about["engines"]),
             tuple(protocols),
             tuple(about["seeds"]),
             about["n"],
             about["versions"],
         )
-        return Bench(setup, trusted)
+        return ShardRunner(setup, trusted)
     except DAMAGED as error:
         if isinstance(error, ScmWorldError):
             raise
         problem = f"what the evaluation says of itself cannot be used: {in_one_line(error)}"
         raise ModelError([problem]) from error
->>>>>>> c480a2e (Episodes and evaluations that say something else than they should are refused by name; tests of undoing cover groups of variables in every task)
 
 
 def _place(

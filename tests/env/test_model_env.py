@@ -345,12 +345,12 @@ def test_the_defaults_of_the_robot_are_what_they_were() -> None:
 
 
 @pytest.mark.parametrize(
-    ("crew", "task"),
+    ("executor", "task"),
     [("loop", Fragile), ("native", Fragile), ("native", FragileTogether), ("processes", Fragile)],
 )
-def test_a_function_that_fails_in_one_world_stops_no_other(crew: str, task: Any) -> None:
+def test_a_function_that_fails_in_one_world_stops_no_other(executor: str, task: Any) -> None:
     """Its world is as it was, and goes on; the others are one step further."""
-    many: Any = gymnasium.make_vec(MODEL_ID, 3, crew=crew, model=task())
+    many: Any = gymnasium.make_vec(MODEL_ID, 3, executor=executor, model=task())
     many.reset(seed=[0, 1, 2])
     asked = np.array([[0.5], [0.25], [-0.5]], dtype=np.float32)
     many.step(asked)
