@@ -126,10 +126,9 @@ class SCM:
     )
 
     def __init__(self, variables: Iterable[Variable]) -> None:
-        self._declared = checked(variables)
-        parents = {name: variable.all_parents for name, variable in self._declared.items()}
-        self._structure: EdgeIndex | None = EdgeIndex(parents)
-        self._order: tuple[str, ...] = self._structure.order
+        self._declared, edges = checked(variables)
+        self._structure: EdgeIndex | None = edges
+        self._order: tuple[str, ...] = edges.order
         self._evaluator = Evaluator(self._declared)
         self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}

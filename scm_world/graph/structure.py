@@ -7,12 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
+from operator import attrgetter
 from typing import Any, final
 
 import networkx as nx
 
 from scm_world.errors import CyclicModel, ModelError, nearest
 from scm_world.variables import Derived, Parent, Variable
+
+_NAME, _KEY = attrgetter("name"), attrgetter("name", "lag")  # of parents
 
 
 @final
@@ -155,11 +158,12 @@ def _cycles(graph: nx.DiGraph) -> Iterable[list[str]]:
 
 
 def _parent_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    keys = [(parent.name, parent.lag) for parent in variable.all_parents]
-    if len(set(keys)) == len(keys) and all(name in known for name, _ in keys):
-        return
-    named = Counter(keys)
-    for (name, lag), times in named.items():
+    causes = variable.all_parents
+    names = set(map(_NAME, causes))
+    unique = len(names) == len(causes) or len(set(map(_KEY, causes))) == len(causes)
+    if unique and known.keys() >= names:
+        return  # nearly always, and there are many
+    for (name, lag), times in Counter(map(_KEY, causes)).items():
         if name not in known:
             hint = nearest(name, known)
             suggestion = f"; did you mean {hint!r}?" if hint else ""
@@ -194,8 +198,11 @@ def _bundle_problems(variable: Variable, known: Mapping[str, Variable]) -> Itera
             yield f"{name!r} in the bundle {variable.name!r} is no quantity of its own"
 
 
-def checked(variables: Iterable[Variable]) -> dict[str, Variable]:
+def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeIndex]:
     """Index variables by name, or raise one error that lists everything that is wrong.
+
+    Returns:
+        The variables by name, and the edges among them.
 
     Raises:
         ModelError: Duplicate names, unknown parents, contemporaneous cycles.
@@ -215,10 +222,13 @@ def checked(variables: Iterable[Variable]) -> dict[str, Variable]:
             sound |= set() if found else {id(parents[variable.name])}
         problems.extend(_variable_problems(variable, by_name))
         problems.extend(_bundle_problems(variable, by_name))
+    if problems:  # of parents that there are, cycles are told as well
+        for name, causes in parents.items():
+            parents[name] = tuple(parent for parent in causes if parent.name in by_name)
     try:
-        _topological(by_name, [edge for edge in _instant(parents) if edge.cause in by_name])
+        edges = EdgeIndex(parents)
     except ModelError as error:
         problems.extend(error.problems)
     if problems:
         raise ModelError(problems)
-    return by_name
+    return by_name, edges

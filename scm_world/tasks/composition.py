@@ -68,15 +68,17 @@ class State:
     a: Space | None = None
     b: Space | None = None
 
-    def declare(self, inputs: Iterable[Parent]) -> Measured:
+    def declare(self, inputs: Mapping[str, Parent]) -> Measured:
         """Write the declaration.
 
         Args:
-            inputs: All quantities of the world that physics knows, as causes that act where
-                there is contact.
+            inputs: All quantities of the world that physics knows, by name, as causes that act
+                where there is contact.
         """
         always = tuple(Parent(name, 1) for name in self.always)
-        contact = tuple(parent for parent in inputs if parent.name not in self.always)
+        contact = dict(inputs)
+        for name in self.always:
+            contact.pop(name, None)
         on_set = tuple(Parent(name, 0, "set") for name in self.on_set)
         return Measured(
             name=self.name,
@@ -87,7 +89,7 @@ class State:
             b=self.b,
             default=self.default,
             doc=self.doc,
-            parents=always + contact + on_set,
+            parents=(*always, *contact.values(), *on_set),
             start=self.start,
             carry=self.carry,
             restart=self.restart,

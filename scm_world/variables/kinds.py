@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Annotated, Any, Literal, final, get_args
 
 import numpy as np
@@ -83,7 +84,12 @@ def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
         raise ValueError(f"parents must be a sequence of names, got the text {value!r}")
     if isinstance(value, tuple) and set(map(type, value)) <= {Parent}:
         return value  # variables with the same parents share one tuple of them
-    return validate(tuple(Parent(p) if isinstance(p, str) else p for p in value))
+    return validate(tuple(_instantly(p) if isinstance(p, str) else p for p in value))
+
+
+@lru_cache(maxsize=2**14)
+def _instantly(name: str) -> Parent:
+    return Parent(name)
 
 
 AsParents = Annotated[tuple[Parent, ...], WrapValidator(_as_parents)]

@@ -111,7 +111,7 @@ class BlockWorld(Composition):
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
         names = [name for entity in self.entities for name in entity.inputs()]
-        inputs = tuple(Parent(name, 1, "contact") for name in (*names, *self.deciding))
+        inputs = {name: Parent(name, 1, "contact") for name in (*names, *self.deciding)}
         declared: list[Variable] = list(self.shared)
         for entity in self.entities:
             declared.extend(entity.variables())
