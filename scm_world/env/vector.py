@@ -91,6 +91,11 @@ class Vector:
         self._size = low.size
         self._read = places(where[name] for name in self._slices if name != KEYPOINTS)
         self._published = world.conventions.published_observation
+        self._turns = [
+            place
+            for name, place in self._slices.items()
+            if self._published and name.endswith(".orientation")
+        ]
         hard = np.concatenate([np.full(part.low.size, part.saturates) for part in parts])
         self._scale(low, high, normalize & bounded & (high > low), hard)
         self._version = -1
@@ -126,6 +131,8 @@ class Vector:
             out: Their rows are written, shape (n_worlds, n).
         """
         scale_rows(numbers, rows, self._read, self._shifts, self._scales, out)
+        for place in self._turns:
+            out[rows, place] *= _signs(out[rows, place])
 
     def observe(self, now: Mapping[str, Value]) -> NDArray[np.float32]:
         """Give the observation, shape (n,)."""
@@ -144,6 +151,8 @@ class Vector:
             raw = np.insert(raw, self._slices[KEYPOINTS].start, self._keypoints.observe(now))
         raw = self._sensed(raw) if self._noise else raw
         scale_rows(raw[None], FIRST, np.arange(raw.size), np.zeros(raw.size), self._scales, found)
+        for place in self._turns:
+            found[:, place] *= _signs(found[:, place])
         return shown
 
     def _sensed(self, raw: Floats) -> Floats:
@@ -158,6 +167,23 @@ def box(low: Floats, high: Floats) -> gymnasium.Space[NDArray[np.float32]]:
     """Give a space of 32-bit floats."""
     bounds: Any = (low.astype(np.float32), high.astype(np.float32))
     return gymnasium.spaces.Box(*bounds, dtype=np.float32)
+
+
+def _signs(turns: NDArray[np.float32]) -> Floats:
+    """Give the signs with which quaternions (x, y, z, w) are read from a rotation matrix.
+
+    The predecessor's engine does so: w is positive where the trace of the matrix is, which is up
+    to 120°; beyond, the greatest of the other three is.
+
+    Args:
+        turns: Shape (n, 4), of any length.
+
+    Returns:
+        1 or -1, shape (n, 1).
+    """
+    near = 4.0 * turns[:, 3] ** 2 > (turns**2).sum(axis=1)
+    first = np.where(near, 3, np.abs(turns[:, :3]).argmax(axis=1))
+    return np.where(turns[np.arange(len(turns)), first] < 0.0, -1.0, 1.0)[:, None]
 
 
 def _places(parts: Sequence[ObservedPart]) -> dict[str, slice]:

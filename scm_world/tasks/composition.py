@@ -245,10 +245,12 @@ class Composition(ABC):
         """Give the physics step [s]."""
         return float(self.structure(values).timestep)
 
-    def overlaps(self, scene: Scene, tolerance: float | None = None) -> tuple[Overlap, ...]:
+    def overlaps(
+        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+    ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m].
 
-        None stands for what the task allows after an intervention.
+        None stands for what the task allows after an intervention on the variables asked for.
         """
         return ()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from scm_world.errors import UnknownOption
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.variables import Box, Integers, Space, Variable
+
+OBSTACLE_FRICTION = 1.0
 
 
 @final
@@ -32,6 +34,8 @@ class Conventions:
             ``A|B`` as the hull of A and B, and, in picking, cylindrical positions of goals of
             which the height alone counts.
         static_counts: Obstacles count for the length of an episode, like blocks.
+        published_physics: On Bullet, the shapes, the damping and the spinning friction of the
+            predecessor; everywhere, obstacles with the friction of blocks.
         tolerance: How deep two bodies may lie in one another after an intervention [m].
         robot_tolerance: The same where one of them is a link of the robot [m].
     """
@@ -44,6 +48,7 @@ class Conventions:
     distance_as_reward: bool = False
     published_spaces: bool = False
     static_counts: bool = False
+    published_physics: bool = False
     tolerance: float = TOLERANCE
     robot_tolerance: float = TOLERANCE
 
@@ -56,7 +61,7 @@ class Conventions:
 CONVENTIONS = {
     "scm_world": Conventions("scm_world"),
     "causal_world": Conventions(
-        *("causal_world", True, True, True, True, True, True, True),
+        *("causal_world", True, True, True, True, True, True, True, True),
         tolerance=0.03,
         robot_tolerance=0.0095,
     ),
@@ -77,7 +82,7 @@ def conventions(name: str) -> Conventions:
 
 def _as_published(variable: Variable) -> Variable:
     """Source: CausalWorld 1.2, ``task_generators/base_task.py``."""
-    changes: dict[str, Space | None] = {}
+    changes: dict[str, Any] = {}
     a, b = variable.a, variable.b
     if variable.name == "gravity":
         a = b = None
@@ -88,6 +93,8 @@ def _as_published(variable: Variable) -> Variable:
     hull = _hull(variable.shape, a, b)
     if hull is not None:
         changes["a_or_b"] = hull
+    if variable.name.startswith("obstacle") and variable.name.endswith(".friction"):
+        changes["default"] = OBSTACLE_FRICTION
     return variable.model_copy(update=changes) if changes else variable
 
 

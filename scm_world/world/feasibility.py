@@ -80,7 +80,7 @@ class Present:
         if not self._moves_surfaces(change):
             return []
         then = plan.compiled.describe(plan.static, plan.state)
-        found = plan.compiled.composition.overlaps(then)
+        found = plan.compiled.composition.overlaps(then, asked=plan.asked)
         if not found:
             return []
         now = base.compiled

@@ -49,13 +49,9 @@ class TriFingerTask(Task):
         default_weights: Weight of every dense reward term, in order, and of
             ``fractional_success``.
         paper_weights: Where the published training runs differ.
-        head = HEAD
-    saturates = True
-    raised = hardware.RAISED
-    policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
-        name: partial(_scripted, name) for name in ("sweep", "across", "grasp", "hold")
-    }
-    ready_terms: Further reward terms, by name in the option ``terms``.
+        ready_terms: Further reward terms, by name in the option ``terms``.
+        unchecked: Prefixes of variables; an intervention that sets one may put bodies as deep in
+            one another as it likes, under the conventions of the predecessor.
         start: Where the robot begins, shape (9,) [rad].
     """
 
@@ -74,6 +70,7 @@ class TriFingerTask(Task):
         name: partial(_scripted, name) for name in ("sweep", "across", "grasp", "hold")
     }
     ready_terms: ClassVar[tuple[Measured, ...]] = shaping.ROBOT
+    unchecked: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = hardware.REST
 
     def __init__(self, **common: Unpack[Common]) -> None:
@@ -141,7 +138,10 @@ class TriFingerTask(Task):
         )
         there = tuple(entity for entity in entities if entity.name not in self.absent)
         while True:
-            made = BlockWorld(there, tuple(self.shared()), self.decided_by, mode, self.conventions)
+            unchecked = self.unchecked if self.conventions.published_spaces else ()
+            made = BlockWorld(
+                *(there, tuple(self.shared()), self.decided_by, mode, self.conventions, unchecked)
+            )
             variables: list[Variable] = [*made.variables(), *self.readouts()]
             if not self.absent:
                 return made, variables

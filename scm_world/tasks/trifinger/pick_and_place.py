@@ -10,6 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.tasks.composition import Entity
+from scm_world.tasks.conventions import Conventions
 from scm_world.tasks.rewards import FRACTION, term
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import kernels, shapes
@@ -143,7 +144,7 @@ class PickAndPlace(OneBlock):
             spaces=self._sector(GOAL, sign=1.0),
         )
         size = obstacle_size(f"{WALL}.size", WALL_SIZE, a=WALL_A, b=WALL_B)
-        yield Obstacle(WALL, size=size, position=_wall_position())
+        yield Obstacle(WALL, size=size, position=_wall_position(self.conventions))
 
     def _sector(self, name: str, *, sign: float) -> tuple[Box, Box]:
         """Give the cylindrical positions on one side of the wall.
@@ -195,7 +196,17 @@ class PickAndPlace(OneBlock):
         yield smoothness()
 
 
-def _wall_position() -> Derived:
+def _wall_position(conventions: Conventions) -> Variable:
+    """Stand the wall on the floor; the predecessor's keeps its center when its size changes."""
+    if conventions.published_spaces:
+        return Exogenous(
+            name=f"{WALL}.cartesian_position",
+            unit="m",
+            shape=(3,),
+            bounds=numbers.POSITION_BOUNDS,
+            default=(0.0, 0.0, WALL_SIZE[2] / 2.0),
+            doc="Position of the center.",
+        )
     return Derived(
         name=f"{WALL}.cartesian_position",
         unit="m",

@@ -37,6 +37,14 @@ def lifted(height: Value, *, place: Floats) -> Floats:
     return np.concatenate([at, np.asarray(height)[..., None]], axis=-1)
 
 
+def put(*parents: Floats, center: Floats) -> Floats:
+    """Put a block at its place, however large it is and however it is turned, shape (3,) [m].
+
+    Source: CausalWorld 1.2: in picking alone, blocks that grow reach into the floor.
+    """
+    return np.array(center)
+
+
 def above_the_center(cylindrical: Floats) -> Floats:
     """Put a goal above the centre of the arena, at the height of a cylindrical position.
 
@@ -99,7 +107,12 @@ class Picking(OneBlock):
 
     def entities(self) -> Iterable[Entity]:
         """A block and its goal."""
-        yield self.tool(spaces=self.spaces(TOOL, airborne=self.conventions.published_spaces))
+        published = self.conventions.published_spaces
+        center = (*self.place[:2], self.place[2] + self._below(TOOL))
+        yield self.tool(
+            spaces=self.spaces(TOOL, airborne=published),
+            start=Function(put, constants={"center": center}) if published else None,
+        )
         yield self.goal(
             Exogenous(
                 name=HEIGHT,
@@ -116,7 +129,7 @@ class Picking(OneBlock):
                 mechanism=Function(lifted, constants={"place": self.place[:2]}),
             ),
             spaces=self._above(),
-            inverse=above_the_center if self.conventions.published_spaces else from_cylindrical,
+            inverse=above_the_center if published else from_cylindrical,
         )
 
     def _above(self) -> tuple[Box, Box]:

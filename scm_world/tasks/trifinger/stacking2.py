@@ -152,6 +152,7 @@ class Stacking2(Building):
         FRACTION: 1.0,
     }
     goal_causes = (f"{TOWER}.polar", f"{TOWER}.euler_orientation")
+    unchecked = (TOWER,)
 
     def __init__(
         self,

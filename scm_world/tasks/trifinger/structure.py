@@ -40,12 +40,15 @@ class Structure:
         obstacles: Names of boxes that never move by themselves. Blocks, middle and lower links
             and fingertips collide with them.
         hulls: The movable blocks that are no boxes, each with its convex shape.
+        published: Whether Bullet realises all bodies as the predecessor does; see
+            ``bullet.published``.
     """
 
     blocks: tuple[str, ...] = ()
     preset: Preset = FAST
     obstacles: tuple[str, ...] = ()
     hulls: tuple[tuple[str, Hull], ...] = ()
+    published: bool = False
 
     @property
     def timestep(self) -> float:
@@ -80,7 +83,7 @@ class Structure:
 
     def realization(self, backend: str) -> Any:
         """Return how the robot is realised on a backend, or drawn."""
-        return _realization(backend)
+        return _realization("published" if self.published and backend == "bullet" else backend)
 
     def hull(self, block: str) -> Hull | None:
         """Give the shape of a block that is no box; None for a box."""
@@ -90,6 +93,7 @@ class Structure:
 _REALIZATIONS = {
     "mujoco": ("mujoco.realization", "TriFinger"),
     "bullet": ("bullet.client", "TriFingerClient"),
+    "published": ("bullet.published", "PublishedClient"),
     "fake": ("fake", None),
     "renderer": ("drawing", "DRAWING"),
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +129,7 @@ def _form(engine: Any, client: int, shape: Shape) -> int:
     return form
 
 
-def add_block(engine: Any, client: int, shape: Shape) -> int:
+def add_block(engine: Any, client: int, shape: Shape, *, damping: float = 0.0) -> int:
     """Add a block; its mass, friction and so on are set afterwards.
 
     Blocks are multibodies, not the engine's rigid bodies: those are faster in piles, but their
@@ -138,28 +139,33 @@ def add_block(engine: Any, client: int, shape: Shape) -> int:
     block: int = engine.createMultiBody(1.0, form, physicsClientId=client)
     if isinstance(shape, Hull):
         engine.changeDynamics(block, -1, collisionMargin=HULL_MARGIN, physicsClientId=client)
-    engine.changeDynamics(block, -1, linearDamping=0, physicsClientId=client)
-    engine.changeDynamics(block, -1, angularDamping=0, physicsClientId=client)
+    _dampen(engine, client, block, damping)
     engine.changeDynamics(
         block, -1, activationState=engine.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
     )
     return block
 
 
-def add_robot(engine: Any, client: int) -> int:
-    """Add the robot without motors and without damping."""
+def _dampen(engine: Any, client: int, body: int, damping: float) -> None:
+    """Set how fast a body loses speed. Beside it, any other change would land on the base."""
+    engine.changeDynamics(body, -1, linearDamping=damping, physicsClientId=client)
+    engine.changeDynamics(body, -1, angularDamping=damping, physicsClientId=client)
+
+
+def add_robot(
+    engine: Any, client: int, *, meshes: Mapping[str, str] | None = None, damping: float = 0.0
+) -> int:
+    """Add the robot without motors; ``meshes`` are those of ``robot_urdf``."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "trifinger.urdf"
-        file.write_text(robot_urdf())
+        file.write_text(robot_urdf(meshes))
         robot: int = engine.loadURDF(
             str(file),
             useFixedBase=True,
             flags=engine.URDF_USE_INERTIA_FROM_FILE | engine.URDF_USE_SELF_COLLISION,
             physicsClientId=client,
         )
-    # One property a call: beside damping or maxJointVelocity, all others would land on the base.
-    engine.changeDynamics(robot, -1, linearDamping=0, physicsClientId=client)
-    engine.changeDynamics(robot, -1, angularDamping=0, physicsClientId=client)
+    _dampen(engine, client, robot, damping)
     engine.changeDynamics(robot, -1, maxJointVelocity=FASTEST_JOINT, physicsClientId=client)
     for link in range(link_index(3, 0)):
         engine.changeDynamics(robot, link, jointDamping=0, physicsClientId=client)

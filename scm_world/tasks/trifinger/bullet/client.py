@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, ClassVar, final
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -33,13 +34,15 @@ from scm_world.tasks.trifinger.structure import Structure, controller_spec, para
 NO_TORQUES = [0.0] * len(JOINTS)
 
 
-@final
 class TriFingerClient(Client):
     """A physics client with a TriFinger in it.
 
     Attributes:
         bodies: The engine's numbers of all bodies.
+        block_damping: What share of its speed a block loses in a second, roughly.
     """
+
+    block_damping: ClassVar[float] = 0.0
 
     modes: ClassVar[tuple[ControlMode, ...]] = (
         ControlMode.JOINT_POSITIONS,
@@ -124,13 +127,15 @@ class TriFingerClient(Client):
         obstacles = {
             name: arena.add_obstacle(engine, handle, shapes[name]) for name in structure.obstacles
         }
-        blocks = {name: arena.add_block(engine, handle, shapes[name]) for name in structure.blocks}
-        self.bodies = Bodies(was.robot, was.floor, was.stage, obstacles, blocks, shapes)
+        blocks = {
+            name: arena.add_block(engine, handle, shapes[name], damping=self.block_damping)
+            for name in structure.blocks
+        }
+        self.bodies = replace(was, obstacles=obstacles, blocks=blocks, shapes=shapes)
 
     def _place(self, parameters: Values) -> None:
-        """Put the obstacles in their places, and enter them anew."""
+        """Put the obstacles in their places."""
         engine, handle = self.engine, self.handle
-        group, mask = arena.OBSTACLE, arena.OBSTACLE_MASK
         for name, body in self.bodies.obstacles.items():
             position = numbers(parameters, (name, "position"))
             turn = numbers(parameters, (name, "orientation"))
@@ -139,7 +144,16 @@ class TriFingerClient(Client):
                     f"{name}.orientation must be a quaternion, got {turn}", "bullet"
                 )
             engine.resetBasePositionAndOrientation(body, position, turn, physicsClientId=handle)
-            engine.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=handle)
+
+    def entered(self) -> Iterator[tuple[int, int, int, int]]:
+        """List bodies and links, each with group and mask, in the order in which they meet."""
+        bodies = self.bodies
+        for body in bodies.obstacles.values():
+            yield body, -1, arena.OBSTACLE, arena.OBSTACLE_MASK
+        for link, group, mask in arena.LINK_GROUPS:
+            yield bodies.robot, link, group, mask
+        for body in bodies.blocks.values():
+            yield body, -1, arena.BLOCK, -1
 
     def pose(self, parameters: Values, state: list[float]) -> None:
         """Put all that stands or moves in its place, and make the engine forget the contacts."""
@@ -149,13 +163,12 @@ class TriFingerClient(Client):
         engine.resetBasePositionAndOrientation(robot, position, orientation, physicsClientId=handle)
         for joint, angle, speed in zip(JOINTS, state[:9], state[9:18], strict=True):
             engine.resetJointState(robot, joint, angle, speed, physicsClientId=handle)
-        for link, group, mask in arena.LINK_GROUPS:
-            engine.setCollisionFilterGroupMask(robot, link, group, mask, physicsClientId=handle)
         for index, body in enumerate(self.bodies.blocks.values()):
             row = state[ROBOT_SIZE + BLOCK_SIZE * index :][:BLOCK_SIZE]
             engine.resetBasePositionAndOrientation(body, row[:3], row[3:7], physicsClientId=handle)
             engine.resetBaseVelocity(body, row[7:10], row[10:13], physicsClientId=handle)
-            engine.setCollisionFilterGroupMask(body, -1, arena.BLOCK, -1, physicsClientId=handle)
+        for body, link, group, mask in self.entered():
+            engine.setCollisionFilterGroupMask(body, link, group, mask, physicsClientId=handle)
 
     def write(self, key: ParameterKey, value: Any) -> None:
         """Set one parameter of live bodies."""

@@ -1,4 +1,4 @@
-"""The robot as URDF text, generated from the constants of ``scene.trifinger``.
+"""The robot as URDF text, generated from the constants of ``hardware``.
 
 Every link has at most one collision shape, so that the engine's saved states are exact; the
 fingertip is therefore a link of its own. A finger is the links base, upper, middle, lower, tip.
@@ -7,7 +7,7 @@ fingertip is therefore a link of its own. A finger is the links base, upper, mid
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import Capsule, Inertial
@@ -28,16 +28,21 @@ def link_index(finger: int, link: int) -> int:
     return LINKS_IN_ENGINE * finger + link
 
 
-def robot_urdf() -> str:
-    """Describe the whole robot."""
+def robot_urdf(meshes: Mapping[str, str] | None = None) -> str:
+    """Describe the whole robot.
+
+    Args:
+        meshes: Files with the collision shapes of the parts that have one; capsules if None.
+    """
+    forms = meshes or {part: _capsule(shape) for part, shape in hardware.COLLISION.items()}
     lines = ['<robot name="trifinger">', _link("base", 1.0, _UNIT, None)]
     for finger in range(3):
-        lines.extend(_finger(finger))
+        lines.extend(_finger(finger, forms))
     lines.append("</robot>")
     return "\n".join(lines)
 
 
-def _finger(finger: int) -> Iterator[str]:
+def _finger(finger: int, forms: Mapping[str, str]) -> Iterator[str]:
     """Describe the five links of a finger and the joints above them."""
     names = [hardware.link_name(hardware.FINGERS[finger], link) for link in range(4)]
     names.append(f"{names[3]}_tip")
@@ -45,8 +50,8 @@ def _finger(finger: int) -> Iterator[str]:
     inertials = (*hardware.INERTIAL, Inertial(_UNIT.center, _UNIT.orientation, tip))  # type: ignore[arg-type]
     masses = (*hardware.LINK_MASS, hardware.TIP_MASS)
     for link, name in enumerate(names):
-        shape = hardware.COLLISION[PARTS[link - 1]] if link else None
-        yield _link(name, masses[link], inertials[link], shape)
+        form = forms.get(PARTS[link - 1]) if link else None
+        yield _link(name, masses[link], inertials[link], form)
     offset, yaw = hardware.FINGER_OFFSET[finger], hardware.FINGER_YAW[finger]
     yield _joint("base", names[0], offset, yaw=yaw)
     for joint in range(3):
@@ -54,26 +59,29 @@ def _finger(finger: int) -> Iterator[str]:
     yield _joint(names[3], names[4], hardware.TIP_ORIGIN)
 
 
-def _link(name: str, mass: float, inertial: Inertial, shape: Capsule | None) -> str:
+def _link(name: str, mass: float, inertial: Inertial, form: str | None) -> str:
     moments = zip(("ixx", "iyy", "izz"), inertial.per_mass, strict=True)
     inertia = " ".join(f'{axis}="{mass * moment!r}"' for axis, moment in moments)
     return (
         f'<link name="{name}"><inertial>{_origin(inertial.center, _rpy(inertial.orientation))}'
         f'<mass value="{mass!r}"/><inertia {inertia} ixy="0" ixz="0" iyz="0"/></inertial>'
-        f"{_shapes(shape)}</link>"
+        f"{_shapes(form)}</link>"
     )
 
 
-def _shapes(shape: Capsule | None) -> str:
-    """Describe a collision shape and its picture. The finger base has a picture only."""
-    if shape is None:
+def _shapes(form: str | None) -> str:
+    """Describe a collision shape and its picture. A link without the former has a picture only."""
+    if form is None:
         return '<visual><geometry><box size="0.02 0.02 0.02"/></geometry></visual>'
+    return f"<visual>{form}</visual><collision>{form}</collision>"
+
+
+def _capsule(shape: Capsule) -> str:
     x, y, z = (end - start for start, end in zip(shape.start, shape.end, strict=True))
     middle = tuple((start + end) / 2 for start, end in zip(shape.start, shape.end, strict=True))
     tilt = (0.0, math.atan2(math.hypot(x, y), abs(z)), math.atan2(y, x))  # from the z axis
     capsule = f'<capsule radius="{shape.radius!r}" length="{math.hypot(x, y, z)!r}"/>'
-    body = f"{_origin(middle, tilt)}<geometry>{capsule}</geometry>"
-    return f"<visual>{body}</visual><collision>{body}</collision>"
+    return f"{_origin(middle, tilt)}<geometry>{capsule}</geometry>"
 
 
 def _joint(

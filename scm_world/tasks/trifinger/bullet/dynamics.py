@@ -44,6 +44,9 @@ class Bodies:
         obstacles: By name.
         blocks: By name, in the order of the state.
         shapes: Of obstacles and blocks, by name.
+        spinning: What robot, floor and stage, obstacles, and blocks get of the spinning friction
+            of the scene; see ``BLOCK_SPINNING``.
+        ground: What is under the floor, if anything is.
     """
 
     robot: int
@@ -52,6 +55,8 @@ class Bodies:
     obstacles: dict[str, int] = field(default_factory=dict)
     blocks: dict[str, int] = field(default_factory=dict)
     shapes: dict[str, Shape] = field(default_factory=dict)
+    spinning: tuple[float, float, float] = (OTHER_SPINNING, OTHER_SPINNING, BLOCK_SPINNING)
+    ground: int = -1
 
     def place(self, name: str) -> tuple[int, int]:
         """Give body and link of a block, obstacle, link or surface."""
@@ -73,10 +78,14 @@ class Bodies:
             return [self.place(name), (self.robot, link_index(LINKS[name][0], TIP))]
         return [self.place(name)]
 
-    def others(self) -> Iterator[tuple[int, int]]:
-        """Give bodies and links of all that collides and is no block."""
-        yield from self.places("robot")
-        yield from ((body, -1) for body in (self.floor, *self.stage, *self.obstacles.values()))
+    def groups(self) -> tuple[list[tuple[int, int]], ...]:
+        """Give bodies and links of robot, floor and stage, those of obstacles, and of blocks."""
+        fixed = [*self.places("robot"), *((body, -1) for body in (self.floor, *self.stage))]
+        return (
+            fixed,
+            [(b, -1) for b in self.obstacles.values()],
+            [(b, -1) for b in self.blocks.values()],
+        )
 
 
 def write(engine: Any, client: int, bodies: Bodies, key: ParameterKey, value: Any) -> None:
@@ -111,7 +120,6 @@ def _changes(
     bodies: Bodies, name: str, quantity: str, value: float
 ) -> Iterator[tuple[int, int, dict[str, float]]]:
     """List bodies, links, and what becomes of them: one property a call, see ``add_robot``."""
-    blocks = [(body, -1) for body in bodies.blocks.values()]
     match quantity:
         case "friction":
             yield from ((*place, {"lateralFriction": value}) for place in bodies.places(name))
@@ -119,12 +127,11 @@ def _changes(
             if value < 0.0:
                 raise EngineFailure(f"restitution must not be negative, got {value}", "bullet")
             root = {"restitution": math.sqrt(value)}
-            yield from ((*place, root) for place in (*bodies.others(), *blocks))
+            yield from ((*place, root) for places in bodies.groups() for place in places)
         case "spinning_friction":
-            share = {"spinningFriction": OTHER_SPINNING * value}
-            yield from ((*place, share) for place in bodies.others())
-            share = {"spinningFriction": BLOCK_SPINNING * value}
-            yield from ((*place, share) for place in blocks)
+            for share, places in zip(bodies.spinning, bodies.groups(), strict=True):
+                change = {"spinningFriction": share * value}
+                yield from ((*place, change) for place in places)
 
 
 def moments(bodies: Bodies, name: str, mass: float) -> list[float]:

@@ -35,7 +35,7 @@ def _name(bodies: Bodies, body: int, link: int) -> str:
     if body == bodies.robot:
         finger, part = divmod(link, LINKS_IN_ENGINE)
         return hardware.link_name(hardware.FINGERS[finger], min(part, LOWER))
-    if body == bodies.floor:
+    if body in (bodies.floor, bodies.ground):
         return "floor"
     boxes = (*bodies.blocks.items(), *bodies.obstacles.items())
     return next((name for name, number in boxes if number == body), "stage")

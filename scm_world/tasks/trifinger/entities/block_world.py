@@ -56,7 +56,9 @@ class BlockWorld(Composition):
         deciding: Variables that decide which entities there are. A body that comes or goes acts
             on the others by contact, so they do.
         mode: What a command means.
-        conventions: Say how deep bodies may lie in one another after an intervention.
+        conventions: Say how deep bodies may lie in one another after an intervention, and
+            whether Bullet has the physics of the predecessor.
+        unchecked: What makes an intervention accepted however deep it puts bodies.
     """
 
     entities: tuple[Entity, ...]
@@ -64,6 +66,7 @@ class BlockWorld(Composition):
     deciding: tuple[str, ...] = ()
     mode: ControlMode = ControlMode.JOINT_POSITIONS
     conventions: Conventions = CONVENTIONS["scm_world"]
+    unchecked: tuple[str, ...] = ()
     solid: bool = field(init=False, default=True)
     blocks: tuple[str, ...] = field(init=False)
     obstacles: tuple[str, ...] = field(init=False)
@@ -87,14 +90,19 @@ class BlockWorld(Composition):
         """Say which bodies the engine has to build, and how finely it cuts time."""
         name = PRESET_NAMES[int(values[PRESET])]
         if name not in self._structures:
-            made = Structure(self.blocks, preset(name), self.obstacles, self.hulls)
+            published = self.conventions.published_physics
+            made = Structure(self.blocks, preset(name), self.obstacles, self.hulls, published)
             self._structures[name] = made
         return self._structures[name]
 
-    def overlaps(self, scene: Scene, tolerance: float | None = None) -> tuple[Overlap, ...]:
+    def overlaps(
+        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
+    ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m]."""
         if tolerance is not None:
             return overlaps(scene, tolerance=tolerance)
+        if any(name.partition(".")[0] in self.unchecked for name in asked):
+            return ()
         robot, others = self.conventions.robot_tolerance, self.conventions.tolerance
         return tuple(
             overlap
