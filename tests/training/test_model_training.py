@@ -28,7 +28,9 @@ def test_a_recipe_takes_a_model() -> None:
     made = recipe(TASK, curriculum=2)
     assert made.env == {}
     assert made.trials.protocols == ("P0", "A", "B")
-    assert Recipe.from_dict(made.as_dict()) == made
+    assert Recipe.from_dict(made.as_dict(), trusted=(TASK,)) == made
+    with pytest.raises(UnknownOption, match="trusted"):
+        Recipe.from_dict(made.as_dict())
     with pytest.raises(UnknownOption, match="P5"):
         recipe(TASK, trials={"protocols": ("P5",)})
     with pytest.raises(UnknownOption, match="did you mean 'pushing'"):
@@ -52,7 +54,7 @@ def test_an_agent_is_trained_evaluated_and_goes_on(tmp_path: Path, kind: str) ->
     metric = {"Balance": "success", "Falling": "return"}[kind]
     assert json.loads(first.read_text())["metric"] == metric
     assert load_policy(trained.policy).n_actions == 1
-    found = evaluate(folder, "A,B", n=2)
+    found = evaluate(folder, "A,B", task=task, n=2)
     assert found.task == task
     assert found.metric() == metric
     longer = train(made, out=folder, steps=512)
