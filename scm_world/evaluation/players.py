@@ -95,6 +95,10 @@ class WorldPolicy:
 
     policy: Callable[..., Any]
 
+    def __post_init__(self) -> None:
+        """Belong to the module of the function, which files may have to trust."""
+        object.__setattr__(self, "__module__", getattr(self.policy, "__module__", None))
+
     def __call__(self, world: Any) -> Any:
         """Choose the action."""
         return self.policy(world)
