@@ -203,4 +203,5 @@ def promising(base: StepBase, plan: InterventionPlan, key: NoiseKey, count: int)
             candidates.attempts = attempts
         yield from candidates.attempts[candidates.attempts < count - 1].tolist()
         first, size = first + size, 4 * CHUNK
-    yield count - 1
+    if count > 1:
+        yield count - 1
