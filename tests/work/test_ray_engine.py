@@ -180,6 +180,7 @@ def test_a_sweep_on_ray_has_the_same_files(ray: Executor, tmp_path: Path) -> Non
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
 
 
+@pytest.mark.slow
 def test_a_benchmark_on_ray_finds_the_same_graphs(ray: Executor, tmp_path: Path) -> None:
     """Only the seconds differ; each run is kept, and none is done again."""
     asked: Any = {"budgets": [40, 80], "seeds": 1, "standardised": False}
