@@ -16,6 +16,7 @@ from rich.text import Text
 
 from scm_world.cli import console, options
 from scm_world.cli.arguments import load_system, suffix, tag
+from scm_world.errors import UnknownOption
 
 if TYPE_CHECKING:
     from scm_world.graph import SCM
@@ -62,7 +63,14 @@ def _model(name: str, option: Sequence[str] | None, **settings: str | None) -> S
 
 def graph(
     task: options.System,
-    format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.TABLE,
+    format_: Annotated[
+        Format | None,
+        typer.Option(
+            "--format",
+            help="How to write it; without it the ending of --out says so.",
+            show_default="table",
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="File to write to.")] = None,
     action_mode: Annotated[
         str | None,
@@ -76,11 +84,16 @@ def graph(
 ) -> None:
     """Show the declared causal graph of a system.
 
-    Example: scm-world graph pushing --format html --out graph.html
+    Example: scm-world graph pushing --out graph.html
     """
     from scm_world.graph import to_json
     from scm_world.graph.exchange import causal_graph, to_html, write_graph
 
+    if format_ is None:
+        ending = "" if out is None else out.suffix.lower().removeprefix(".")
+        if ending not in {*Format, "", "txt"}:
+            raise UnknownOption("format of a graph", ending, tuple(Format))
+        format_ = Format(ending) if ending in {*Format} else Format.TABLE
     if format_ is Format.PNG and out is None:
         out = Path(f"{tag(task)}{suffix(option or ())}-graph.png")
     if out is not None:

@@ -158,6 +158,21 @@ def test_graph_goes_to_a_file(form: str) -> None:
     assert Path("deep/graph.txt").read_text() == shown
 
 
+def test_the_ending_of_a_file_says_how_a_graph_is_written() -> None:
+    """graph.png is a picture, graph.json the model; an ending that is no format is refused."""
+    Path("chain.py").write_text(CHAIN)
+    assert call("graph", "chain.py:chain", "--out", "graph.png").exit_code == 0
+    assert imread("graph.png").shape[1] == 1600
+    assert call("graph", "chain.py:chain", "--out", "graph.json").exit_code == 0
+    shown = call("graph", "chain.py:chain", "--format", "json").stdout
+    assert Path("graph.json").read_text() == shown
+    refused = call("graph", "chain.py:chain", "--out", "graph.svg")
+    assert refused.exit_code == 2
+    assert "'svg'" in refused.output
+    assert "png" in refused.output
+    assert not Path("graph.svg").exists()
+
+
 def test_graph_as_picture_has_a_default_name() -> None:
     """The picture of the declared graph is a PNG 1600 pixels wide."""
     Path("chain.py").write_text(CHAIN)
