@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import json
 import logging
 import sys
 import types
@@ -160,6 +161,7 @@ def main() -> None:
     parser.add_argument("task", choices=ACTORS)
     parser.add_argument("--protocols", nargs="+", default=[f"P{index}" for index in range(12)])
     parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--out", type=Path, help="a file that gets a line of JSON for every start")
     asked = parser.parse_args()
     stand_in_for_gym()
     import causal_world
@@ -183,6 +185,12 @@ def main() -> None:
             except ScmWorldError as problem:
                 refused += 1
                 print(f"{protocol}: {problem}", file=sys.stderr)
+        if asked.out:
+            names = ("there", "here", "first", "states")
+            with asked.out.open("a", encoding="utf-8") as file:
+                for pair in pairs:
+                    about = {"task": asked.task, "protocol": protocol}
+                    print(json.dumps(about | dict(zip(names, pair, strict=True))), file=file)
         theirs, ours, first, apart = np.array(pairs).T
         off = ours - theirs
         error = off.std(ddof=1) / len(off) ** 0.5 if len(off) > 1 else float("nan")
