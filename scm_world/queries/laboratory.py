@@ -21,8 +21,9 @@ from scm_world.errors import (
     Forbidden,
     UnknownOption,
     UnreadableFile,
+    UnwritableFolder,
 )
-from scm_world.output.reading import read_text
+from scm_world.output.reading import read_text, regular
 from scm_world.queries.outcomes import Outcome, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, sample
@@ -69,6 +70,7 @@ class Journal:
 
     Raises:
         UnreadableFile: The file is no log, or one on other terms.
+        UnwritableFolder: It cannot be written.
     """
 
     def __init__(
@@ -81,7 +83,15 @@ class Journal:
         head = json.loads(json.dumps({"format": FORMAT, **terms}))
         if self._path is None:
             return
-        if self._path.exists() and self._path.stat().st_size:
+        try:
+            regular(self._path)
+            written = self._path.stat().st_size
+        except FileNotFoundError:
+            written = 0
+        except OSError as error:
+            advice = "give the laboratory a file"
+            raise UnreadableFile(str(path), error.strerror or str(error), advice) from None
+        if written:
             self._read(head)
         else:
             self._append(head)
@@ -130,10 +140,14 @@ class Journal:
         if self._path is None:
             return
         self.refuse_others()
-        with self._path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(line, allow_nan=False) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
+        try:
+            with self._path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(line, allow_nan=False) + "\n")
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            said = f"{self._path.name}: {error.strerror or error}"
+            raise UnwritableFolder(str(self._path.parent), said) from None
         self._size = self._path.stat().st_size
 
     def _read(self, head: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from scm_world.errors import (
     UnknownOption,
     UnknownVariable,
     UnreadableFile,
+    UnwritableFolder,
 )
 from scm_world.queries import (
     Clamp,
@@ -139,6 +141,16 @@ def test_a_laboratory_goes_on_with_its_log(tmp_path: Path) -> None:
     log.write_text("no\n")
     with pytest.raises(UnreadableFile, match="no log"):
         lab(log=log)
+
+
+def test_a_log_that_is_no_file_is_refused(tmp_path: Path) -> None:
+    """A pipe is not waited for; a folder, a device and a missing folder are typed errors."""
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe", Path("/dev/full")):
+        with pytest.raises(UnreadableFile, match=r"directory|no regular file"):
+            lab(log=path)
+    with pytest.raises(UnwritableFolder, match="No such file"):
+        lab(log=tmp_path / "missing" / "log.jsonl")
 
 
 def test_a_killed_process_loses_no_finished_experiment(tmp_path: Path) -> None:
