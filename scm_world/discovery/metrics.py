@@ -267,15 +267,15 @@ def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, An
         return {**result, "notes": (f"no intervention distances: {reason}",)}
     notes = []
     result["shd_classes"] = shd_of_classes(edges[0], true[0])
-    bounds = sid_bounds(edges[0], true[0])
-    if bounds is None:
-        notes.append(f"no SID: there are more than {MEMBERS} ways to direct the found graph")
-    else:
-        result["sid_lower"], result["sid_upper"] = bounds
     if has_gadjid():
         result |= {f"{kind}_aid": aid(edges[0], true[0], kind) for kind in kinds}
+        bounds = sid_bounds(edges[0], true[0])
+        if bounds is None:
+            notes.append(f"no SID: there are more than {MEMBERS} ways to direct the found graph")
+        else:
+            result["sid_lower"], result["sid_upper"] = bounds
     else:
-        notes.append("no adjustment distances: pip install 'scm-world[discovery]'")
+        notes.append("no SID, no adjustment distances: pip install 'scm-world[discovery]'")
     return {**result, "notes": tuple(notes)}
 
 

@@ -8,17 +8,17 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
+from scm_world._arguments import whole_number
 from scm_world.discovery.metrics import GraphScore, score
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
 from scm_world.output.locations import Location, located
 from scm_world.output.reading import read_text
-from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.series import Series, checked_count
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.world import World
@@ -158,7 +158,7 @@ def discover(
         >>> discover(model, probes=2).score.shd
         0
     """
-    checked_count("number of probes", probes)
+    whole_number("number of probes", probes, least=1)
     started = time.perf_counter()
     if isinstance(system, SCM):
         series = Series(PairedEquations(system, seed), probes, progress)

@@ -4,15 +4,6 @@ from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
 from scm_world.geometry.filling import overlap_fraction
 from scm_world.geometry.hulls import Hull, box_hull, extents, hull_of, hull_overlap, load_hull
 from scm_world.geometry.overlap import aabb_overlap_fraction, overlap_volume
-from scm_world.geometry.penetration import (
-    box_box,
-    box_capsule,
-    box_floor,
-    box_wall,
-    capsule_capsule,
-    capsule_floor,
-    capsule_wall,
-)
 from scm_world.geometry.rotations import (
     angle_between,
     canonical,
@@ -22,22 +13,13 @@ from scm_world.geometry.rotations import (
     rotation_matrix,
     to_rotation_vector,
 )
-from scm_world.geometry.sweep import Found, sweep
 
 __all__ = [
-    "Found",
     "Hull",
     "aabb_overlap_fraction",
     "angle_between",
-    "box_box",
-    "box_capsule",
-    "box_floor",
     "box_hull",
-    "box_wall",
     "canonical",
-    "capsule_capsule",
-    "capsule_floor",
-    "capsule_wall",
     "extents",
     "from_cylindrical",
     "from_rotation_vector",
@@ -49,7 +31,6 @@ __all__ = [
     "quaternion_inverse",
     "quaternion_product",
     "rotation_matrix",
-    "sweep",
     "to_cylindrical",
     "to_rotation_vector",
 ]

@@ -8,7 +8,7 @@ from functools import lru_cache
 from itertools import pairwise, permutations, product
 from os import PathLike
 from pathlib import Path
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.geometry.arrays import compact
 from scm_world.geometry.hull_kernels import Solid, hull_overlap_kernel
-from scm_world.geometry.rotations import from_rotation_matrix
+from scm_world.geometry.rotations import from_rotation_matrix, rotation_matrix
 
 Vector = tuple[float, float, float]
 
@@ -341,3 +341,54 @@ def _relax(axes: Floats, values: Floats) -> Floats:
         relaxed[:, i] = np.cos(angle) * axes[:, i] + np.sin(angle) * axes[:, j]
         relaxed[:, j] = np.cos(angle) * axes[:, j] - np.sin(angle) * axes[:, i]
     return relaxed
+
+
+class Convex(NamedTuple):
+    """All points within a radius of the convex hull of some corners.
+
+    Attributes:
+        corners: Shape (n, 3) [m].
+        normals: Of the flat sides that are to be looked at, shape (k, 3).
+        radius: Not negative [m].
+    """
+
+    corners: Floats
+    normals: Floats
+    radius: float = 0.0
+
+
+def placed(hull: Hull, position: ArrayLike, orientation: ArrayLike) -> Convex:
+    """Put a polyhedron into the world.
+
+    Args:
+        hull: The shape.
+        position: Of its center of mass, shape (3,) [m].
+        orientation: Quaternion (x, y, z, w).
+    """
+    turn = rotation_matrix(orientation).T
+    corners = np.asarray(position) + np.array(hull.vertices) @ turn
+    return Convex(corners, np.array(hull.planes)[:, :3] @ turn)
+
+
+def sides_depth(first: Convex, second: Convex) -> float:
+    """Bound how far two bodies would have to be moved to come apart.
+
+    Args:
+        first: A body. It or the second one has flat sides.
+        second: Another.
+
+    Returns:
+        The least depth along the normals of all sides [m]. The true one is at most that, and is
+        less only where an edge or a corner of one body meets an edge of the other.
+
+    Example:
+        >>> cube, upright = box_hull([1.0, 1.0, 1.0]), [0.0, 0.0, 0.0, 1.0]
+        >>> at = [placed(cube, [x, 0.0, 0.0], upright) for x in (0.0, 0.75)]
+        >>> sides_depth(*at)
+        0.25
+    """
+    axes = np.vstack([first.normals, second.normals]).T
+    one, other = first.corners @ axes, second.corners @ axes  # (n, k) each
+    ahead = one.max(axis=0) - other.min(axis=0)
+    behind = other.max(axis=0) - one.min(axis=0)
+    return float(np.minimum(ahead, behind).min()) + first.radius + second.radius

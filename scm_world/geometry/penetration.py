@@ -79,7 +79,7 @@ def box_box_kernel(
     center_b: Floats,
     rotation_b: Floats,
 ) -> float:
-    """Measure how far two boxes must be moved apart; see ``box_box``.
+    """Measure how far two boxes must be moved to come apart [m].
 
     Args:
         half_a: Half edge lengths, shape (3,) [m].
@@ -106,7 +106,7 @@ def box_box_kernel(
 def box_capsule_kernel(
     half: Floats, center: Floats, rotation: Floats, start: Floats, end: Floats, radius: float
 ) -> float:
-    """Measure how deep a capsule lies in a box; see ``box_capsule``.
+    """Measure how deep a capsule lies in a box [m].
 
     Args:
         half: Half edge lengths of the box, shape (3,) [m].
@@ -137,7 +137,7 @@ def capsule_capsule_kernel(
     end_b: Floats,
     radius_b: float,
 ) -> float:
-    """Measure how deep two capsules lie in one another; see ``capsule_capsule``."""
+    """Measure how deep two capsules lie in one another [m]: always exact."""
     return radius_a + radius_b - segment_segment_distance(start_a, end_a, start_b, end_b)
 
 
@@ -171,7 +171,7 @@ def _write_corners(half: Floats, center: Floats, rotation: Floats, corners: Floa
 def box_wall_kernel(
     half: Floats, center: Floats, rotation: Floats, inner: float, height: float
 ) -> float:
-    """Measure how deep a box stands in the wall; see ``box_wall``.
+    """Measure how deep a box stands in the wall [m].
 
     The distance from the axis is convex, so it is greatest at a corner of the part below the
     height: a corner of the box, or where an edge passes the height.
@@ -214,7 +214,11 @@ def _into_wall(start: Floats, end: Floats, along: float, inner: float, height: f
 def capsule_wall_kernel(
     start: Floats, end: Floats, radius: float, inner: float, height: float
 ) -> float:
-    """Measure how deep a capsule lies in the wall; see ``capsule_wall``."""
+    """Measure how deep a capsule lies in the wall [m].
+
+    It is exact to 1e-6 m for a segment of the robot's size; where the capsule is wholly within the
+    radius or above the height it is minus a lower bound of the distance.
+    """
     outermost = max(math.hypot(start[0], start[1]), math.hypot(end[0], end[1])) + radius
     lowest = min(start[2], end[2]) - radius
     if outermost <= inner or lowest >= height:
@@ -235,45 +239,6 @@ def capsule_wall_kernel(
             low = left
         deepest = max(deepest, depth_left, depth_right)
     return radius + deepest
-
-
-def _box(
-    size: ArrayLike, position: ArrayLike, orientation: ArrayLike
-) -> tuple[Floats, Floats, Floats]:
-    """Give half edges, center and rotation of a box."""
-    rotation = np.empty((3, 3))
-    rotation_kernel(compact(orientation), rotation)
-    return 0.5 * compact(size), compact(position), rotation
-
-
-def box_box(
-    size_a: ArrayLike,
-    position_a: ArrayLike,
-    orientation_a: ArrayLike,
-    size_b: ArrayLike,
-    position_b: ArrayLike,
-    orientation_b: ArrayLike,
-) -> float:
-    """Measure how far two boxes would have to be moved to come apart.
-
-    Args:
-        size_a: Full edge lengths of the first box, shape (3,) [m].
-        position_a: Its center, shape (3,) [m].
-        orientation_a: Its quaternion (x, y, z, w).
-        size_b: As ``size_a``, of the second box.
-        position_b: As ``position_a``.
-        orientation_b: As ``orientation_a``.
-
-    Returns:
-        The depth [m]: exact where positive, else minus a lower bound of the distance.
-
-    Example:
-        >>> cube, upright = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]
-        >>> box_box(cube, [0.0, 0.0, 0.0], upright, cube, [0.75, 0.0, 0.0], upright)
-        0.25
-    """
-    first = _box(size_a, position_a, orientation_a)
-    return float(box_box_kernel(*first, *_box(size_b, position_b, orientation_b)))
 
 
 def box_capsule(
@@ -299,83 +264,7 @@ def box_capsule(
         of the segment's deepest point below the nearest face. Exact to rounding wherever the
         spheres around both bodies meet, else minus a lower bound of the distance.
     """
-    box = _box(size, position, orientation)
+    rotation = np.empty((3, 3))
+    rotation_kernel(compact(orientation), rotation)
+    box = 0.5 * compact(size), compact(position), rotation
     return float(box_capsule_kernel(*box, compact(start), compact(end), float(radius)))
-
-
-def capsule_capsule(
-    start_a: ArrayLike,
-    end_a: ArrayLike,
-    radius_a: float,
-    start_b: ArrayLike,
-    end_b: ArrayLike,
-    radius_b: float,
-) -> float:
-    """Measure how deep two capsules lie in one another.
-
-    Args:
-        start_a: Of the segment of the first capsule, shape (3,) [m].
-        end_a: Of its segment, shape (3,) [m].
-        radius_a: Its radius [m].
-        start_b: As ``start_a``, of the second capsule.
-        end_b: As ``end_a``.
-        radius_b: As ``radius_a``.
-
-    Returns:
-        The depth [m]: the sum of the radii less the distance of the segments, always exact.
-    """
-    first = compact(start_a), compact(end_a), float(radius_a)
-    return float(capsule_capsule_kernel(*first, compact(start_b), compact(end_b), float(radius_b)))
-
-
-def box_floor(size: ArrayLike, position: ArrayLike, orientation: ArrayLike) -> float:
-    """Measure how deep the lowest corner of a box lies below z = 0 [m]; arguments as above."""
-    return float(box_floor_kernel(*_box(size, position, orientation)))
-
-
-def capsule_floor(start: ArrayLike, end: ArrayLike, radius: float) -> float:
-    """Measure how deep the lowest point of a capsule lies below z = 0 [m]."""
-    return float(capsule_floor_kernel(compact(start), compact(end), float(radius)))
-
-
-def box_wall(
-    size: ArrayLike, position: ArrayLike, orientation: ArrayLike, inner: float, height: float
-) -> float:
-    """Measure how deep a box stands in the wall around the z axis.
-
-    Args:
-        size: Full edge lengths, shape (3,) [m].
-        position: Center, shape (3,) [m].
-        orientation: Quaternion (x, y, z, w).
-        inner: Where the wall begins [m].
-        height: Where it ends [m].
-
-    Returns:
-        The depth [m] as the module defines it, else minus a lower bound of the distance.
-    """
-    box = _box(size, position, orientation)
-    return float(box_wall_kernel(*box, float(inner), float(height)))
-
-
-def capsule_wall(
-    start: ArrayLike, end: ArrayLike, radius: float, inner: float, height: float
-) -> float:
-    """Measure how deep a capsule lies in the wall around the z axis.
-
-    Args:
-        start: Of the segment, shape (3,) [m].
-        end: Of the segment, shape (3,) [m].
-        radius: Of the capsule [m].
-        inner: Where the wall begins [m].
-        height: Where it ends [m].
-
-    Returns:
-        The depth [m]: the radius plus the depth of the segment's deepest point in the wall, or
-        less its distance; to 1e-6 m for a segment of the robot's size. Where the capsule is
-        wholly within the radius or above the height, minus a lower bound of the distance.
-    """
-    return float(
-        capsule_wall_kernel(
-            compact(start), compact(end), float(radius), float(inner), float(height)
-        )
-    )

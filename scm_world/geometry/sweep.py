@@ -126,24 +126,6 @@ def _sweep_capsules(
 
 
 @njit(cache=True)
-def _select(table: Floats, tolerance: float) -> tuple[Integers, Floats]:
-    """List the pairs whose depth exceeds the tolerance."""
-    n = len(table)
-    count = 0
-    for i in range(n):
-        for j in range(i + 1, n):
-            count += table[i, j] > tolerance
-    pairs, depths = np.empty((count, 2), dtype=np.int64), np.empty(count)
-    count = 0
-    for i in range(n):
-        for j in range(i + 1, n):
-            if table[i, j] > tolerance:
-                pairs[count, 0], pairs[count, 1], depths[count] = i, j, table[i, j]
-                count += 1
-    return pairs, depths
-
-
-@njit(cache=True)
 def _depths(
     sizes: Floats,
     positions: Floats,
@@ -178,24 +160,6 @@ def _depths(
             )
             _deepen(table, number, n_movable + members[c, 1], depth)
     return table
-
-
-@njit(cache=True)
-def sweep_kernel(
-    sizes: Floats,
-    positions: Floats,
-    orientations: Floats,
-    capsules: Floats,
-    members: Integers,
-    frame_origins: Floats,
-    frame_orientations: Floats,
-    n_fixed: int,
-    wall: tuple[float, float],
-    tolerance: float,
-) -> tuple[Integers, Floats]:
-    """Find all intersections; see ``sweep``, which names the result."""
-    bodies = sizes, positions, orientations, capsules, members, frame_origins, frame_orientations
-    return _select(_depths(*bodies, n_fixed, wall), tolerance)
 
 
 @njit(cache=True)
@@ -281,17 +245,7 @@ def sweep(
     Returns:
         The pairs and their depths.
     """
-    return Found(
-        *sweep_kernel(
-            sizes,
-            positions,
-            orientations,
-            capsules,
-            members,
-            frame_origins,
-            frame_orientations,
-            n_fixed,
-            wall,
-            tolerance,
-        )
-    )
+    bodies = sizes, positions, orientations, capsules, members, frame_origins, frame_orientations
+    table = _depths(*bodies, n_fixed, wall)
+    deep = table > tolerance  # above the diagonal only
+    return Found(np.argwhere(deep), table[deep])

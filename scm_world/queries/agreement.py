@@ -2,10 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Literal, final
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, final
 
-from scm_world.queries.experiments.effects import FACTOR, EdgeKey
-from scm_world.queries.verification import Report, Row, Verification, arrow, listed, written
+import numpy as np
+
+from scm_world.queries.experiments.effects import (
+    FACTOR,
+    RESOLUTION,
+    EdgeKey,
+    Response,
+    Series,
+    gap,
+)
+from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import probes as probe_states
+from scm_world.queries.progress import Progress, part
+from scm_world.queries.verification import (
+    Report,
+    Row,
+    Verification,
+    arrow,
+    listed,
+    named,
+    written,
+)
+from scm_world.tasks import Task
+from scm_world.variables import Measured
+from scm_world.world import World
 
 SAME = 0.95
 """Share of the comparable edges whose sign must be the same."""
@@ -142,7 +166,12 @@ class Agreement(Report):
         for sign in self.signs:
             if sign.moves or not moving:
                 by_edge.setdefault(sign.key, []).append(sign)
-        return tuple(_together(key, found, factor) for key, found in sorted(by_edge.items()))
+        edges = []
+        for key, found in sorted(by_edge.items()):
+            clear = [sign.equal for sign in found if sign.clear(factor)]
+            counts = {"compared": len(found), "clear": len(clear), "equal": sum(clear)}
+            edges.append(EdgeSigns(**named(key), **counts))
+        return tuple(edges)
 
     def at(self, factor: float) -> Share:
         """Count equal signs of what the engine decides, among effects of some clarity."""
@@ -194,15 +223,6 @@ class Agreement(Report):
         return "\n\n".join([*map(str, self.verifications), written(title, self.rows())])
 
 
-def _together(key: EdgeKey, signs: list[Sign], factor: float) -> EdgeSigns:
-    cause, effect, lag = key
-    clear = [sign for sign in signs if sign.clear(factor)]
-    equal = sum(sign.equal for sign in clear)
-    return EdgeSigns(
-        cause=cause, effect=effect, lag=lag, compared=len(signs), clear=len(clear), equal=equal
-    )
-
-
 def _row(share: Share, good: bool) -> Row:
     name = f"same sign, effects > {share.factor:g} x engines' gap"
     edges = (
@@ -216,3 +236,72 @@ def _row(share: Share, good: bool) -> Row:
 
 def _percent(part: int, whole: int) -> str:
     return f"{100 * part / whole:.1f} %" if whole else "none"
+
+
+# --- the experiments ------------------------------------------------------------------------------
+
+SAME_CHANGE = 1e-9
+"""Two changes that differ by less are the same one, as far as ``do`` and reading back can tell."""
+
+Responses = Mapping[tuple[EdgeKey, int], Response]
+
+
+def compare_signs(
+    task: Task | str,
+    backends: tuple[str, str],
+    probes: int,
+    seed: int,
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> tuple[Sign, ...]:
+    """Experiment on two engines from the same numbers, and compare how effects answer.
+
+    Args:
+        task: A task, or the name of one.
+        backends: Names of the engines.
+        probes: How many states to experiment in.
+        seed: Of states and values.
+        progress: Called with (finished, planned) after each probe state of each engine.
+        options: Arguments of ``World``, without ``backend``.
+
+    Raises:
+        KeyboardInterrupt: It was interrupted.
+    """
+    found: list[Responses] = []
+    for number, backend in enumerate(backends):
+        told = part(progress, number * probes, len(backends) * probes)
+        world = World(task, backend=backend, **options)
+        try:
+            series = Series(Paired(world, seed, responses=True), probes, told)
+            series.run(probe_states(world, probes, seed, settled=False))
+            if series.done < probes:
+                raise KeyboardInterrupt
+            found.append(series.effects.responses or {})
+            measured = [v for v in world.model.variables if isinstance(v, Measured)]
+        finally:
+            world.close()
+    moves = frozenset(v.name for v in measured if v.mechanism is None)
+    return tuple(_signs(found[0], found[1], moves))
+
+
+def _signs(one: Responses, other: Responses, moves: frozenset[str]) -> Iterator[Sign]:
+    for key in sorted(one.keys() & other.keys()):
+        edge, probe = key
+        first, second = one[key], other[key]
+        if first.change.shape != second.change.shape:
+            continue
+        if np.abs(first.change - second.change).max() > SAME_CHANGE:
+            continue
+        component = int(np.argmax(np.abs(first.answer) + np.abs(second.answer)))
+        answers = first.answer[component], second.answer[component]
+        if not RESOLUTION < min(map(abs, answers)) < np.inf:
+            continue
+        most = first.change[np.argmax(np.abs(first.change))]
+        yield Sign(
+            **named(edge),
+            probe=probe,
+            component=component,
+            moves=edge[1] in moves and edge[2] == 1,
+            answers=(float(np.sign(most) * answers[0]), float(np.sign(most) * answers[1])),
+            apart=gap(first.base, second.base),
+        )

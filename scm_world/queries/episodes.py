@@ -22,7 +22,6 @@ from scm_world.queries.rollouts import (
     Trace,
     Unit,
     as_names,
-    length,
     run,
 )
 from scm_world.queries.twins import AnyTwins
@@ -264,44 +263,6 @@ class Episode:
         if isinstance(result, Exception):
             raise result
         return episode_of(self.twins, units[place], result)
-
-
-def rollout(
-    twins: AnyTwins,
-    policy: Any = None,
-    *,
-    seed: int = 0,
-    number: int = 0,
-    do: Mapping[str, Any] | None = None,
-    steps: int | None = None,
-    record: Iterable[str] = (),
-) -> Episode:
-    """Let an episode happen on a twin of a world.
-
-    Args:
-        twins: Of the world.
-        policy: A function of the world, actions of shape (n_actions,) or (steps, n_actions),
-            ``"random"``, or None: the action that lets the system be.
-        seed: Of the noise.
-        number: Of the episode within that noise.
-        do: A plan, or interventions.
-        steps: How many control steps; as many as the task has if None.
-        record: Variables to write down on the way; others are found by going through again.
-
-    Raises:
-        InterventionError: An intervention was refused.
-        UnknownOption: The number of steps is none.
-    """
-    with twins.twin() as world:
-        unit = Unit(
-            seed=seed,
-            number=number,
-            layers=((0, Plan(do)),),
-            policy=policy,
-            steps=length(world, steps),
-            names=as_names(record),
-        )
-        return episode_of(twins, unit, unit.run(world))
 
 
 def episode_of(twins: AnyTwins, unit: Unit, trace: Trace) -> Episode:

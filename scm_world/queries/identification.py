@@ -9,12 +9,13 @@ from typing import Any, final
 
 import networkx as nx
 import numpy as np
+from scipy.special import stdtrit
 
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
 from scm_world.graph.evaluate import AppliedIntervention, source_of
-from scm_world.queries.estimates import CONFIDENCE, Effect, t_quantile
+from scm_world.queries.estimates import CONFIDENCE, Effect
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Mechanism
@@ -306,5 +307,5 @@ def _standardised(
     apart = each.mean(axis=0)
     mean, variance = float(apart @ slopes), spread * float(apart @ inverse @ apart)
     variance += float((each @ slopes).var(ddof=1)) / len(effect)  # units are a sample, too
-    half = t_quantile(0.5 + 0.5 * CONFIDENCE, degrees) * float(np.sqrt(variance))
+    half = float(stdtrit(degrees, 0.5 + 0.5 * CONFIDENCE)) * float(np.sqrt(variance))
     return mean, mean - half, mean + half

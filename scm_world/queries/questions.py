@@ -6,15 +6,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Self, final
 
+import numpy as np
+
+from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
-from scm_world.queries import estimates, samples
-from scm_world.queries.episodes import Episode, rollout
+from scm_world.queries import samples
+from scm_world.queries.episodes import Episode, episode_of
 from scm_world.queries.equations import Equations, System
-from scm_world.queries.estimates import Effect
+from scm_world.queries.estimates import Effect, effect_of
 from scm_world.queries.outcomes import usual_outcomes
 from scm_world.queries.plans import Plan
-from scm_world.queries.progress import Progress
+from scm_world.queries.progress import Progress, part
+from scm_world.queries.rollouts import Unit, as_names, length
 from scm_world.queries.samples import STEPS, Samples, Setting
 from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.variables import Variable
@@ -63,16 +67,17 @@ class Questions(ABC):
             InterventionError: An intervention was refused.
             ActionError: The policy is none, or gave no action.
         """
-        plan = self._with(do)
-        return rollout(
-            self._asked()[0],
-            policy,
-            seed=seed,
-            number=episode,
-            do=plan,
-            steps=steps,
-            record=record,
-        )
+        twins, plan = self._asked()[0], self._with(do)
+        with twins.twin() as world:
+            unit = Unit(
+                seed=seed,
+                number=episode,
+                layers=((0, plan),),
+                policy=policy,
+                steps=length(world, steps),
+                names=as_names(record),
+            )
+            return episode_of(twins, unit, unit.run(world))
 
     def counterfactual(
         self,
@@ -178,16 +183,15 @@ class Questions(ABC):
         Returns:
             Mean and 95 % interval of the difference, and by how much pairing pays.
         """
-        return estimates.effect(
-            *self._asked(),
-            outcome,
-            do=self._with(do),
-            versus=self._with(versus),
-            n=n,
-            paired=paired,
-            setting=self._setting(setting),
-            progress=progress,
+        count = whole_number("n", n, least=2)
+        treated, control = (
+            self.sample(count, plan, outcomes=(outcome,), first=first, progress=told, **setting)
+            for plan, first, told in (
+                (do, 0, part(progress, 0, 2 * count)),
+                (versus, 0 if paired else count, part(progress, count, 2 * count)),
+            )
         )
+        return effect_of(self._asked()[1], outcome, treated, control, paired=paired)
 
     def effect_over(
         self,
@@ -211,14 +215,18 @@ class Questions(ABC):
         """
         if len(values) < 2:
             raise UnknownOption("values", values, ("two or more values of the variable",))
-        return estimates.effect_over(
-            *self._asked(),
-            outcome,
-            plans=[self._with({name: value}) for value in values],
-            n=n,
-            setting=self._setting(setting),
-            progress=progress,
+        count = whole_number("n", n, least=2)
+        control, *others = (
+            self.sample(
+                count,
+                {name: value},
+                outcomes=(outcome,),
+                progress=part(progress, index * count, len(values) * count),
+                **setting,
+            )
+            for index, value in enumerate(values)
         )
+        return tuple(effect_of(self._asked()[1], outcome, one, control) for one in others)
 
     def effect_by(
         self,
@@ -247,16 +255,25 @@ class Questions(ABC):
         Returns:
             For each group the ends of the covariate, and the effect.
         """
-        return estimates.effect_by(
-            *self._asked(),
-            outcome,
-            do=self._with(do),
-            versus=self._with(versus),
-            by=by,
-            bins=bins,
-            n=n,
-            setting=self._setting(setting),
-            progress=progress,
+        count = whole_number("n", n, least=2 * whole_number("bins", bins, least=1))
+        treated, control = (
+            self.sample(count, plan, outcomes=(outcome, by), progress=told, **setting)
+            for plan, told in (
+                (do, part(progress, 0, 2 * count)),
+                (versus, part(progress, count, 2 * count)),
+            )
+        )
+        _, place = control.values()
+        if place.ndim != 1:
+            allowed = ("one number for each unit, such as Outcome(name, 'first', 0)",)
+            raise UnknownOption("by", by, allowed)
+        groups = np.array_split(np.argsort(place, kind="stable"), bins)
+        return tuple(
+            (
+                (float(place[group].min()), float(place[group].max())),
+                effect_of(self._asked()[1], outcome, treated, control, rows=group),
+            )
+            for group in groups
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import accumulate
-from typing import Literal, Self, final
+from typing import Any, Literal, Self, final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -244,6 +244,11 @@ class Verification(Report):
 
     def __str__(self) -> str:
         return written(f"Verification of {self.task} on {self.backend}", self.rows())
+
+
+def named(key: EdgeKey) -> dict[str, Any]:
+    """Name the parts of an edge as the fields of reports are."""
+    return dict(zip(("cause", "effect", "lag"), key, strict=True))
 
 
 def arrow(key: EdgeKey) -> str:

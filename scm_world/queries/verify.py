@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, final
 
+from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.policies.scripted import Random
-from scm_world.queries.agreement import Agreement, Sign
-from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.agreement import Agreement, Sign, compare_signs
+from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
-from scm_world.queries.experiments.series import Series, checked_count
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import local_report
 from scm_world.queries.local_truth import has_local_graphs
 from scm_world.queries.progress import Progress
-from scm_world.queries.signs import compare_signs
-from scm_world.queries.verification import Fired, LocalShare, Undeclared, Verification
+from scm_world.queries.verification import (
+    Fired,
+    LocalShare,
+    Undeclared,
+    Verification,
+    named,
+)
 from scm_world.tasks import Task
 from scm_world.variables import Measured
 from scm_world.world import World
@@ -86,8 +91,8 @@ def verify(
         >>> found.floor, found.undeclared, found.passed  # without physics nothing moves
         (0.0, (), False)
     """
-    checked_count("number of probes", probes)
-    checked_count("least number of probes", least)
+    whole_number("number of probes", probes, least=1)
+    whole_number("least number of probes", least, least=1)
     if isinstance(system, World | SCM):
         if options:
             raise UnknownOption("option for a world that is made", next(iter(options)), ())
@@ -203,14 +208,30 @@ def _verified(
     interrupted = done < probes and not watch.ended
     open_ = found.symmetric_difference(declared)
     held_out: Series | None = None
+    again: set[EdgeKey] | None = None
     if world and generated and open_ and not interrupted:
         causes = {cause for cause, _, _ in open_}
-        held_out = _held_out(world, causes, seed, lambda new, more: watch(new, done + more))
+        held_out = Series(Paired(world, seed + OTHER, causes=causes), HELD_OUT)
+        with contextlib.suppress(KeyboardInterrupt):
+            states = probe_states(world, HELD_OUT, seed + OTHER)
+            held_out.run(states, lambda new, more: watch(new, done + more) and False)
         interrupted = held_out.done < HELD_OUT
+        again = held_out.effects.edges(set(declared))
         effects.take(held_out.effects, done)
         found = effects.edges(set(declared))
-    again = None if held_out is None else held_out.effects.edges(set(declared))
-    colors = {edge for edge in {*found, *declared} if _is_color(edge[0]) and edge[1] in measured}
+    undeclared = []
+    for key in sorted(found - set(declared)):
+        setting = effects.settings[key]
+        undeclared.append(
+            Undeclared(
+                **named(key),
+                size=effects.largest[key],
+                probe=setting.probe,
+                kind=setting.kind,
+                change=() if setting.change is None else tuple(setting.change.tolist()),
+                again=None if again is None else key in again,
+            )
+        )
     return Verification(
         task=world.task.name if world else "model",
         backend=world.backend.name if world else "equations",
@@ -226,39 +247,28 @@ def _verified(
         threshold=effects.threshold,
         settable=len(paired.targets),
         untried=tuple(sorted(set(paired.targets) - effects.undone)) if world else (),
-        fired=tuple(_fired(key, effects, watch) for key in sorted(found & set(declared))),
-        never_fired=tuple(sorted(set(declared) - found)),
-        undeclared=tuple(
-            _undeclared(key, effects, None if again is None else key in again)
-            for key in sorted(found - set(declared))
+        fired=tuple(
+            Fired(
+                **named(key),
+                after=watch.after[key],
+                largest=effects.largest[key],
+                states=effects.states[key],
+            )
+            for key in sorted(found & set(declared))
         ),
-        colors=tuple(sorted(colors)),
+        never_fired=tuple(sorted(set(declared) - found)),
+        undeclared=tuple(undeclared),
+        colors=tuple(
+            sorted(
+                edge
+                for edge in {*found, *declared}
+                if edge[0].endswith("color") and edge[1] in measured
+            )
+        ),
         local=_local(world, seed) if world and not interrupted else None,
         seconds=time.perf_counter() - started,
         versions=versions(world.engine if world else ""),
     )
-
-
-def _held_out(
-    world: World, causes: Collection[str], seed: int, watch: Callable[[Effects, int], bool]
-) -> Series:
-    """Experiment with some causes again, in probe states of another seed.
-
-    Args:
-        world: To experiment with.
-        causes: Of the edges that were left open.
-        seed: Of the first probe states.
-        watch: Told what was seen, after each probe state.
-    """
-    series = Series(Paired(world, seed + OTHER, causes=causes), HELD_OUT)
-
-    def told(effects: Effects, done: int) -> bool:
-        watch(effects, done)
-        return False
-
-    with contextlib.suppress(KeyboardInterrupt):
-        series.run(probe_states(world, HELD_OUT, seed + OTHER), told)
-    return series
 
 
 def _local(world: World, seed: int) -> LocalShare | None:
@@ -273,34 +283,3 @@ def _local(world: World, seed: int) -> LocalShare | None:
             steps=report.steps, right=score.right, extra=score.extra, missed=score.missed
         )
     return None
-
-
-def _is_color(name: str) -> bool:
-    return name.endswith("color")
-
-
-def _fired(key: EdgeKey, effects: Effects, watch: _Watch) -> Fired:
-    cause, effect, lag = key
-    return Fired(
-        cause=cause,
-        effect=effect,
-        lag=lag,
-        after=watch.after[key],
-        largest=effects.largest[key],
-        states=effects.states[key],
-    )
-
-
-def _undeclared(key: EdgeKey, effects: Effects, again: bool | None) -> Undeclared:
-    (cause, effect, lag), setting = key, effects.settings[key]
-    change = () if setting.change is None else tuple(setting.change.tolist())
-    return Undeclared(
-        cause=cause,
-        effect=effect,
-        lag=lag,
-        size=effects.largest[key],
-        probe=setting.probe,
-        kind=setting.kind,
-        change=change,
-        again=again,
-    )

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 from scipy.spatial import ConvexHull
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.geometry.penetration import (
-    box_box,
+    box_box_kernel,
     box_capsule,
-    box_floor,
-    box_wall,
-    capsule_capsule,
-    capsule_floor,
-    capsule_wall,
+    box_floor_kernel,
+    box_wall_kernel,
+    capsule_capsule_kernel,
+    capsule_floor_kernel,
+    capsule_wall_kernel,
 )
 from scm_world.geometry.rotations import from_rotation_vector, rotation_matrix
 
@@ -36,6 +38,35 @@ def _corners(box: Box) -> Floats:
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
     corners: Floats = signs * box[0] @ rotation_matrix(box[2]).T + box[1]
     return corners
+
+
+def _placed(size: ArrayLike, position: ArrayLike, orientation: ArrayLike) -> Box:
+    """Give half edges, center and rotation, as compiled functions take them."""
+    return 0.5 * np.array(size), np.array(position, dtype=float), rotation_matrix(orientation)
+
+
+def box_box(*boxes: ArrayLike) -> float:
+    """Measure how deep two boxes lie in one another."""
+    return float(box_box_kernel(*_placed(*boxes[:3]), *_placed(*boxes[3:])))
+
+
+def box_wall(size: ArrayLike, position: ArrayLike, orientation: ArrayLike, *wall: float) -> float:
+    """Measure how deep a box stands in the wall."""
+    return float(box_wall_kernel(*_placed(size, position, orientation), *wall))
+
+
+def box_floor(size: ArrayLike, position: ArrayLike, orientation: ArrayLike) -> float:
+    """Measure how deep a box lies in the floor."""
+    return float(box_floor_kernel(*_placed(size, position, orientation)))
+
+
+def capsule_capsule(*capsules: Any) -> float:
+    """Measure how deep two capsules lie in one another."""
+    return float(
+        capsule_capsule_kernel(
+            *(np.array(part, dtype=float) if np.ndim(part) else part for part in capsules)
+        )
+    )
 
 
 def _along(start: Floats, end: Floats, n: int = 20_001) -> Floats:
@@ -161,7 +192,9 @@ def test_the_lowest_corner_meets_the_floor() -> None:
     assert box_floor(CUBE, (0, 0, 0.4), UPRIGHT) == pytest.approx(0.1)
     on_edge = from_rotation_vector([np.pi / 4, 0.0, 0.0])
     assert box_floor(CUBE, (0, 0, 0.4), on_edge) == pytest.approx(np.sqrt(0.5) - 0.4)
-    assert capsule_floor((0, 0, 0.3), (0, 0, 0.05), 0.06) == pytest.approx(0.01)
+    assert capsule_floor_kernel(
+        np.array([0, 0, 0.3]), np.array([0, 0, 0.05]), 0.06
+    ) == pytest.approx(0.01)
 
 
 def test_the_outermost_corner_meets_the_wall() -> None:
@@ -205,7 +238,7 @@ def test_capsules_meet_the_wall_as_their_deepest_point_does() -> None:
         outside = -np.hypot(np.minimum(beyond, 0.0), np.minimum(below, 0.0))
         both = (beyond > 0.0) & (below > 0.0)
         expected = 0.01 + np.max(np.where(both, np.minimum(beyond, below), outside))
-        depth = capsule_wall(middle - offset, middle + offset, 0.01, *WALL)
+        depth = capsule_wall_kernel(middle - offset, middle + offset, 0.01, *WALL)
         if depth > 0.0:
             inside += 1
             assert depth == pytest.approx(expected, abs=1e-5)

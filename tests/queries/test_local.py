@@ -20,12 +20,13 @@ from scm_world.queries.local import (
     LocalGraph,
     LocalReport,
     RuleScore,
+    islands,
     local_episode,
     local_graph,
     local_report,
     paired_truth,
+    reached,
 )
-from scm_world.queries.local_graphs import islands, reached
 from scm_world.queries.local_truth import Listener, listening
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FINGERS as NAMES

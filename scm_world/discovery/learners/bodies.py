@@ -21,7 +21,7 @@ from scm_world._types import Floats
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError
 from scm_world.queries import Episode, Plan, World
-from scm_world.queries.local_graphs import LocalEpisode, LocalGraph, local_graph
+from scm_world.queries.local import LocalEpisode, LocalGraph, local_graph
 from scm_world.queries.local_truth import Pair, movers, paired_truth
 from scm_world.queries.rollouts import Running, Unit
 from scm_world.variables import Draw, Hard, Null

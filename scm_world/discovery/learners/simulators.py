@@ -17,11 +17,10 @@ from scm_world._types import Floats, Value, Values
 from scm_world.discovery.data.recorded import first_label
 from scm_world.errors import InterventionError, ModelError
 from scm_world.graph import SCM, NoiseKey
-from scm_world.queries.experiments.effects import Effects
-from scm_world.queries.experiments.models import paired_effects
+from scm_world.queries.experiments.effects import Effects, Series
+from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
-from scm_world.queries.experiments.series import Series
 from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting
@@ -110,7 +109,9 @@ class SCMSimulator:
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time; see ``PairedSimulator``."""
         probes = max(1, budget // (len(self.names) + 2))
-        return paired_effects(self._model, probes=probes, seed=self._seed)
+        series = Series(PairedEquations(self._model, self._seed), probes)
+        series.run(range(probes))
+        return series.effects
 
     def prepare(self, unit: int) -> None:
         """Draw a unit: two instants of it.

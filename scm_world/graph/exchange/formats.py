@@ -14,7 +14,6 @@ from typing import Any, final
 import networkx as nx
 
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
-from scm_world.graph.exchange.grammar import parse
 from scm_world.graph.exchange.html import to_html
 from scm_world.graph.exchange.model import (
     VIEWS,
@@ -72,11 +71,6 @@ def _listed(look: dict[str, str], more: dict[str, str] | dict[str, int | str]) -
     return ", ".join(f"{key}={value}" for key, value in pairs)
 
 
-def from_dot(text: str) -> CausalGraph:
-    """Read a directed graph in the DOT language, without ports and HTML labels."""
-    return from_parts(*parse(text, "digraph"))
-
-
 def to_dagitty(graph: CausalGraph) -> str:
     """Write a graph for dagitty, www.dagitty.net and its R package.
 
@@ -89,11 +83,6 @@ def to_dagitty(graph: CausalGraph) -> str:
     nodes = [f'"{name}"' for name in graph.names]
     edges = [f'"{edge.cause}" -> "{edge.effect}"' for edge in graph.edges]
     return "\n".join(["dag {", *nodes, *edges, "}"])
-
-
-def from_dagitty(text: str) -> CausalGraph:
-    """Read what dagitty writes; positions, exposures and outcomes are left out."""
-    return from_parts(*parse(text, "dag"))
 
 
 def to_digraph(graph: CausalGraph) -> nx.DiGraph:
@@ -197,7 +186,7 @@ class TextFormat:
 _TIMELESS: tuple[View, tuple[View, ...]] = ("two_slice", ("summary", "two_slice"))
 
 FORMATS = {
-    "dot": TextFormat(to_dot, from_dot),
+    "dot": TextFormat(to_dot, None),
     "gml": TextFormat(
         lambda graph: "\n".join(nx.generate_gml(to_digraph(graph))),
         lambda text: from_digraph(nx.parse_gml(text)),
@@ -207,7 +196,7 @@ FORMATS = {
         lambda text: from_digraph(nx.parse_graphml(text)),
     ),
     "node-link": TextFormat(to_node_link, from_node_link),
-    "dagitty": TextFormat(to_dagitty, from_dagitty, *_TIMELESS),
+    "dagitty": TextFormat(to_dagitty, None, *_TIMELESS),
     "csv": TextFormat(to_csv, from_csv, *_TIMELESS),
     "html": TextFormat(to_html, None),
 }
@@ -277,16 +266,16 @@ def read_graph(
     format: str,  # noqa: A002 # as above
     view: View | None = None,
 ) -> CausalGraph:
-    """Read a graph from a file (a ``Path``) or from text (a ``str``).
+    r"""Read a graph from a file (a ``Path``) or from text (a ``str``).
 
-    TextFormat and view are those of ``write_graph``; HTML is not read.
+    Format and view are those of ``write_graph``; DOT, dagitty and HTML are not read.
 
     Raises:
         UnreadableFile: It is no directed graph in this format.
         UnknownOption: There is no such format or view.
 
     Example:
-        >>> read_graph("dag { mass -> weight }", format="dagitty").edges
+        >>> read_graph("cause,mass,weight\nmass,0,1\nweight,0,0", format="csv").edges
         (Edge(cause='mass', effect='weight', lag=0, when=None),)
     """
     known, chosen = _known(format, view, to_read=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
+from scm_world.queries.progress import Progress
 
 EdgeKey = tuple[str, str, int]
 """Cause, effect, lag."""
@@ -172,3 +173,57 @@ def gap(a: Value, b: Value) -> float:
         return 0.0
     size = float(np.max(np.abs(x.astype(float) - y)))
     return size if size == size else np.inf
+
+
+@final
+class Series:
+    """Experiments that may be interrupted (Ctrl-C) or end early.
+
+    Args:
+        paired: Does the experiments: ``Paired`` or ``PairedEquations``.
+        planned: How many probe states there are.
+        progress: Is told how far it is.
+        done: How many of them were finished before.
+
+    Attributes:
+        effects: What was seen in the probe states that are finished.
+        done: How many these are.
+    """
+
+    def __init__(
+        self,
+        paired: Any,
+        planned: int,
+        progress: Progress | None = None,
+        *,
+        done: int = 0,
+    ) -> None:
+        self._paired, self.planned, self._progress = paired, planned, progress
+        self.effects: Effects = paired.effects
+        self.done = done
+
+    def run(
+        self, probes: Iterable[Any], enough: Callable[[Effects, int], bool] | None = None
+    ) -> None:
+        """Do all experiments.
+
+        Args:
+            probes: The probe states.
+            enough: Is shown effects and how many probe states are finished after each of them;
+                ends the series by returning True.
+
+        Raises:
+            KeyboardInterrupt: It was interrupted before the first probe state was finished.
+        """
+        try:
+            for number, probe in enumerate(probes, self.done):
+                self._paired.run(number, probe)
+                self.done, self.effects = number + 1, self._paired.effects.copy()
+                last = enough is not None and enough(self.effects, self.done)
+                if self._progress is not None:
+                    self._progress(self.done, self.done if last else self.planned)
+                if last:
+                    return
+        except KeyboardInterrupt:
+            if self.done == 0:
+                raise

@@ -54,20 +54,6 @@ class PairedEquations:
         effects.end_of_probe()
 
 
-def paired_effects(model: SCM, *, probes: int, seed: int) -> Effects:
-    """Find the direct effects in a structural causal model; see ``PairedEquations``.
-
-    Args:
-        model: Every variable of it can be computed.
-        probes: How many units to draw.
-        seed: Of the units and of the values.
-    """
-    paired = PairedEquations(model, seed)
-    for number in range(probes):
-        paired.run(number)
-    return paired.effects
-
-
 def _compare(
     model: SCM,
     cause: str,

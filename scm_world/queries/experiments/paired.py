@@ -26,9 +26,19 @@ from scm_world.queries.experiments.effects import (
     Response,
     gap,
 )
-from scm_world.queries.experiments.mechanisms import see_mechanisms
 from scm_world.queries.experiments.probes import Probe
-from scm_world.variables import Box, Categories, Integers, Measured, Noise, Rotations, Variable
+from scm_world.variables import (
+    Box,
+    Categories,
+    Derived,
+    Exogenous,
+    Integers,
+    Measured,
+    Noise,
+    Rotations,
+    Variable,
+)
+from scm_world.variables.kinds import SpaceName
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world import World
 
@@ -40,6 +50,9 @@ FAR = (0.4, -0.4, 0.2, -0.2)
 
 TRIED_ALONE = 8
 """In how many probes the mechanisms of what does not move are tried on their own."""
+
+FEW = 24  # mechanisms with more causes than this are left to experiments in the world
+NUDGE = 0.2  # how far, as a fraction, to move a cause that has no spaces to be drawn from
 
 SEEN_ELSEWHERE = 8
 """How many earlier values of a readout are kept, to hand them to its children."""
@@ -405,3 +418,58 @@ def _elsewhere(present: Value, share: Floats, low: Floats, high: Floats) -> Valu
     moved = present + share * spread
     inside = np.where((moved < low) | (moved > high), 2 * present - moved, moved)
     return np.asarray(np.clip(inside, low, high))
+
+
+def see_mechanisms(
+    world: World, present: Values, effects: Effects, noise: Noise, number: int
+) -> None:
+    """Try every mechanism of what does not move: sizes, layouts, goals, piles.
+
+    An experiment in the world changes one thing about the present structure. Some causes show only
+    in other circumstances (the noise of a wall only where walls are random). So each mechanism is
+    also tried on its own: all its causes have values of one circumstance, and one of them gets the
+    value that it has in another. A mechanism can be handed nothing but its declared causes, so
+    what is not declared is looked for in the world alone.
+
+    Args:
+        world: Its model has the mechanisms.
+        present: Values of the probe: the first circumstance.
+        effects: What is seen is noted there.
+        noise: Draws two more, one from the spaces A and one from B.
+        number: Of the probe.
+    """
+    model, static = world.model, world.static_names
+    now = {name: present[name] for name in static}
+    circumstances = []
+    for episode in (2 * number, 2 * number + 1):
+        space: SpaceName = "B" if episode % 2 else "A"
+        roots = {
+            variable.name: _drawn(variable, space, now, noise, episode)
+            for variable in model.variables
+            if isinstance(variable, Exogenous) and variable.name in now
+        }
+        circumstances.append(model.solve(roots, only=static))
+    one, other = circumstances if number % 2 == 0 else reversed(circumstances)
+    for child in model.variables:
+        if not isinstance(child, Derived) or child.name not in now:
+            continue
+        names = {parent.name for parent in child.parents}
+        if not names <= now.keys() or len(names) > FEW:
+            continue
+        for base, changed in ((one, other), (now, one)):
+            before = model.solve(base, only=(child.name,))[child.name]
+            for cause in child.parents:
+                known = {**base, cause.name: changed[cause.name]}
+                after = model.solve(known, only=(child.name,))[child.name]
+                effects.see(cause.name, child.name, 0, after, before)
+
+
+def _drawn(variable: Variable, name: SpaceName, now: Values, noise: Noise, episode: int) -> Value:
+    space = variable.space(name)
+    if space is not None:
+        drawn = noise.draw(space, variable.name, variable.shape, now, episode=episode)
+        return np.asarray(drawn[0])
+    if variable.dtype != "real" or variable.bounds is None:
+        return now[variable.name]
+    unit = noise.uniforms(f"{variable.name}|nudge", n=1, episode=episode)[0, 0]
+    return variable.bounds.nearest(now[variable.name] * (1.0 + NUDGE * unit), now)

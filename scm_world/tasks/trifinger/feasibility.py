@@ -9,8 +9,7 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.geometry.arrays import compact, rows
-from scm_world.geometry.convex import Convex, placed, sides_depth
-from scm_world.geometry.hulls import box_hull
+from scm_world.geometry.hulls import Convex, box_hull, placed, sides_depth
 from scm_world.geometry.penetration import box_capsule
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, apart_in_rows, sweep
