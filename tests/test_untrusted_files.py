@@ -32,7 +32,7 @@ REFERENCES = (
     "scm_world.cli.app:main",
     "scm_world.__main__:main",
     "scm_world.tasks.factories:load_factory",
-    "scm_world.testing.requests:random_request",
+    "scm_world.testing.model:check_model",
     f"{BAIT}:run",
 )
 

@@ -202,8 +202,7 @@ def sweep(
     Example: scm-world sweep pushing --over tool_block.mass=0.02:0.08:5
     """
     from scm_world.discovery.data import sweep as swept
-    from scm_world.discovery.data.levels import points_of
-    from scm_world.discovery.data.swept import ENDS, SUMMARY, TABLE
+    from scm_world.discovery.data.sweeps import ENDS, SUMMARY, TABLE, points_of
     from scm_world.queries import World
 
     check_parquet(format_)
@@ -276,7 +275,7 @@ def read_over(texts: Iterable[str]) -> dict[str, Any]:
 
 def _levels(text: str) -> Any:
     from scm_world.discovery.data import Levels
-    from scm_world.discovery.data.levels import check_points
+    from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES
 
     hint = "'--over'"

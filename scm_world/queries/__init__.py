@@ -13,7 +13,7 @@ from scm_world.queries.identification import (
     identify,
     nature_graph,
 )
-from scm_world.queries.laboratory import Laboratory, intervention_data
+from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
@@ -51,7 +51,6 @@ __all__ = [
     "compare",
     "do",
     "identify",
-    "intervention_data",
     "load_episode",
     "nature_graph",
     "save_episode",

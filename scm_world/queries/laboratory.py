@@ -76,23 +76,23 @@ class Journal:
     def __init__(
         self, path: Path | str | None, terms: dict[str, Any], trusted: Sequence[str] = ()
     ) -> None:
-        self._path = None if path is None else Path(path)
+        self.path = None if path is None else Path(path)
         self._trusted = tuple(trusted)
         self._size = 0
         self.records: list[Experiment] = []
         head = json.loads(json.dumps({"format": FORMAT, **terms}))
-        if self._path is None:
+        if self.path is None:
             return
         try:
-            regular(self._path)
-            written = self._path.stat().st_size
+            regular(self.path)
+            written = self.path.stat().st_size
         except FileNotFoundError:
             written = 0
         except OSError as error:
             advice = "give the laboratory a file"
             raise UnreadableFile(str(path), error.strerror or str(error), advice) from None
         if written:
-            self._read(head)
+            self._read(self.path, head)
         else:
             self._append(head)
 
@@ -101,15 +101,10 @@ class Journal:
         """Number of the first episode that was not lived yet."""
         return sum(r.episodes for r in self.records if not r.kind.endswith("counterfactual"))
 
-    @property
-    def is_written(self) -> bool:
-        """Whether there is a file."""
-        return self._path is not None
-
     def write(self, kind: str, samples: Samples, *, at: int = 0, row: int | None = None) -> None:
         """Add an experiment; it is on the disk when this returns."""
         record = Experiment(kind, samples, at, row)
-        if self._path is not None:
+        if self.path is not None:
             self._append(
                 {
                     "kind": kind,
@@ -129,31 +124,28 @@ class Journal:
         Raises:
             UnreadableFile: The file is not as it was left.
         """
-        if self._path is None:
+        if self.path is None:
             return
-        size = self._path.stat().st_size if self._path.exists() else 0
+        size = self.path.stat().st_size if self.path.exists() else 0
         if size != self._size:
             reason = "another laboratory has written to it"
-            raise UnreadableFile(str(self._path), reason, "open it again to go on with all of it")
+            raise UnreadableFile(str(self.path), reason, "open it again to go on with all of it")
 
     def _append(self, line: dict[str, Any]) -> None:
-        if self._path is None:
+        if self.path is None:
             return
         self.refuse_others()
         try:
-            with self._path.open("a", encoding="utf-8") as stream:
+            with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(line, allow_nan=False) + "\n")
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            said = f"{self._path.name}: {error.strerror or error}"
-            raise UnwritableFolder(str(self._path.parent), said) from None
-        self._size = self._path.stat().st_size
+            said = f"{self.path.name}: {error.strerror or error}"
+            raise UnwritableFolder(str(self.path.parent), said) from None
+        self._size = self.path.stat().st_size
 
-    def _read(self, head: dict[str, Any]) -> None:
-        path = self._path
-        if path is None:
-            return
+    def _read(self, path: Path, head: dict[str, Any]) -> None:
         text = read_text(path)
         whole = text[: text.rfind("\n") + 1]
         try:
@@ -162,7 +154,11 @@ class Journal:
                 other = [key for key in head if first.get(key) != head[key]]
                 reason = f"it is the log of other experiments: {', '.join(other)} differ"
                 raise UnreadableFile(str(path), reason, "give the laboratory another log")
-            self.records = [_record(line, self._trusted) for line in lines]
+            for line in lines:
+                columns = {n: np.array(values, float) for n, values in line["values"].items()}
+                plan = Plan.from_dict(line["plan"], trusted=self._trusted)
+                samples = Samples(columns, tuple(line["units"]), line["seed"], plan)
+                self.records.append(Experiment(line["kind"], samples, line["at"], line["row"]))
         except DAMAGED as error:
             if isinstance(error, UnreadableFile):
                 raise
@@ -171,13 +167,6 @@ class Journal:
         if whole != text:  # the process was killed while it wrote
             path.write_text(whole, encoding="utf-8")
         self._size = path.stat().st_size
-
-
-def _record(line: dict[str, Any], trusted: Sequence[str]) -> Experiment:
-    columns = {name: np.array(values, dtype=float) for name, values in line["values"].items()}
-    plan = Plan.from_dict(line["plan"], trusted=trusted)
-    samples = Samples(columns, tuple(line["units"]), line["seed"], plan)
-    return Experiment(line["kind"], samples, line["at"], line["row"])
 
 
 QUESTIONS = ("see", "do", "counterfactual")
@@ -243,17 +232,14 @@ class Laboratory:
         self.visible = _matching("visible", visible, everything)
         self.settable = _matching("settable", settable, can_be_set)
         self.budget = None if budget is None else whole_number("budget", budget, least=0)
-        self.outcomes = self._reported(outcomes)
-        self._lock = threading.Lock()
-        self._journal = Journal(log, self.terms(), trusted)
-
-    def _reported(self, outcomes: Iterable[Any] | None) -> tuple[Outcome, ...]:
         wanted = self.visible if outcomes is None else tuple(outcomes)
-        found = tuple(dict.fromkeys(o if isinstance(o, Outcome) else Outcome(o) for o in wanted))
-        for outcome in found:
+        found = (o if isinstance(o, Outcome) else Outcome(o) for o in wanted)
+        self.outcomes = tuple(dict.fromkeys(found))
+        for outcome in self.outcomes:
             if outcome.name not in self.visible:
                 raise Forbidden(f"see {outcome.name}", self.visible)
-        return found
+        self._lock = threading.Lock()
+        self._journal = Journal(log, self.terms(), trusted)
 
     def terms(self) -> dict[str, Any]:
         """Say what has to be the same for a log to be gone on with."""
@@ -333,31 +319,35 @@ class Laboratory:
             Forbidden: As in ``do``, or the unit was never seen.
             BudgetExhausted: No episode is left.
         """
-        with self._lock:
-            return self._imagine(unit, request, at)
-
-    def _imagine(self, unit: int, request: Mapping[str, Any], at: int) -> dict[str, Floats]:
-        self._permit("counterfactual", request, 1)
-        plan = self._with(self._plan_of(unit))
         names = tuple(dict.fromkeys(outcome.name for outcome in self.outcomes))
-        episode = self._setting.episode(self._twins, self._world, plan, unit, ())
-        try:
-            other = episode.counterfactual(request, at=at, record=names)
-        except Exception:
-            self._journal.write("refused counterfactual", self._nothing((unit,), request), at=at)
-            raise
-        columns = {column(outcome): outcome.of(other) for outcome in self.outcomes}
-        held = Samples(
-            {k: v[None] for k, v in columns.items()}, (unit,), self._setting.seed, Plan(request)
-        )
-        self._journal.write("counterfactual", held, at=at)
+        with self._lock:
+            self._permit("counterfactual", request, 1)
+            lived = (r for r in self._journal.records if r.kind in ("see", "do"))
+            known = next((r for r in lived if unit in r.samples.numbers), None)
+            if known is None:
+                last = self._journal.next_unit
+                there = f"units 0 to {last - 1}" if last else "none yet: see or do something first"
+                raise Forbidden(f"imagine unit {unit}, which was never seen", (there,))
+            plan = self._with(known.samples.plan)
+            episode = self._setting.episode(self._twins, self._world, plan, unit, ())
+            try:
+                other = episode.counterfactual(request, at=at, record=names)
+            except Exception:
+                held = self._samples({}, (unit,), request)
+                self._journal.write("refused counterfactual", held, at=at)
+                raise
+            columns = {column(outcome): outcome.of(other) for outcome in self.outcomes}
+            held = self._samples({k: v[None] for k, v in columns.items()}, (unit,), request)
+            self._journal.write("counterfactual", held, at=at)
         return {name: values.copy() for name, values in columns.items()}
 
     def _with(self, request: Mapping[str, Any]) -> Plan:
         return Plan(merged(self._world.model, self._given, Plan(request)))
 
-    def _nothing(self, units: Sequence[int], request: Mapping[str, Any]) -> Samples:
-        return Samples({}, tuple(units), self._setting.seed, Plan(request))
+    def _samples(
+        self, columns: dict[str, Floats], units: Iterable[int], request: Mapping[str, Any]
+    ) -> Samples:
+        return Samples(columns, tuple(units), self._setting.seed, Plan(request))
 
     def run(self, protocol: Path | str | Iterable[Mapping[str, Any]]) -> tuple[Samples, ...]:
         """Carry out a protocol: a table of settings in, a data set out.
@@ -403,30 +393,25 @@ class Laboratory:
     ) -> Samples:
         count = whole_number("n", n, least=1)
         with self._lock:
-            return self._carry_out(kind, request, count, row)
-
-    def _carry_out(
-        self, kind: str, request: Mapping[str, Any], count: int, row: int | None
-    ) -> Samples:
-        self._permit(kind, request, count)
-        first = self._journal.next_unit
-        try:
-            found = sample(
-                self._twins,
-                self._world,
-                self._with(request),
-                count,
-                outcomes=self.outcomes,
-                setting=self._setting,
-                first=first,
-            )
-        except Exception:  # how far it came may tell something: it is paid
-            units = range(first, first + count)
-            self._journal.write(f"refused {kind}", self._nothing(units, request), row=row)
-            raise
-        named = replace(found, plan=Plan(request))
-        self._journal.write(kind, named, row=row)
-        return named.copy()
+            self._permit(kind, request, count)
+            units = range(self._journal.next_unit, self._journal.next_unit + count)
+            try:
+                found = sample(
+                    self._twins,
+                    self._world,
+                    self._with(request),
+                    count,
+                    outcomes=self.outcomes,
+                    setting=self._setting,
+                    first=units.start,
+                )
+            except Exception:  # how far it came may tell something: it is paid
+                held = self._samples({}, units, request)
+                self._journal.write(f"refused {kind}", held, row=row)
+                raise
+            named = replace(found, plan=Plan(request))
+            self._journal.write(kind, named, row=row)
+            return named.copy()
 
     # --- permissions --------------------------------------------------------------------------
 
@@ -435,7 +420,7 @@ class Laboratory:
             raise Forbidden(kind, self.allow)
         plan = Plan(request)
         self._journal.refuse_others()
-        if self._journal.is_written:
+        if self._journal.path is not None:
             plan.as_dict()  # or it could not be written down afterwards
         for name in plan:
             if name not in self.settable:
@@ -445,11 +430,15 @@ class Laboratory:
 
     def _permit_looks(self, plan: Plan) -> None:
         """Check what a plan looks at: events, and causes of mechanisms."""
+
+        def sees(body: str) -> bool:  # the ground, or a body with visible variables
+            return body in ("floor", "twins") or any(n.startswith(body) for n in self.visible)
+
         for name, part in plan.timed():
             event = getattr(part, "event", None)
             if isinstance(event, Reaches) and event.name not in self.visible:
                 raise Forbidden(f"wait with {name} for {event.name}", self.visible)
-            if isinstance(event, Contact) and not all(map(self._sees, event.bodies)):
+            if isinstance(event, Contact) and not all(map(sees, event.bodies)):
                 raise Forbidden(f"wait with {name} for contacts", self.visible)
         for name, act in plan.acts():
             self._world.model.accept(name, act)
@@ -457,24 +446,10 @@ class Laboratory:
                 if parent.name not in self.visible:
                     raise Forbidden(f"let {name} follow {parent.name}", self.visible)
 
-    def _sees(self, body: str) -> bool:
-        """Tell whether a body may be watched: the ground, or one with visible variables."""
-        return body in ("floor", "twins") or any(name.startswith(body) for name in self.visible)
-
     def _afford(self, n: int) -> None:
         left = self.remaining
         if left is not None and n > left:
             raise BudgetExhausted(n, left)
-
-    def _plan_of(self, unit: int) -> Plan:
-        for record in self._journal.records:
-            if record.kind in ("see", "do") and unit in record.samples.numbers:
-                return record.samples.plan
-        raise Forbidden(f"imagine unit {unit}, which was never seen", self._units())
-
-    def _units(self) -> Sequence[str]:
-        last = self._journal.next_unit
-        return (f"units 0 to {last - 1}",) if last else ("none yet: see or do something first",)
 
 
 def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:
@@ -483,23 +458,3 @@ def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tup
         if not any(fnmatchcase(name, pattern) for name in names):
             raise UnknownOption(option, pattern, names)
     return tuple(n for n in names if any(fnmatchcase(n, pattern) for pattern in given))
-
-
-def intervention_data(
-    experiments: Iterable[Samples], names: Sequence[str]
-) -> tuple[list[Floats], list[list[int]]]:
-    """Give experiments the way learners from interventions take them.
-
-    Args:
-        experiments: What was seen and done.
-        names: Columns; each a number.
-
-    Returns:
-        One table of shape (n, m) for each experiment, and the numbers of the columns that it
-        intervened on.
-    """
-    tables, targets = [], []
-    for found in experiments:
-        tables.append(np.column_stack([np.asarray(found[name], float) for name in names]))
-        targets.append([i for i, name in enumerate(names) if name in found.plan])
-    return tables, targets

@@ -14,8 +14,7 @@ from scm_world.models.scene import ControlMode, ParameterKey, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.tasks.trifinger.structure import Structure, default_scene
-from scm_world.testing.scenes import STONE, named, same
-from scm_world.testing.suite import Suite
+from scm_world.testing.scenes import STONE, Suite, named, same
 
 HALF = 0.0325  # [m] of the default cube
 FAR_UP = {("robot", "height"): np.array(1.5)}  # [m] where the robot touches nothing

@@ -11,6 +11,7 @@ from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.structure import Structure, parameter_keys
 from scm_world.testing.scenes import (
     STONE,
+    Suite,
     apart_scene,
     changed_states,
     check_parameters,
@@ -18,7 +19,6 @@ from scm_world.testing.scenes import (
     play,
     same,
 )
-from scm_world.testing.suite import Suite
 
 
 class ParameterConformance(Suite):

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
+import pytest
 
 from scm_world._types import ArrayLike, Floats
-from scm_world.backends.base import Backend
+from scm_world.backends.base import Backend, EngineSnapshot
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
-from scm_world.models.scene import ControlMode, ParameterKey, Parameters, Scene
+from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.presets import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
@@ -178,3 +182,54 @@ def check_parameters(actual: Parameters, expected: Parameters) -> None:
             actual[key], value, rtol=0, atol=tolerance, err_msg=".".join(key)
         )
         assert actual[key].shape == value.shape
+
+
+class Suite(ABC):
+    """What the parts of the conformance suite share.
+
+    Attributes:
+        preset: Numerical settings under which the suite runs.
+        long: Horizon of the longest comparison, in control steps.
+    """
+
+    preset: ClassVar[Preset] = FAST
+    long: ClassVar[int] = LONG
+
+    @abstractmethod
+    def make(self) -> Backend:
+        """Create a backend without a scene."""
+
+    @pytest.fixture
+    def scene(self) -> Scene:
+        """Describe the busy scene."""
+        return busy_scene(self.preset)
+
+    @pytest.fixture
+    def backend(self, scene: Scene) -> Iterator[Backend]:
+        """Provide a backend in the middle of an episode."""
+        with self.built(scene) as backend:
+            play(backend, 2, seed=1)
+            yield backend
+
+    @contextmanager
+    def built(self, scene: Scene) -> Iterator[Backend]:
+        """Provide a new backend with a scene, and close it."""
+        backend = self.make()
+        backend.build(scene)
+        try:
+            yield backend
+        finally:
+            backend.close()
+
+    def continued(self, backend: Backend, start: EngineSnapshot, steps: int = 10) -> Floats:
+        """Go on from a snapshot."""
+        backend.restore(start)
+        return play(backend, steps)
+
+    def change_and_undo(
+        self, backend: Backend, keys: Iterable[ParameterKey], parameters: Parameters
+    ) -> None:
+        """Set parameters to something else and back."""
+        for key in keys:
+            backend.apply(Difference(parameters={key: other_value(key, parameters[key])}))
+            backend.apply(Difference(parameters={key: parameters[key]}))

@@ -14,6 +14,7 @@ from scm_world.errors import SnapshotMismatch
 from scm_world.models.scene import ControlMode, Difference, Scene
 from scm_world.tasks.trifinger.structure import Structure, default_scene, parameter_keys
 from scm_world.testing.scenes import (
+    Suite,
     another,
     changed_states,
     check_parameters,
@@ -22,7 +23,6 @@ from scm_world.testing.scenes import (
     play,
     same,
 )
-from scm_world.testing.suite import Suite
 
 
 class StateConformance(Suite):

@@ -1,6 +1,7 @@
-"""A conformance suite for tasks.
+"""Conformance suites for worlds and for tasks.
 
-Subclass it in a test file, say how to make a world of the task, and pytest runs the rest::
+Subclass ``TaskConformance`` in a test file, say how to make a world of the task, and pytest runs
+the rest::
 
     class TestMyTask(TaskConformance):
         def make(self) -> World:
@@ -9,27 +10,124 @@ Subclass it in a test file, say how to make a world of the task, and pytest runs
 
 from __future__ import annotations
 
+import pickle
 import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
+from functools import cache
+from multiprocessing import get_context
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from scm_world._types import Floats, Value
-from scm_world.errors import Infeasible
+from scm_world.errors import Infeasible, InterventionError, OutOfBounds, SeveralProblems
 from scm_world.graph import from_json, to_json
 from scm_world.models import Scene
 from scm_world.tasks import Timing
-from scm_world.testing.dynamics import SEED, WorldConformance
-from scm_world.testing.values import command, moved, quantities
-from scm_world.variables import Draw, Noise, Variable
+from scm_world.tasks.trifinger import hardware
+from scm_world.variables import (
+    Box,
+    Categories,
+    Draw,
+    Integers,
+    Noise,
+    Rotations,
+    Scale,
+    Shift,
+    Variable,
+)
 from scm_world.variables.kinds import SpaceName
-from scm_world.variables.reserved import SENSOR_NOISE
-from scm_world.world import World, WorldSnapshot
+from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
+from scm_world.world import Audit, World, WorldSnapshot
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
 _SPACES: tuple[SpaceName, ...] = ("A", "B")
+SEED = 20_26
+
+
+class WorldConformance(ABC):
+    """Every promise that a world makes, as a test.
+
+    Attributes:
+        awake: Interventions without which a variable has no effect: where obstacles are does not
+            matter as long as there are none.
+    """
+
+    awake: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+
+    @abstractmethod
+    def make(self) -> World:
+        """Create a world of the task."""
+
+    @pytest.fixture
+    def world(self) -> Iterator[World]:
+        """Provide a world at the start of an episode."""
+        world = self.make()
+        world.reset(seed=SEED)
+        yield world
+        world.close()
+
+    def prepare(self, world: World, name: str) -> None:
+        """Begin an episode in which a variable matters."""
+        world.reset(seed=SEED, do=self.awake.get(name))
+
+    def test_one_seed_has_one_future(self, world: World) -> None:
+        """Same seed, actions and interventions give the same bits, here and in another process."""
+        elsewhere = _pool().submit(_future, type(self), dict(vars(self)))
+        first = story(world)
+        assert story(world) == first
+        assert elsewhere.result(timeout=120) == first
+
+    def test_do_and_undo_leave_no_trace(self, world: World) -> None:
+        """Each quantity is set and set back; the next steps are bit-identical."""
+        for name in quantities(world):
+            self.prepare(world, name)
+            play(world, 2)
+            start, values = world.snapshot(), world.values()
+            future = play(world, 3)
+            world.restore(start)
+            try:
+                moved(world, name)
+            except InterventionError:
+                continue  # where it stands after two steps, nothing near is feasible
+            world.do({name: values[name]})
+            assert same(world.values(), values), name
+            assert play(world, 3) == future, name
+
+    def test_a_snapshot_goes_on_bit_for_bit(self, world: World) -> None:
+        """After it was pickled, and after other episodes."""
+        play(world, 4)
+        saved, values = pickle.dumps(world.snapshot()), world.values()
+        future = play(world, 6)
+        world.reset()
+        play(world, 3)
+        world.restore(pickle.loads(saved))  # noqa: S301 # our own
+        assert same(world.values(), values)
+        assert play(world, 6) == future
+
+    def test_what_is_refused_leaves_no_trace(self, world: World) -> None:
+        """A request of which one part is wrong changes nothing at all."""
+        play(world, 2)
+        start, values = world.snapshot(), world.values()
+        future = play(world, 4)
+        world.restore(start)
+        for wrong in ({"gravity": [0.0, 0.0, np.nan]}, {"no_such_variable": 1.0}):
+            with pytest.raises(InterventionError):
+                world.do({"floor_friction": 0.3, "joint_velocities": Shift(0.1), **wrong})
+            assert same(world.values(), values)
+        assert play(world, 4) == future
+
+    def test_a_reset_leaves_nothing_behind(self, world: World) -> None:
+        """After an episode with interventions the next one is as if there had been none."""
+        values, future = world.values(), play(world, 5)
+        story(world)
+        world.reset(seed=SEED)
+        assert same(world.values(), values)
+        assert play(world, 5) == future
 
 
 class TaskConformance(WorldConformance):
@@ -49,7 +147,10 @@ class TaskConformance(WorldConformance):
 
     def test_names_are_unique_and_published(self, world: World) -> None:
         """Names are ``entity.quantity``, and none stands for two things."""
-        declared = [variable.name for variable in _declared(world)]
+        options = world.options
+        mode, period = options.action_mode, options.control_period
+        timing = Timing(mode, options.preset, period, world.max_episode_length, options.resolution)
+        declared = [variable.name for variable in world.task.compose(timing)[1]]
         assert len(set(declared)) == len(declared)
         assert not [name for name in declared if not _NAME.fullmatch(name)]
 
@@ -193,17 +294,6 @@ def out_of_bounds(world: World) -> list[str]:
     ]
 
 
-def _declared(world: World) -> list[Variable]:
-    """List the declarations as they were written down, duplicates included."""
-    options, task = world.options, world.task
-    mode, period = options.action_mode, options.control_period
-    length, fine = world.max_episode_length, options.resolution
-    timing = Timing(mode, options.preset, period, length, fine)
-    return [
-        *task.compose(timing)[1],
-    ]
-
-
 def _differ(one: Scene, other: Scene) -> bool:
     """Tell whether two scenes have other bodies, or the same ones but for their properties."""
     if one.structure != other.structure or len(one.goals) != len(other.goals):
@@ -250,3 +340,121 @@ def _meant(variable: Variable, value: Value) -> tuple[Value, ...]:
     if getattr(variable, "inverse", None) is not None:
         return (np.asarray(meant.inverse.bind()(value)),)
     return (value,)
+
+
+# --- values and actions -------------------------------------------------------------------------
+
+
+def quantities(world: World) -> list[str]:
+    """Name every parameter and state that can be set, each in its own coordinates."""
+    model = world.model
+    return [
+        name
+        for name in model
+        if model.declared(name).settable
+        and model.declared(name).role != "action"
+        and model.target(name) == name
+        and name != CONTROL_INDEX
+    ]
+
+
+def nearby(world: World, name: str) -> Iterator[Value]:
+    """Give other possible values of a variable, near the present one."""
+    variable, value = world.model.declared(name), world[name]
+    match variable.bounds:
+        case Box() as box:
+            low, high = box.bounds(variable.shape, world.values())
+            inwards = 0.02 * (low + 0.37 * (high - low) - value)
+            yield value + inwards
+            yield value + 0.02 * (low - value)
+            first = np.zeros(variable.shape)
+            first.flat[0] = inwards.flat[0]
+            yield from (value + first, value - first)
+        case Integers(high=most):
+            yield np.where(value < most, value + 1, value - 1)
+        case Categories(members=members):
+            yield np.asarray(next(member for member in members if member != value))
+        case Rotations():
+            for angle in (0.1, 0.02):  # [rad]
+                yield np.array([0.0, 0.0, np.sin(angle / 2.0), np.cos(angle / 2.0)])
+        case _:
+            raise ValueError(f"{name} has no bounds to choose from")
+
+
+def moved(world: World, name: str) -> tuple[Value, Audit]:
+    """Give a variable the first nearby value that is feasible: blocks may touch one another.
+
+    Returns:
+        The value, and what became of it.
+    """
+    *others, last = nearby(world, name)
+    for value in others:
+        try:
+            return value, world.do({name: value})
+        except (Infeasible, OutOfBounds, SeveralProblems):
+            continue
+    return last, world.do({name: last})
+
+
+def command(world: World, generator: np.random.Generator) -> Floats:
+    """Draw an action: anywhere in its range, now and then at its ends, or near the rest pose."""
+    low, high = world.action_low, world.action_high
+    match generator.integers(4):
+        case 0:
+            return np.asarray(np.where(generator.random(9) < 0.5, low, high))
+        case 1 if world.action_mode == "joint_positions":
+            return np.asarray(np.array(hardware.REST) + generator.uniform(-0.8, 0.8, 9))
+        case _:
+            return np.asarray(generator.uniform(low, high))
+
+
+def same(first: Mapping[str, Value], second: Mapping[str, Value]) -> bool:
+    """Compare all values of two worlds bit for bit."""
+    return first.keys() == second.keys() and all(
+        np.asarray(first[name]).tobytes() == np.asarray(second[name]).tobytes() for name in first
+    )
+
+
+def play(world: World, steps: int) -> list[bytes]:
+    """Take random actions, always the same ones; give states and rewards."""
+    generator, seen = np.random.default_rng(SEED), []
+    for _ in range(steps):
+        world.step(command(world, generator))
+        now = world.evaluate(("reward", "fractional_success"))
+        numbers = [now["reward"], now["fractional_success"]]
+        seen.append(world.current()[1].vector.tobytes() + np.array(numbers, float).tobytes())
+    return seen
+
+
+def story(world: World) -> list[bytes]:
+    """Play two episodes with all kinds of interventions; give everything that there was."""
+    seen = []
+    for episode in range(2):
+        world.reset(seed=SEED + episode)
+        for request in (
+            world.task.sample_goal("A"),
+            {"gravity": Draw("A"), "robot_finger_60_link_2.mass": Scale(0.7)},
+            {"actuator_noise": 0.02, "joint_velocities": Shift(0.1)},
+        ):
+            with suppress(InterventionError):  # what is refused here is refused everywhere
+                world.do(request)
+            seen += play(world, 4)
+        values = world.values()
+        seen += [name.encode() + np.asarray(values[name]).tobytes() for name in sorted(values)]
+    return seen
+
+
+@cache
+def _pool() -> ProcessPoolExecutor:
+    """Give the other process, which knows nothing of this one."""
+    return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+
+
+def _future(suite: type[WorldConformance], attributes: dict[str, Any]) -> list[bytes]:
+    made = object.__new__(suite)
+    vars(made).update(attributes)
+    world = made.make()
+    try:
+        return story(world)
+    finally:
+        world.close()

@@ -16,8 +16,7 @@ from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode, Difference, Scene
 from scm_world.tasks.trifinger.hardware import REST
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, PhysicalState
-from scm_world.testing.scenes import SUBSTEPS, other_value
-from scm_world.testing.suite import Suite
+from scm_world.testing.scenes import SUBSTEPS, Suite, other_value
 
 COUNT = 4
 MODE = ControlMode.JOINT_POSITIONS

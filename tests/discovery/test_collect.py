@@ -285,7 +285,7 @@ def test_noise_reaches_what_is_measured_and_nothing_else(world: World) -> None:
 
 def test_the_range_is_that_of_the_observations(world: World) -> None:
     """A sensor has the same strength here as in the environment."""
-    from scm_world.discovery.data.sensors import half_range
+    from scm_world.discovery.data.worlds import half_range
 
     vector = observer(world, world.compiled, Observing(normalize=False), None)  # type: ignore[arg-type]
     for name, place in vector.layouts["observation"].items():

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from scm_world.cli.app import app
 from scm_world.cli.datasets import read_over
 from scm_world.discovery.data import Dataset, Design, Levels, Swept, collect, load, sweep
-from scm_world.discovery.data.levels import points_of
+from scm_world.discovery.data.sweeps import points_of
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM
 from scm_world.queries import Outcome, World

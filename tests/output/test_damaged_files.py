@@ -18,8 +18,8 @@ import pytest
 from scm_world import SCM
 from scm_world.backends import read_model
 from scm_world.curricula import Curriculum
-from scm_world.discovery.data.files import load as dataset_of
 from scm_world.discovery.data.folders import SIDECAR
+from scm_world.discovery.data.folders import load as dataset_of
 from scm_world.errors import ModelError, ScmWorldError, UnreadableFile
 from scm_world.evaluation import Evaluation, check, evaluate
 from scm_world.evaluation.players import as_player

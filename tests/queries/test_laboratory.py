@@ -27,7 +27,6 @@ from scm_world.queries import (
     Outcome,
     Reaches,
     World,
-    intervention_data,
 )
 from scm_world.variables import Mechanism
 
@@ -48,9 +47,6 @@ def test_experiments_are_of_new_units() -> None:
     assert (mine.spent, mine.remaining) == (7, 3)
     assert [record.kind for record in mine.records] == ["see", "do"]
     assert done["floor_friction"].tolist() == [0.3] * 4
-    tables, targets = intervention_data([seen, done], ["tool_block.mass", "floor_friction"])
-    assert [table.shape for table in tables] == [(3, 2), (4, 2)]
-    assert targets == [[], [1]]
 
 
 def test_the_budget_is_never_exceeded() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from worlds import NEEDS_BULLET, actions, play, same, settable
 
+from benchmarks.fuzz import random_request
 from scm_world.errors import InterventionError
-from scm_world.testing.requests import random_request
 from scm_world.world import World
 
 

@@ -3,12 +3,10 @@
 from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
-from scm_world.discovery.data.files import load, save
-from scm_world.discovery.data.levels import Levels
+from scm_world.discovery.data.folders import load, save
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sources import DataSource, SourceRows
-from scm_world.discovery.data.sweeps import sweep
-from scm_world.discovery.data.swept import Swept
+from scm_world.discovery.data.sweeps import Levels, Swept, sweep
 from scm_world.discovery.data.views import (
     CausalLearn,
     as_causal_learn,

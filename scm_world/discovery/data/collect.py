@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypedDict, Unpack, final
@@ -12,12 +12,9 @@ from typing import Any, TypedDict, Unpack, final
 from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
-from scm_world.discovery.data.files import refusals, together
-from scm_world.discovery.data.folders import SHARD, Folder, Head
-from scm_world.discovery.data.laboratories import Experiments
-from scm_world.discovery.data.models import ModelSource
-from scm_world.discovery.data.sources import DataSource, SourceRows, Tell
-from scm_world.discovery.data.worlds import WorldSource
+from scm_world.discovery.data.folders import SHARD, Folder, Head, refusals, together
+from scm_world.discovery.data.sources import DataSource, ModelSource, SourceRows, Tell
+from scm_world.discovery.data.worlds import Experiments, WorldSource
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.output.locations import Location
@@ -108,21 +105,25 @@ def collect(
     whole_number("seed", seed, least=0)
     made = source_of(source, design, count, seed=seed, **circumstances)
     about = json.loads(json.dumps(made.about))
+    folder = None
     if out is None:
         size = count if made.at_once else size
-        head = Head(about, made.columns, count, size, format, made.edges)
-        with _opened(source, engine, workers, address) as executor:
-            return together(head, _gathered(made, head, None, executor, progress))
-    if isinstance(source, Laboratory):
+    elif isinstance(source, Laboratory):
         allowed = ("None with a laboratory: give it a log, and save the dataset",)
         raise UnknownOption("out", str(out), allowed)
-    if about.get("model", "") is None:
+    elif about.get("model", "") is None:
         raise ModelError(["a function of the model has no name: define it at the top of a module"])
     head = Head(about, made.columns, count, size, format, made.edges)
-    folder = Folder(out, head, design.modules)
-    with _opened(source, engine, workers, address) as executor, folder.opened():
-        parts = _gathered(made, head, folder, executor, progress)
-        folder.note(refusals(parts), complete=True)
+    if out is not None:
+        folder = Folder(out, head, design.modules)
+    with opened(engine, workers, address) as executor:
+        if isinstance(source, Laboratory) and not isinstance(executor, Serial):
+            allowed = ("'serial' with one worker: a laboratory keeps its books in one process",)
+            raise UnknownOption("engine of work", executor.engine, allowed)
+        with nullcontext() if folder is None else folder.opened():
+            parts = _gathered(made, head, folder, executor, progress)
+            if folder is not None:
+                folder.note(refusals(parts), complete=True)
     return together(head, parts)
 
 
@@ -173,18 +174,6 @@ def _refuse_others(given: Mapping[str, Any], allowed: tuple[str, ...], of: str) 
             raise UnknownOption(f"circumstance of {of}", name, allowed or ("nothing",))
 
 
-@contextmanager
-def _opened(
-    source: Any, engine: Executor | str | None, workers: int | None, address: str | None
-) -> Iterator[Executor]:
-    """Open what makes shards."""
-    with opened(engine, workers, address) as executor:
-        if isinstance(source, Laboratory) and not isinstance(executor, Serial):
-            allowed = ("'serial' with one worker: a laboratory keeps its books in one process",)
-            raise UnknownOption("engine of work", executor.engine, allowed)
-        yield executor
-
-
 def _gathered(
     source: DataSource,
     head: Head,
@@ -193,18 +182,23 @@ def _gathered(
     progress: Progress | None,
 ) -> list[SourceRows]:
     """Read or make all parts."""
-    ranges = head.ranges()
-    tally = _Tally(head.n, progress)
+    ranges, serial, done = head.ranges(), isinstance(executor, Serial), 0
+
+    def tell(more: int) -> None:
+        nonlocal done
+        done += more
+        if progress is not None and more:
+            progress(done, head.n)
+
     parts: dict[int, SourceRows] = {}
     for index, numbers in enumerate(ranges):
         part = None if folder is None else folder.read(index, numbers)
         if part is not None:
             parts[index] = part
-            tally.add(len(numbers))
+            tell(len(numbers))
     missing = [index for index in range(len(ranges)) if index not in parts]
-    serial = isinstance(executor, Serial)
     executor.check("source of episodes with several workers", source)
-    make = partial(Maker, source, tally.add if serial else None)
+    make = partial(Maker, source, tell if serial else None)
     refused = [pair for part in parts.values() for pair in part.refused]
     made = sum(len(ranges[index]) for index in parts)
     for place, found in executor.run(make, [ranges[index] for index in missing]):
@@ -212,32 +206,16 @@ def _gathered(
         parts[index] = part = replace(found, table=replace(found.table, about=head.about))
         refused += part.refused
         made += len(ranges[index])
-        if made == head.n or not source.uneven:
-            _refuse_hopeless(refused, made)
+        is_known = made >= ENOUGH and (made == head.n or not source.uneven)
+        if is_known and 2 * len(refused) > made:
+            number, why = refused[-1]
+            said = f"{len(refused)} of {made} episodes were refused; number {number} because"
+            raise InterventionError(f"{said}: {why}", variable="")
         if folder is not None:
             folder.write(index, ranges[index], part)
         if not serial:
-            tally.add(len(ranges[index]))
+            tell(len(ranges[index]))
     return [parts[index] for index in range(len(ranges))]
-
-
-@final
-class _Tally:
-    """Counts episodes.
-
-    Args:
-        total: How many there will be.
-        progress: Told how many there are.
-    """
-
-    def __init__(self, total: int, progress: Progress | None) -> None:
-        self._done, self._total, self._progress = 0, total, progress
-
-    def add(self, more: int) -> None:
-        """Count some more."""
-        self._done += more
-        if self._progress is not None and more:
-            self._progress(self._done, self._total)
 
 
 @final
@@ -250,22 +228,9 @@ class Maker:
     """
 
     def __init__(self, source: DataSource, tell: Tell | None = None) -> None:
-        self._source, self._tell = source, tell or _silent
+        self._source, self._tell = source, tell
 
     def __call__(self, numbers: range) -> SourceRows:
         """Let the episodes of a shard happen."""
-        part = self._source.part(numbers, self._tell)
+        part = self._source.part(numbers, self._tell or (lambda more: None))
         return replace(part, table=replace(part.table, about={}))  # it is the same in all of them
-
-
-def _silent(more: int) -> None:
-    """Tell nobody."""
-
-
-def _refuse_hopeless(refused: list[tuple[int, str]], done: int) -> None:
-    if done >= ENOUGH and 2 * len(refused) > done:
-        number, why = refused[-1]
-        raise InterventionError(
-            f"{len(refused)} of {done} episodes were refused; number {number} because: {why}",
-            variable="",
-        )

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.discovery.data.disorder import disorder
 from scm_world.errors import ModelError, UnknownVariable
 from scm_world.queries.plans import Plan
 
@@ -131,7 +130,7 @@ class Dataset:
         ):
             problems.append(f"a row refers to a regime that is not among {len(self.regimes)}")
         if not problems:
-            problems += disorder(self.episode, self.step)
+            problems += _disorder(self.episode, self.step)
         if problems:
             raise ModelError(problems)
 
@@ -348,6 +347,35 @@ class Dataset:
             episode=np.concatenate([part.episode for part in parts]),
             step=np.concatenate([part.step for part in parts]),
         )
+
+
+def _disorder(episode: Ints, step: Ints) -> list[str]:
+    """Say where rows of one episode do not stand together, with rising steps.
+
+    Example:
+        >>> _disorder(np.array([4, 4, 7]), np.array([0, 1, 0]))
+        []
+        >>> _disorder(np.array([4, 4, 7]), np.array([1, 0, 0]))[0]
+        'the rows of episode 4 do not stand together in time: sort the rows by episode and step'
+    """
+    starts = np.flatnonzero(np.diff(episode, prepend=episode[:1] - 1))
+    _, begun = np.unique(episode[starts], return_index=True)
+    again = np.delete(starts, begun)
+    back = np.flatnonzero((np.diff(episode) == 0) & (np.diff(step) <= 0)) + 1
+    if not again.size and not back.size:
+        return []
+    pairs, times = np.unique(np.stack([episode, step]), axis=1, return_counts=True)
+    if times.max() > 1:
+        number, instant = pairs[:, times.argmax()]
+        return [
+            f"two rows are step {instant} of episode {number}: if two tables have the same episode "
+            "numbers, give one of them others; if not, give each row of an episode its own step"
+        ]
+    number = episode[min([*again, *back])]
+    return [
+        f"the rows of episode {number} do not stand together in time: sort the rows by episode "
+        "and step"
+    ]
 
 
 def block(column: Column) -> str:

@@ -6,12 +6,21 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, final
 
+import numpy as np
+
 from scm_world._arguments import whole_number
-from scm_world.discovery.data.dataset import Column
-from scm_world.discovery.data.shards import ShardPlace, check_kind, check_names, decoded, encoded
+from scm_world.discovery.data.dataset import Column, Dataset, Regime
+from scm_world.discovery.data.shards import (
+    check_kind,
+    check_names,
+    checksum,
+    decoded,
+    encoded,
+    raw_of,
+)
 from scm_world.discovery.data.sources import FORMAT, SourceRows
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
@@ -82,6 +91,14 @@ class Head:
         """Sum up the terms."""
         return hashlib.sha256(json.dumps(self.terms, sort_keys=True).encode()).hexdigest()
 
+    @property
+    def empty(self) -> Dataset:
+        """The dataset without its rows."""
+        none = np.zeros(0, dtype=np.int64)
+        return Dataset(
+            np.empty((0, len(self.columns))), self.columns, (), none, none, none, self.about
+        )
+
     def ranges(self) -> list[range]:
         """Give the numbers of the episodes of each file."""
         return [
@@ -122,24 +139,19 @@ class Folder:
         except OSError as error:
             raise UnreadableFile(str(path), said(error), "make it readable") from None
         try:
-            place, part = decoded(
-                data, head.kind, self._plan, head.columns, head.about, self._trusted
-            )
+            there, part = decoded(data, head.kind, self._plan, head.empty, self._trusted)
         except DAMAGED as error:
             if isinstance(error, ModelError) and "trusted" in str(error):
                 raise
             advice = f"delete it, and {self.again}: only it is made anew"
             raise UnreadableFile(str(path), str(error), advice) from None
-        self._check_place(path, place, numbers)
-        return part if place.stop >= numbers.stop else None
-
-    def _check_place(self, path: Location, place: ShardPlace, numbers: range) -> None:
-        reason = f"it holds the episodes from {place.first} to {place.stop - 1}"
-        if place.first != numbers.start or place.stop > numbers.start + self.head.shard:
+        reason = f"it holds the episodes from {there.start} to {there.stop - 1}"
+        if there.start != numbers.start or there.stop > numbers.start + head.shard:
             raise UnreadableFile(str(path), reason, "put it back under its own name")
-        if place.stop > numbers.stop:
-            reason += f", and {SIDECAR} says that there are {self.head.n} in all"
+        if there.stop > numbers.stop:
+            reason += f", and {SIDECAR} says that there are {head.n} in all"
             raise UnreadableFile(str(path), reason, f"put the {SIDECAR} back that belongs to it")
+        return part if there.stop >= numbers.stop else None
 
     @property
     def again(self) -> str:
@@ -154,8 +166,7 @@ class Folder:
         Raises:
             UnwritableFolder: There is no room, or no permission.
         """
-        place = ShardPlace(self._plan, numbers.start, numbers.stop)
-        write_durably(self.shard(index), encoded(part, place, self.head.kind))
+        write_durably(self.shard(index), encoded(part, self._plan, numbers, self.head.kind))
 
     # --- the sidecar --------------------------------------------------------------------------
 
@@ -171,21 +182,17 @@ class Folder:
         check_kind(self.head.kind)
         check_names(self.head.columns)
         with locked(self.path):
-            self._begin()
+            for stale in self.path.glob(f".*{PARTIAL}"):  # of a process that was killed
+                if is_draft(stale.name, "shard-") or is_draft(stale.name, SIDECAR):
+                    removed(stale)
+            if (self.path / SIDECAR).exists():
+                self._check_same(read_sidecar(self.path))
+            elif any(not path.name.startswith(".") for path in self.path.iterdir()):
+                reason = f"it holds other files, and no {SIDECAR}"
+                raise UnreadableFile(str(self.path), reason, "give a new or an empty folder")
+            else:
+                self.note({})
             yield
-
-    def _begin(self) -> None:
-        sidecar = self.path / SIDECAR
-        for stale in self.path.glob(f".*{PARTIAL}"):  # of a process that was killed
-            if is_draft(stale.name, "shard-") or is_draft(stale.name, SIDECAR):
-                removed(stale)
-        if sidecar.exists():
-            self._check_same(read_sidecar(self.path))
-        elif any(not path.name.startswith(".") for path in self.path.iterdir()):
-            reason = f"it holds other files, and no {SIDECAR}"
-            raise UnreadableFile(str(self.path), reason, "give a new or an empty folder")
-        else:
-            self.note({})
 
     def _check_same(self, there: Mapping[str, Any]) -> None:
         mine = self.head.terms
@@ -258,10 +265,109 @@ def read_sidecar(folder: Location) -> dict[str, Any]:
 def head_of(found: Mapping[str, Any]) -> Head:
     """Turn what a sidecar says into what it said it from."""
     columns = tuple(Column(**column) for column in found["columns"])
-    n, shard = (
-        whole_number("n", found["n"], least=0),
-        whole_number("shard", found["shard"], least=1),
-    )
+    n = whole_number("n", found["n"], least=0)
+    shard = whole_number("shard", found["shard"], least=1)
     graph = found["graph"]
     edges = None if graph is None else tuple(Edge(*key) for key in graph)
     return Head(found["about"], columns, n, shard, found["files"], edges, found["content"])
+
+
+# --- whole datasets -------------------------------------------------------------------------------
+
+
+def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool = False) -> Dataset:
+    """Read a dataset.
+
+    Args:
+        folder: That ``collect`` or ``save`` wrote; it may be a URL.
+        trusted: Packages, besides this one, whose functions may be mechanisms of its plans.
+        partial: Whether files may be missing, since a collection was interrupted.
+
+    Raises:
+        UnreadableFile: A file is missing, damaged, or belongs to another dataset; it says which,
+            and what to do.
+        ModelError: A plan names a function outside of the trusted packages.
+        MissingExtra: A library that reads it is not installed.
+    """
+    place = located(folder)
+    head = head_of(read_sidecar(place))
+    check_kind(head.kind)
+    files = Folder(place, head, trusted)
+    parts, ranges = [], head.ranges()
+    known = {files.shard(index) for index in range(len(ranges))}
+    for stranger in sorted(set(place.glob(f"shard-*.{head.kind}")) - known, key=str):
+        reason = f"the dataset has {len(ranges)} files, and it is none of them"
+        raise UnreadableFile(str(stranger), reason, "remove it from the folder")
+    for index, numbers in enumerate(ranges):
+        part = files.read(index, numbers)
+        if part is None and not partial:
+            advice = f"{files.again} to go on, or load it with partial=True"
+            raise UnreadableFile(str(files.shard(index)), "it is not there yet", advice)
+        if part is not None:
+            parts.append(part)
+    return together(head, parts)
+
+
+def together(head: Head, parts: Sequence[SourceRows]) -> Dataset:
+    """Put the parts of a dataset together, with what was refused."""
+    tables = [part.table for part in parts] or [head.empty]
+    refused = refusals(parts)
+    about = {**head.about, "refused": refused} if refused else dict(head.about)
+    return replace(Dataset.joined(tables), about=about)
+
+
+def refusals(parts: Sequence[SourceRows]) -> dict[str, str]:
+    """Say why episodes could not be, by their number."""
+    return {str(number): why for part in parts for number, why in part.refused}
+
+
+def save(
+    dataset: Dataset,
+    folder: Location | str,
+    *,
+    shard: int = SHARD,
+    format: str = "parquet",  # noqa: A002 # as other libraries call it
+) -> Location:
+    """Write a dataset to a new folder, without loss.
+
+    Args:
+        dataset: Its ``about`` has to be plain data: what JSON can hold.
+        folder: New or empty, or one in which saving the same dataset was interrupted; it may be a
+            URL.
+        shard: How many episodes are in a file.
+        format: ``"parquet"`` or ``"csv"``.
+
+    Raises:
+        UnreadableFile: Something else is in the folder, be it a dataset with other numbers only.
+        UnwritableFolder: There is no room, or no permission.
+        ModelError: A part of it cannot be written.
+    """
+    try:
+        about = json.loads(json.dumps(dataset.about, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ModelError(
+            [f"what the dataset says about itself is no plain data: {error}"]
+        ) from None
+    table = _trimmed(dataset)
+    starts = np.flatnonzero(np.diff(table.episode, prepend=table.episode[:1] - 1))
+    ends = [*starts, len(table)]
+    size = whole_number("shard", shard, least=1)
+    head = Head(about, table.columns, len(starts), size, format, content=checksum(raw_of(table)))
+    files = Folder(folder, head)
+    with files.opened():
+        files.note({})
+        for index, numbers in enumerate(head.ranges()):
+            rows = table.rows(slice(ends[numbers.start], ends[numbers.stop]))
+            files.write(index, numbers, SourceRows(_trimmed(rows)))
+        files.note({}, complete=True)
+    return files.path
+
+
+def _trimmed(table: Dataset) -> Dataset:
+    """Number the regimes as they occur, each once, and leave out those that no row has."""
+    used, first = np.unique(table.regime, return_index=True)
+    kept: dict[Regime, int] = {}
+    number = np.zeros(len(table.regimes), dtype=np.int64)
+    for old in used[np.argsort(first)]:
+        number[old] = kept.setdefault(table.regimes[old], len(kept))
+    return replace(table, regimes=tuple(kept), regime=number[table.regime])

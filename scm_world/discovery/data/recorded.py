@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from fnmatch import fnmatchcase
-from functools import cached_property
-from typing import Any, final
 
-import numpy as np
-
-from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, columns_of
-from scm_world.discovery.data.sensors import Sensors
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph import SCM
-from scm_world.queries.episodes import Episode
 from scm_world.queries.outcomes import Outcome, column
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS
@@ -147,115 +140,3 @@ def columns_of_outcome(variable: Variable, outcome: Outcome) -> tuple[Column, ..
         chosen = tuple(replace(c, dtype="real") for c in chosen)
     plain = Outcome(outcome.name, outcome.how)
     return labelled(chosen, column(plain).removesuffix(outcome.name).strip())
-
-
-# --- one row per episode ----------------------------------------------------------------------
-
-
-@final
-@dataclass(frozen=True)
-class Ends:
-    """One row per episode: causes as they are at its beginning, and outcomes.
-
-    Args:
-        world: That is watched.
-        causes: Names of variables.
-        outcomes: What is measured.
-    """
-
-    world: World
-    causes: Sequence[str]
-    outcomes: Sequence[Outcome]
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """What stands in a row."""
-        model, declared = self.world.model, self.world.model.declared
-        causes = [
-            labelled(columns_of(declared(name), "first"), first_label(model, name))
-            for name in self.causes
-        ]
-        outcomes = [columns_of_outcome(declared(o.name), o) for o in self.outcomes]
-        return tuple(column for part in (*causes, *outcomes) for column in part)
-
-    @property
-    def watched(self) -> tuple[str, ...]:
-        """Variables to write down on the way."""
-        return tuple(dict.fromkeys((*self.causes, *(o.name for o in self.outcomes))))
-
-    def targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
-        """Name the columns' variables that an intervention at the beginning sets."""
-        model = self.world.model
-        return tuple(f"{first_label(model, n)} {n}".strip() for n in reached(model, names))
-
-    def rows(self, episode: Episode, sensors: Sensors) -> Floats:
-        """Read an episode, shape (1, p)."""
-        values = [sensors.read(episode, outcome) for outcome in self._read]
-        return np.concatenate([np.ravel(value) for value in values])[None]
-
-    @cached_property
-    def _read(self) -> tuple[Outcome, ...]:
-        return (*(Outcome(name, "first") for name in self.causes), *self.outcomes)
-
-
-# --- one row per instant ----------------------------------------------------------------------
-
-
-@final
-@dataclass(frozen=True)
-class Instants:
-    """One row per control step: everything as it is when the action is chosen, and the action.
-
-    Args:
-        world: That is watched.
-        names: Of variables.
-
-    Raises:
-        UnknownOption: An outcome sums up the episode.
-    """
-
-    world: World
-    names: Sequence[str]
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """What stands in a row."""
-        declared = self.world.model.declared
-        return tuple(c for name in self.watched for c in columns_of(declared(name)))
-
-    @property
-    def watched(self) -> tuple[str, ...]:
-        """Variables to write down on the way; the actions are always among them."""
-        return tuple(dict.fromkeys((*self.names, *self.world.compiled.actions)))
-
-    def targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
-        """Name what is set in the row of a control step: a state is at the first one only."""
-        model = self.world.model
-        return tuple(n for n in reached(model, names) if step == 0 or not is_state(model, n))
-
-    def rows(self, episode: Episode, sensors: Sensors) -> Floats:
-        """Read an episode, shape (steps, p)."""
-        parts = [
-            # At an instant the world still has the action of the step before.
-            np.asarray(episode[name], float)[1:]
-            if name in self.world.compiled.commanded
-            else sensors.instants(episode, name)[:-1]
-            for name in self.watched
-        ]
-        return np.concatenate([part.reshape(episode.steps, -1) for part in parts], axis=1)
-
-
-def names_of(outcomes: Iterable[Any]) -> tuple[str, ...]:
-    """Name the variables of outcomes, for rows of instants.
-
-    Raises:
-        UnknownOption: An outcome is not simply a variable.
-    """
-    found = []
-    for given in outcomes:
-        name = given.name if given == Outcome(given.name) else None
-        if name is None:
-            allowed = ("names of variables with every_step=True",)
-            raise UnknownOption("outcome", str(given), allowed)
-        found.append(name)
-    return tuple(found)

@@ -6,8 +6,8 @@ import csv
 import hashlib
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
@@ -32,22 +32,6 @@ FORMAT = "scm_world/shard/1"
 
 @final
 @dataclass(frozen=True)
-class ShardPlace:
-    """To which part of which dataset a file belongs.
-
-    Attributes:
-        plan: Sums up everything that decides the rows.
-        first: Number of its first episode.
-        stop: Number after its last one.
-    """
-
-    plan: str
-    first: int
-    stop: int
-
-
-@final
-@dataclass(frozen=True)
 class Raw:
     """What a file holds, before it is believed."""
 
@@ -61,74 +45,90 @@ Encode = Callable[[Raw, Sequence[str]], bytes]
 Decode = Callable[[bytes, Sequence[str]], Raw]
 
 
-def encoded(part: SourceRows, place: ShardPlace, kind: str) -> bytes:
+def encoded(part: SourceRows, plan: str, numbers: range, kind: str) -> bytes:
     """Write episodes as the bytes of a file; the same ones every time.
+
+    Args:
+        part: The episodes.
+        plan: Sums up everything that decides the rows of the dataset they belong to.
+        numbers: Of the episodes.
+        kind: Of the file.
 
     Raises:
         ModelError: A plan has a function without a name, or a column has a name of ours.
     """
     header = {
         "format": FORMAT,
-        "plan": place.plan,
-        "first": place.first,
-        "stop": place.stop,
+        "plan": plan,
+        "first": numbers.start,
+        "stop": numbers.stop,
         "refused": [list(pair) for pair in part.refused],
         **_regimes(part.table.regimes),
     }
-    raw = _raw(header, part.table)
-    header["checksum"] = _checksum(raw)
+    raw = raw_of(part.table, header)
+    header["checksum"] = checksum(raw)
     return CODECS[kind][0](raw, part.table.names)
 
 
-def content_of(table: Dataset) -> str:
-    """Sum up the rows of a table and what was done in them.
+def raw_of(table: Dataset, header: dict[str, Any] | None = None) -> Raw:
+    """Give a table as a file holds it; with its regimes as the header, if there is no other.
 
     Raises:
         ModelError: A plan has a function without a name.
     """
-    return _checksum(_raw(_regimes(table.regimes), table))
-
-
-def _raw(header: dict[str, Any], table: Dataset) -> Raw:
+    head = _regimes(table.regimes) if header is None else header
     numbers = {name: getattr(table, name) for name in NUMBERS}
-    return Raw(header, numbers, target_texts(table), table.values)
+    texts = [
+        ";".join(c.name for c in table.columns if not c.lag and c.variable in regime.targets)
+        for regime in table.regimes
+    ]
+    return Raw(head, numbers, [texts[number] for number in table.regime], table.values)
 
 
 def decoded(
-    data: bytes,
-    kind: str,
-    plan: str,
-    columns: tuple[Column, ...],
-    about: dict[str, Any],
-    trusted: Sequence[str],
-) -> tuple[ShardPlace, SourceRows]:
+    data: bytes, kind: str, plan: str, empty: Dataset, trusted: Sequence[str]
+) -> tuple[range, SourceRows]:
     """Read what ``encoded`` wrote.
+
+    Args:
+        data: The bytes of the file.
+        kind: Of the file.
+        plan: As above.
+        empty: The dataset it should belong to, without rows.
+        trusted: Packages whose functions may be mechanisms of its plans.
+
+    Returns:
+        The numbers of its episodes, and these.
 
     Raises:
         ValueError: It is damaged, or belongs to another dataset; with the reason.
         ModelError: A plan names a function outside of the trusted packages.
     """
-    raw = CODECS[kind][1](data, [column.name for column in columns])
+    raw = CODECS[kind][1](data, empty.names)
     header = raw.header
     if header.get("format") != FORMAT:
         raise ValueError("it is no part of a dataset")
     given = header.pop("checksum", None)
-    if given != _checksum(raw):
+    if given != checksum(raw):
         raise ValueError("its content is not what was written")
     if header["plan"] != plan:
         raise ValueError("it belongs to another dataset")
-    table = Dataset(
-        values=raw.values,
-        columns=columns,
-        regimes=_read_regimes(header, trusted),
-        about=about,
-        **raw.numbers,
+    acts = [
+        (name, Plan.from_dict({"format": PLAN, "do": {name: parts}}, trusted=trusted)[name])
+        for name, parts in header["acts"]
+    ]
+    regimes = tuple(
+        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
+        for numbers, targets in header["regimes"]
     )
+    rows: dict[str, Any] = {"values": raw.values, "regimes": regimes, **raw.numbers}
+    table = replace(empty, **rows)
     refused = tuple((int(number), str(why)) for number, why in header["refused"])
-    return ShardPlace(header["plan"], header["first"], header["stop"]), SourceRows(table, refused)
+    return range(header["first"], header["stop"]), SourceRows(table, refused)
 
 
-def _checksum(raw: Raw) -> str:
+def checksum(raw: Raw) -> str:
+    """Sum up what a file holds."""
     found = hashlib.sha256(json.dumps([raw.header, raw.targets], sort_keys=True).encode())
     for name in NUMBERS:
         found.update(np.ascontiguousarray(raw.numbers[name], dtype="<i8").tobytes())
@@ -160,26 +160,6 @@ def _regimes(regimes: Sequence[Regime]) -> dict[str, Any]:
         numbers = [acts.setdefault(text, len(acts)) for text in texts]
         written.append([numbers, list(regime.targets)])
     return {"acts": [json.loads(text) for text in acts], "regimes": written}
-
-
-def _read_regimes(header: Mapping[str, Any], trusted: Sequence[str]) -> tuple[Regime, ...]:
-    acts = [
-        (name, Plan.from_dict({"format": PLAN, "do": {name: parts}}, trusted=trusted)[name])
-        for name, parts in header["acts"]
-    ]
-    return tuple(
-        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
-        for numbers, targets in header["regimes"]
-    )
-
-
-def target_texts(table: Dataset) -> list[str]:
-    """Name for each row the columns that were intervened on, with semicolons between them."""
-    texts = [
-        ";".join(c.name for c in table.columns if not c.lag and c.variable in regime.targets)
-        for regime in table.regimes
-    ]
-    return [texts[number] for number in table.regime]
 
 
 # --- Parquet ----------------------------------------------------------------------------------

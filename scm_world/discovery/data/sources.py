@@ -1,17 +1,25 @@
-"""Where rows come from: what a source is, and the rows of some episodes."""
+"""What has rows: a source, the rows of some episodes, and models without physics as sources."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, final
 
 import numpy as np
 
-from scm_world.discovery.data.dataset import Column, Dataset
+from scm_world.discovery.data.dataset import Column, Dataset, columns_of
+from scm_world.discovery.data.designs import Design
+from scm_world.discovery.data.recorded import reached
+from scm_world.errors import ModelError
+from scm_world.graph import SCM, to_json
 from scm_world.graph.structure import Edge
-from scm_world.policies.scripted import Sequence as Given
+from scm_world.queries.equations import Equations
+from scm_world.queries.experiments.versions import versions
+from scm_world.queries.parallel import paths
+from scm_world.queries.rollouts import Unit
+from scm_world.queries.twins import EquationTwins
 
 FORMAT = "scm_world/dataset/1"
 
@@ -55,30 +63,77 @@ class DataSource(Protocol):
         """Let some episodes happen."""
 
 
-def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Name the engine of a world among its options, where it was given as an object."""
-    backend = options["backend"]
-    name = backend if isinstance(backend, str) else type(backend).__qualname__
-    return {**options, "backend": name}
+# --- models ---------------------------------------------------------------------------------------
 
 
-def policy_name(policy: Any) -> str:
-    """Name who acts, the same way in every process.
+@final
+class ModelSource:
+    """Episodes of a causal model without a backend, every variable of which is written down.
 
-    Example:
-        >>> policy_name("random"), policy_name(None), policy_name(len)
-        ('random', 'still', 'builtins:len')
+    Row i of a model without lagged edges is that of
+    ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
+
+    Args:
+        model: To run.
+        design: What is done.
+        seed: Of the noise.
+        steps: Control steps of an episode, each of them a row; None where nothing is lagged.
+
+    Raises:
+        ModelError: The model has lagged edges and ``steps`` is None.
+        InterventionError: A target cannot be set to its values.
     """
-    if policy is None:
-        return "still"
-    if isinstance(policy, str):
-        return policy
-    if hasattr(policy, "__qualname__"):
-        return f"{policy.__module__}:{policy.__qualname__}"
-    if callable(policy):
-        kind = type(policy)
-        text = repr(policy) if hasattr(kind, "__dataclass_fields__") else ""
-        return f"{kind.__module__}:{text or kind.__qualname__}"
-    actions = Given(policy).actions
-    digest = hashlib.sha256(np.ascontiguousarray(actions).tobytes()).hexdigest()
-    return f"actions of shape {actions.shape}, sha256 {digest}"
+
+    at_once = True
+    uneven = False
+
+    def __init__(self, model: SCM, design: Design, *, seed: int, steps: int | None) -> None:
+        self._model, self._design, self._seed = model, design, seed
+        self._twins = EquationTwins(model)
+        self._length = Equations(self._twins.layout).length(steps)
+        for name, act in design.acts.items():
+            model.do({name: act})
+        self.columns: tuple[Column, ...] = tuple(c for v in model.variables for c in columns_of(v))
+        self.edges: tuple[Edge, ...] | None = model.edges
+        try:
+            digest = hashlib.sha256(to_json(model).encode()).hexdigest()
+        except ModelError:  # a function has no name
+            digest = None
+        self.about: dict[str, Any] = {
+            "format": FORMAT,
+            "system": "model",
+            "model": digest,
+            "seed": seed,
+            "steps": 1 if steps is None else steps,
+            "design": design.as_dict(),
+            "versions": versions(),
+        }
+
+    def part(self, numbers: range, tell: Tell) -> SourceRows:
+        """Run some episodes."""
+        chosen = self._design.chosen(self._seed, numbers.start, len(numbers))
+        kinds, where = np.unique(chosen, axis=0, return_inverse=True)
+        kind_of = np.asarray(where, dtype=np.int64).reshape(len(chosen))
+        regimes = [self._design.regime_of(kind) for kind in kinds]
+        plans = [regime.plan for regime in regimes]
+        units = [
+            Unit(self._seed, number, ((0, plans[kind]),), None, self._length)
+            for number, kind in zip(numbers, kind_of.tolist(), strict=True)
+        ]
+        vectors = paths(self._twins, units)[:, min(self._length, 1) :]
+        n, length, size = vectors.shape
+        tell(n)
+        return SourceRows(
+            Dataset(
+                values=vectors.reshape(n * length, size),
+                columns=self.columns,
+                regimes=tuple(
+                    replace(regime, targets=reached(self._model, regime.targets))
+                    for regime in regimes
+                ),
+                regime=np.repeat(kind_of, length),
+                episode=np.repeat(np.arange(numbers.start, numbers.stop), length),
+                step=np.tile(np.arange(length), n),
+                about=self.about,
+            )
+        )

@@ -1,30 +1,270 @@
-"""Sweeps: every point of a grid of interventions, in the same episodes."""
+"""Sweeps: every point of a grid of interventions, in the same episodes, and what came out."""
 
 from __future__ import annotations
 
+import csv
+import io
+import itertools
+import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._types import Floats
 from scm_world.discovery.data.collect import collect
-from scm_world.discovery.data.dataset import Column, Dataset
+from scm_world.discovery.data.dataset import Column, Dataset, Ints
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.folders import SHARD, FewerEpisodes
-from scm_world.discovery.data.levels import Point, points_of
 from scm_world.discovery.data.sources import SourceRows, Tell
-from scm_world.discovery.data.swept import Swept
 from scm_world.discovery.data.worlds import WorldSource
 from scm_world.errors import UnknownOption
+from scm_world.graph import SCM
 from scm_world.graph.structure import Edge
+from scm_world.output.durable import made, write_whole
 from scm_world.output.locations import Location, located
+from scm_world.queries.estimates import CONFIDENCE, difference
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
+from scm_world.variables import Box, Categories, Either, Integers, Variable
+from scm_world.variables.kinds import SPACES
 from scm_world.work.executors import Executor
 from scm_world.world import World
+
+FORMAT = "scm_world/sweep/1"
+TABLE, SUMMARY = "sweep.csv", "sweep.json"
+ENDS = ("", ".low", ".high")
+LEVELS = 5
+MOST = 100_000  # points: each has its own plan, and a row of the table
+
+Point = Mapping[str, Any]
+"""What is done: values as plain numbers or lists, by variable."""
+
+
+@final
+@dataclass(frozen=True)
+class Levels:
+    """Values of a variable that lie evenly in a space, from one end to the other.
+
+    Attributes:
+        space: ``"A"``, ``"B"`` or ``"A|B"`` of the variable, or a ``Box``, ``Integers`` or
+            ``Categories``. Of a vector, the values lead from the lower corner to the upper one; of
+            categories all are taken.
+        count: How many, where there are so many.
+    """
+
+    space: Any = "A"
+    count: int = LEVELS
+
+    def of(self, variable: Variable) -> tuple[Any, ...]:
+        """List the values.
+
+        Raises:
+            UnknownOption: There is no such space, or it has no ends.
+        """
+        count = whole_number(f"levels of {variable.name}", self.count, least=1)
+        check_points(count)
+        space = self.space
+        if isinstance(space, str):
+            if space not in SPACES:
+                raise UnknownOption(f"levels of {variable.name}", space, (*SPACES, "values"))
+            space = variable.space(space)
+        if space is None:
+            allowed = ("values, as it has no such space",)
+            raise UnknownOption(f"levels of {variable.name}", self.space, allowed)
+        return tuple(_plain(value) for value in _evenly(variable, space, count))
+
+
+def _evenly(variable: Variable, space: Any, count: int) -> Sequence[Any]:
+    match space:
+        case Categories():
+            return space.members
+        case Integers():
+            return sorted({round(x) for x in np.linspace(space.low, space.high, count)})
+        case Either():
+            first, other = -(-count // 2), count // 2
+            rest = _evenly(variable, space.second, other) if other else ()
+            return (*_evenly(variable, space.first, first), *rest)
+        case Box() if not space.parents():
+            low, high = space.bounds(variable.shape, {})
+            return [np.asarray(value) for value in np.linspace(low, high, count)]
+    allowed = ("a space with ends of its own", "values")
+    raise UnknownOption(f"levels of {variable.name}", space, allowed)
+
+
+def _plain(value: Any) -> Any:
+    return np.asarray(value).tolist()
+
+
+def points_of(over: Mapping[str, Any], model: SCM) -> tuple[Point, ...]:
+    """List every combination of the values of some variables, the last one varying fastest.
+
+    Args:
+        over: By variable: a list of values, ``Levels``, or a space, which is five levels of it.
+        model: Knows the variables.
+
+    Raises:
+        UnknownVariable: No variable has this name.
+        UnknownOption: A variable has no values, what is given is none, or there are too many
+            combinations.
+
+    Example:
+        >>> from scm_world.variables import Exogenous
+        >>> model = SCM([Exogenous(name="x", a=Box(0.0, 1.0)), Exogenous(name="y")])
+        >>> points_of({"x": Levels("A", 2), "y": [5.0]}, model)
+        ({'x': 0.0, 'y': 5.0}, {'x': 1.0, 'y': 5.0})
+    """
+    if not over:
+        raise UnknownOption("over", "nothing", ("one variable or more, with values",))
+    columns = [_values_of(name, given, model) for name, given in over.items()]
+    check_points(math.prod(map(len, columns)))
+    return tuple(dict(zip(over, chosen, strict=True)) for chosen in itertools.product(*columns))
+
+
+def check_points(count: int) -> None:
+    """Refuse a grid with more points than a table can have.
+
+    Raises:
+        UnknownOption: It has.
+    """
+    if count > MOST:
+        allowed = (f"at most {MOST}: give fewer values, or several sweeps",)
+        raise UnknownOption("points of the grid", count, allowed)
+
+
+def _values_of(name: str, given: Any, model: SCM) -> tuple[Any, ...]:
+    variable = model.declared(name)
+    if isinstance(given, str | Box | Integers | Categories | Either):
+        given = Levels(given)
+    if isinstance(given, Levels):
+        return given.of(variable)
+    try:
+        found = tuple(np.asarray(value, dtype=float).tolist() for value in given)
+    except (TypeError, ValueError):
+        found = ()
+    if not found or any(found.count(value) > 1 for value in found):
+        allowed = ("numbers, each of them once", "Levels(space, count)", "a space")
+        raise UnknownOption(f"values of {name}", given, allowed)
+    return found
+
+
+# --- what came out --------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class Swept:
+    """Episodes at the points of a grid.
+
+    Attributes:
+        points: What was done at each.
+        data: All episodes; number k is unit ``k // p`` at point ``k % p`` of p points.
+    """
+
+    points: tuple[Point, ...]
+    data: Dataset
+
+    @cached_property
+    def measured(self) -> tuple[Column, ...]:
+        """What was measured: all columns but those that were set."""
+        return tuple(c for c in self.data.columns if c.variable not in self.points[0])
+
+    def values(self, point: int, name: str) -> Floats:
+        """Give what was measured at a point, one number for each unit that was not refused."""
+        return np.asarray(self.data[name][self._rows(point)])
+
+    def units(self, point: int) -> Ints:
+        """Give the numbers of these units."""
+        return np.asarray(self.data.episode[self._rows(point)] // len(self.points))
+
+    def _rows(self, point: int) -> Ints:
+        return np.flatnonzero(self.data.episode % len(self.points) == point)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Write the table down: a row for each point, in which None is what nobody knows.
+
+        Its columns are the values that were set (``name``, or ``name[i]`` of a vector), ``n``, the
+        number of ``refused`` episodes, and for each number that was measured its mean with the
+        ends of a 95 % interval (``name``, ``name.low``, ``name.high``), and its mean difference
+        to the first point in the units that both have (``name.change`` with its ends).
+        """
+        refused = self.data.about.get("refused", {})
+        lost = np.array([int(number) % len(self.points) for number in refused], dtype=np.int64)
+        return [
+            {
+                **_flat(point),
+                "n": len(self._rows(place)),
+                "refused": int((lost == place).sum()),
+                **self._means(place),
+            }
+            for place, point in enumerate(self.points)
+        ]
+
+    def _means(self, place: int) -> dict[str, float | None]:
+        found: dict[str, float | None] = {}
+        mine, first = self.units(place), self.units(0)
+        _, here, there = np.intersect1d(mine, first, assume_unique=True, return_indices=True)
+        for column in self.measured:
+            values, base = (self.values(at, column.name) for at in (place, 0))
+            found |= _mean(column.name, values, np.zeros_like(values))
+            found |= _mean(f"{column.name}.change", values[here], base[there])
+        return found
+
+    def save(self, folder: Location) -> tuple[Location, Location]:
+        """Write the table as CSV, and with where it comes from as JSON.
+
+        Raises:
+            UnwritableFolder: There is no room, or no permission.
+        """
+        made(folder)
+        rows = self.rows()
+        stream = io.StringIO(newline="")
+        writer = csv.DictWriter(stream, [*rows[0]], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        write_whole(stream.getvalue(), folder / TABLE)
+        data = {
+            "format": FORMAT,
+            "confidence": CONFIDENCE,
+            "units": {c.name: c.unit for c in self.measured},
+            "points": [dict(point) for point in self.points],
+            "rows": rows,
+            "about": self.data.about,
+        }
+        write_whole(json.dumps(data, indent=1, allow_nan=False) + "\n", folder / SUMMARY)
+        return folder / TABLE, folder / SUMMARY
+
+
+def _flat(point: Point) -> dict[str, float]:
+    """Write values down, the components of vectors apart.
+
+    Example:
+        >>> _flat({"x": 1.0, "g": [0.0, -9.81]})
+        {'x': 1.0, 'g[0]': 0.0, 'g[1]': -9.81}
+    """
+    return {
+        f"{name}[{i}]" if isinstance(value, Sequence) else name: part
+        for name, value in point.items()
+        for i, part in enumerate(np.ravel(value).tolist())
+    }
+
+
+def _mean(name: str, values: Floats, base: Floats) -> dict[str, float | None]:
+    """Estimate the mean difference of paired numbers; one number alone has no interval."""
+    found: list[float | None] = [None, None, None]
+    if len(values) > 1:
+        found = [float(end) for end in difference(values, base, paired=True)[:3]]
+    elif len(values):
+        found[0] = float(values[0] - base[0])
+    return {name + end: value for end, value in zip(ENDS, found, strict=True)}
+
+
+# --- the sweep ------------------------------------------------------------------------------------
 
 
 def sweep(

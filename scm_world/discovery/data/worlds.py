@@ -1,44 +1,63 @@
-"""Rows from a world: an engine moves it, and sensors measure it."""
+"""Rows from a world: an engine moves it, and sensors measure it. Also through a laboratory."""
 
 from __future__ import annotations
 
+import hashlib
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Column, Dataset, Regime
+from scm_world.discovery.data.dataset import Column, Dataset, Regime, columns_of
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.recorded import (
-    Ends,
-    Instants,
+    columns_of_outcome,
     default_causes,
     default_outcomes,
-    names_of,
+    first_label,
+    is_state,
+    labelled,
+    reached,
     settable,
 )
-from scm_world.discovery.data.sensors import Sensors
-from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell, plain_options, policy_name
-from scm_world.errors import InterventionError, UnknownOption
+from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell
+from scm_world.env.bounds import WIDE, bounds, spread
+from scm_world.env.observer import published
+from scm_world.errors import BudgetExhausted, InterventionError, UnknownOption
 from scm_world.graph.structure import Edge
-from scm_world.queries.episodes import episode_of
+from scm_world.policies.scripted import Sequence as Given
+from scm_world.queries.episodes import Episode, episode_of
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.parallel import Result, run_units
 from scm_world.queries.plans import Plan
 from scm_world.queries.rollouts import Unit
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import twins_of
+from scm_world.variables import Noise, Normal
+from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import World
 from scm_world.world.plan import merged
+
+STREAM = "sensor of"
+"""Begins the names of the streams; draws of ``sensor_noise`` itself have another one."""
+
+NORMAL = Normal()
 
 
 @final
 class WorldSource:
     """Episodes of a world, under a design.
+
+    A row is an episode: causes as they are at its beginning, and outcomes. With ``every_step`` it
+    is a control step: everything as it is when the action is chosen, and the action. Sensors have
+    noise with the standard deviation ``sensor_noise``, as a fraction of half the range of a number,
+    as in the observations of the environment. It reaches real states and readouts that have
+    bounds: no parameters, no actions, no counts.
 
     Args:
         world: Is not touched; what is given to it holds in every episode.
@@ -71,44 +90,52 @@ class WorldSource:
     ) -> None:
         self._world, self._twins, self._design = world, twins_of(world), design
         self._setting, self._given = setting, getattr(world, "plan", Plan())
+        self._every_step, model = every_step, world.model
         for name, act in (*design.acts.items(), *Plan(setting.nature).acts()):
-            world.model.accept(name, act)
+            model.accept(name, act)
         chosen = default_causes(world) if causes is None else settable(world, causes)
         varied = tuple(dict.fromkeys((*chosen, *design.targets)))
         wanted = default_outcomes(world, every_step=every_step) if outcomes is None else outcomes
-        measured = _outcomes(wanted)
-        self._rows: Ends | Instants = (
-            Instants(world, (*varied, *names_of(measured)))
-            if every_step
-            else Ends(world, varied, measured)
-        )
-        self.columns: tuple[Column, ...] = self._rows.columns
-        _refuse_twice(self.columns)
-        self._sensors = Sensors(world, self._rows.watched)
-        self.edges: tuple[Edge, ...] | None = world.model.edges
-        self.about: dict[str, Any] = self._about()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Go elsewhere, where workers share the cores: an engine has one thread there."""
-        setting = replace(self._setting, workers=self._setting.workers or 1)
-        return {**self.__dict__, "_setting": setting}
-
-    def _about(self) -> dict[str, Any]:
-        setting = self._setting
-        return {
+        measured = _outcomes(wanted, every_step=every_step)
+        actions = tuple(world.compiled.actions) if every_step else ()
+        self._watched = tuple(dict.fromkeys((*varied, *(o.name for o in measured), *actions)))
+        self._read = (*(Outcome(name, "first") for name in varied), *measured)
+        if every_step:
+            parts = [columns_of(model.declared(name)) for name in self._watched]
+        else:
+            parts = [
+                *(labelled(columns_of(model.declared(n), "first"), first_label(model, n))
+                  for n in varied),
+                *(columns_of_outcome(model.declared(o.name), o) for o in measured),
+            ]  # fmt: skip
+        self.columns: tuple[Column, ...] = tuple(column for part in parts for column in part)
+        there = [column.name for column in self.columns]
+        twice = sorted({name for name in there if there.count(name) > 1})
+        if twice:  # before episodes happen for them
+            allowed = ("what is no cause: those have a column already",)
+            raise UnknownOption("outcomes", ", ".join(twice), allowed)
+        sensed = self._watched if SENSOR_NOISE in model else ()
+        self._half = {name: half_range(world, name) for name in sensed}
+        self.edges: tuple[Edge, ...] | None = model.edges
+        self.about: dict[str, Any] = {
             "format": FORMAT,
-            "system": self._world.task.name,
-            "arguments": {n: str(v) for n, v in sorted(self._world.task.given.items())},
+            "system": world.task.name,
+            "arguments": {n: str(v) for n, v in sorted(world.task.given.items())},
             "options": plain_options(self._twins.options),
             "given": self._given.as_dict()["do"],
             "seed": setting.seed,
             "steps": setting.steps,
             "policy": policy_name(setting.policy),
             "nature": Plan(setting.nature).as_dict()["do"],
-            "design": self._design.as_dict(),
-            "engine": self._world.backend.name,
-            "versions": versions(self._world.engine),
+            "design": design.as_dict(),
+            "engine": world.backend.name,
+            "versions": versions(world.engine),
         }
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Go elsewhere, where workers share the cores: an engine has one thread there."""
+        setting = replace(self._setting, workers=self._setting.workers or 1)
+        return {**self.__dict__, "_setting": setting}
 
     def part(self, numbers: range, tell: Tell) -> SourceRows:
         """Let some episodes happen; those that are refused are left out."""
@@ -117,52 +144,37 @@ class WorldSource:
         lock = threading.Lock()
 
         def finish(place: int, result: Result) -> Floats | str:
-            found: Floats | str
-            if isinstance(result, InterventionError):
-                found = str(result)
-            elif isinstance(result, Exception):
+            if isinstance(result, Exception) and not isinstance(result, InterventionError):
                 raise result
-            else:
-                episode = episode_of(self._twins, units[place], result)
-                found = self._rows.rows(episode, self._sensors)
+            found: Floats | str = str(result)
+            if not isinstance(result, Exception):
+                found = self._row(episode_of(self._twins, units[place], result))
             with lock:
                 tell(1)
             return found
 
-        units = [self._unit(n, regime) for n, regime in zip(numbers, regimes, strict=True)]
-        found = run_units(self._twins, units, finish, self._setting.workers)
-        return self._part(list(zip(numbers, regimes, found, strict=True)))
-
-    def _unit(self, number: int, regime: Regime) -> Unit:
-        given = Plan(merged(self._world.model, self._given, regime.plan))
-        plan = self._setting.plan(self._world, given)
-        return self._setting.unit(self._world, plan, number, self._written)
-
-    def _part(self, found: Sequence[tuple[int, Regime, Floats | str]]) -> SourceRows:
-        """Tell rows from refusals."""
-        rows = [(number, done, rows) for number, done, rows in found if not isinstance(rows, str)]
-        refused = tuple((number, why) for number, _, why in found if isinstance(why, str))
-        return SourceRows(self._table(rows), refused)
-
-    @property
-    def _written(self) -> tuple[str, ...]:
-        """Name what has to be written down on the way: the rest is kept anyway."""
         kept = {*self._world.compiled.slices, *self._world.static_names}
-        return tuple(name for name in self._rows.watched if name not in kept)
-
-    def _table(self, found: Sequence[tuple[int, Regime, Floats]]) -> Dataset:
+        written = tuple(name for name in self._watched if name not in kept)
+        units: list[Unit] = []
+        for number, done in zip(numbers, regimes, strict=True):
+            given = Plan(merged(self._world.model, self._given, done.plan))
+            plan = self._setting.plan(self._world, given)
+            units.append(self._setting.unit(self._world, plan, number, written))
+        found = run_units(self._twins, units, finish, self._setting.workers)
         numbered: dict[Regime, int] = {}
-        regime, episode, step = [], [], []
-        for number, done, rows in found:
+        values, regime, episode, step, refused = [np.empty((0, len(self.columns)))], [], [], [], []
+        for number, done, rows in zip(numbers, regimes, found, strict=True):
+            if isinstance(rows, str):
+                refused.append((number, rows))
+                continue
+            values.append(rows)
             for index in range(len(rows)):
-                targets = self._rows.targets(done.targets, index)
-                at = numbered.setdefault(replace(done, targets=targets), len(numbered))
-                regime.append(at)
+                named = replace(done, targets=self._targets(done.targets, index))
+                regime.append(numbered.setdefault(named, len(numbered)))
                 episode.append(number)
                 step.append(index)
-        parts = [rows for _, _, rows in found]
-        return Dataset(
-            values=np.concatenate([np.empty((0, len(self.columns))), *parts]),
+        table = Dataset(
+            values=np.concatenate(values),
             columns=self.columns,
             regimes=tuple(numbered),
             regime=np.array(regime, dtype=np.int64),
@@ -170,22 +182,184 @@ class WorldSource:
             step=np.array(step, dtype=np.int64),
             about=self.about,
         )
+        return SourceRows(table, tuple(refused))
+
+    def _targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
+        """Name the columns' variables that are set in a row; a state is at the first step only."""
+        model = self._world.model
+        there = reached(model, names)
+        if self._every_step:
+            return tuple(n for n in there if step == 0 or not is_state(model, n))
+        return tuple(f"{first_label(model, n)} {n}".strip() for n in there)
+
+    def _row(self, episode: Episode) -> Floats:
+        """Read an episode, shape (rows, p)."""
+        last = episode.steps
+        if self._every_step:
+            parts = [
+                # At an instant the world still has the action of the step before.
+                np.asarray(episode[name], float)[1:]
+                if name in self._world.compiled.commanded
+                else self._sensed(episode, name, range(last + 1))[:-1]
+                for name in self._watched
+            ]
+            return np.concatenate([part.reshape(last, -1) for part in parts], axis=1)
+        ends = {"final": (last,), "first": (0,), "change": (0, last)}
+        values = []
+        for outcome in self._read:
+            steps = ends.get(outcome.how, range(1, last + 1))
+            seen: Any = {outcome.name: self._sensed(episode, outcome.name, steps)}
+            values.append(outcome.of(seen))
+            if not np.isfinite(values[-1]).all():
+                raise UnknownOption(f"value of {outcome}", values[-1], ("finite numbers",))
+        return np.concatenate([np.ravel(value) for value in values])[None]
+
+    def _sensed(self, episode: Episode, name: str, steps: Iterable[int]) -> Floats:
+        """Read a variable at every instant, with noise at some; the same whatever else is read."""
+        values, half = np.array(episode[name], dtype=np.float64), self._half.get(name)
+        if half is None or not half.any() or not np.any(episode[SENSOR_NOISE]):
+            return values
+        noise, strength = Noise(episode.seed), episode[SENSOR_NOISE]
+        stream, shape = f"{STREAM} {name}", values.shape[1:]
+        for step in steps:
+            drawn = noise.draw(NORMAL, stream, shape, {}, episode=episode.number, step=step)
+            values[step] += float(strength[step]) * half.reshape(shape) * drawn[0]
+        return values
 
 
-def _refuse_twice(columns: Sequence[Column]) -> None:
-    """Refuse two columns with one name, before episodes happen for them."""
-    names = [column.name for column in columns]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        allowed = ("what is no cause: those have a column already",)
-        raise UnknownOption("outcomes", ", ".join(twice), allowed)
+def half_range(world: World, name: str) -> Floats:
+    """Give half the range of each number of a variable that a sensor measures, shape (k,).
+
+    It is that of the environment's observations. 0 where there is none, or no sensor.
+    """
+    variable = world.model.declared(name)
+    if variable.role not in ("state", "readout") or variable.dtype != "real":
+        return np.zeros(int(np.prod(variable.shape)))
+    low, high = bounds(world.model, name)
+    observed = published(world, world.compiled).get(name)
+    if observed is not None and observed.low is not None:
+        low, high = spread(observed.low, variable.shape), spread(observed.high, variable.shape)
+    return np.where((low > -WIDE) & (high < WIDE), (high - low) / 2.0, 0.0)
 
 
-def _outcomes(given: Iterable[Any]) -> tuple[Outcome, ...]:
+def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
     several = (given,) if isinstance(given, str | Outcome) else given
     found = tuple(dict.fromkeys(as_outcome(outcome) for outcome in several))
     for outcome in found:
         if not isinstance(outcome, Outcome):
             allowed = ("the name of a variable", "Outcome(name, how)")
             raise UnknownOption("outcome of a dataset", outcome, allowed)
+        if every_step and outcome != Outcome(outcome.name):
+            names = ("names of variables with every_step=True",)
+            raise UnknownOption("outcome", str(outcome), names)
     return found
+
+
+def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Name the engine of a world among its options, where it was given as an object."""
+    backend = options["backend"]
+    name = backend if isinstance(backend, str) else type(backend).__qualname__
+    return {**options, "backend": name}
+
+
+def policy_name(policy: Any) -> str:
+    """Name who acts, the same way in every process.
+
+    Example:
+        >>> policy_name("random"), policy_name(None), policy_name(len)
+        ('random', 'still', 'builtins:len')
+    """
+    if policy is None:
+        return "still"
+    if isinstance(policy, str):
+        return policy
+    if hasattr(policy, "__qualname__"):
+        return f"{policy.__module__}:{policy.__qualname__}"
+    if callable(policy):
+        kind = type(policy)
+        text = repr(policy) if hasattr(kind, "__dataclass_fields__") else ""
+        return f"{kind.__module__}:{text or kind.__qualname__}"
+    actions = Given(policy).actions
+    digest = hashlib.sha256(np.ascontiguousarray(actions).tobytes()).hexdigest()
+    return f"actions of shape {actions.shape}, sha256 {digest}"
+
+
+# --- through a laboratory -------------------------------------------------------------------------
+
+
+@final
+class Experiments:
+    """Experiments of one episode each, through ``see`` and ``do`` of a laboratory.
+
+    Its permissions and its budget hold, and its errors are raised. A row has its outcomes as it
+    reports them; its number of the unit is the number of the episode.
+
+    Args:
+        laboratory: Says who acts, what varies, and what is measured.
+        design: What is done.
+        n: How many experiments there will be.
+        seed: Of what the design draws by lot.
+
+    Raises:
+        BudgetExhausted: Fewer episodes are left.
+    """
+
+    at_once = False
+    uneven = False
+    edges: tuple[Edge, ...] | None = None
+
+    def __init__(self, laboratory: Laboratory, design: Design, n: int, *, seed: int) -> None:
+        left = laboratory.remaining
+        if left is not None and n > left:
+            raise BudgetExhausted(n, left)
+        self._laboratory, self._design, self._seed = laboratory, design, seed
+        # For units and shapes only; it is private, since it would show the graph.
+        self._model = laboratory._world.model
+        declared = self._model.declared
+        self.columns: tuple[Column, ...] = tuple(
+            c for o in laboratory.outcomes for c in columns_of_outcome(declared(o.name), o)
+        )
+        terms = laboratory.terms()
+        self.about: dict[str, Any] = {
+            "format": FORMAT,
+            "system": "laboratory",
+            "terms": {**terms, "options": plain_options(terms["options"])},
+            "seed": seed,
+            "design": design.as_dict(),
+        }
+
+    def part(self, numbers: range, tell: Tell) -> SourceRows:
+        """Carry out some experiments; those that are refused cost their episode."""
+        rows: list[Floats] = []
+        regimes: list[Regime] = []
+        units: list[int] = []
+        refused: list[tuple[int, str]] = []
+        for number in numbers:
+            regime = self._design.regime(number, seed=self._seed)
+            try:
+                found = (
+                    self._laboratory.do(regime.plan) if regime.targets else self._laboratory.see(1)
+                )
+            except InterventionError as problem:
+                refused.append((number, str(problem)))
+            else:
+                rows.append(found.matrix()[0])
+                regimes.append(self._named(regime))
+                units += found.numbers
+            tell(1)
+        kinds = tuple(dict.fromkeys(regimes))
+        table = Dataset(
+            values=np.concatenate([np.empty((0, len(self.columns))), *rows]),
+            columns=self.columns,
+            regimes=kinds,
+            regime=np.array([kinds.index(regime) for regime in regimes], dtype=np.int64),
+            episode=np.array(units, dtype=np.int64),
+            step=np.zeros(len(rows), dtype=np.int64),
+            about=self.about,
+        )
+        return SourceRows(table, tuple(refused))
+
+    def _named(self, regime: Regime) -> Regime:
+        model = self._model
+        names = (f"{first_label(model, n)} {n}".strip() for n in reached(model, regime.targets))
+        return replace(regime, targets=tuple(names))
