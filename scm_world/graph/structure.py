@@ -6,15 +6,16 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from graphlib import CycleError, TopologicalSorter
 from operator import attrgetter
-from typing import Any, final
+from typing import final
 
 import networkx as nx
 
 from scm_world.errors import CyclicModel, ModelError, nearest
 from scm_world.variables import Derived, Parent, Variable
+from scm_world.variables.kinds import Coupled
 
+_SPACES = ("bounds", "space A", "space B")
 _NAME, _KEY = attrgetter("name"), attrgetter("name", "lag")  # of parents
 
 
@@ -99,9 +100,9 @@ class EdgeIndex:
     def instant_children(self) -> dict[str, tuple[str, ...]]:
         """The variables that follow each variable within the same instant."""
         children: dict[str, list[str]] = {name: [] for name in self._names}
-        for edge in self._instant:
-            if edge.when != "set":
-                children[edge.cause].append(edge.effect)
+        for cause, effect, when in self._instant:
+            if when != "set":
+                children[cause].append(effect)
         return {name: tuple(found) for name, found in children.items()}
 
     def instant_descendants(self, names: Iterable[str]) -> list[str]:
@@ -116,15 +117,20 @@ class EdgeIndex:
         return [name for name in self.order if name in found] if found else []
 
 
-def _instant(parents: Mapping[str, Sequence[Parent]]) -> tuple[Edge, ...]:
-    """List the edges of lag 0. The many states of a model share their parents."""
+def _own(causes: tuple[Parent, ...]) -> tuple[Parent, ...]:
+    """Give the edges into a variable that may have lag 0: not those that many states share."""
+    return causes.own if isinstance(causes, Coupled) else causes
+
+
+def _instant(parents: Mapping[str, tuple[Parent, ...]]) -> list[tuple[str, str, str | None]]:
+    """List cause, effect and condition of the edges of lag 0; many states share their parents."""
     distinct = {id(causes): causes for causes in parents.values()}
-    of_lag_0 = {key: [p for p in causes if p.lag == 0] for key, causes in distinct.items()}
-    return tuple(
-        Edge(parent.name, name, 0, parent.when)
+    of_lag_0 = {key: [p for p in _own(causes) if not p.lag] for key, causes in distinct.items()}
+    return [
+        (parent.name, name, parent.when)
         for name, causes in parents.items()
         for parent in of_lag_0[id(causes)]
-    )
+    ]
 
 
 def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
@@ -138,15 +144,28 @@ def _reachable(name: str, step: Mapping[str, Sequence[str]]) -> frozenset[str]:
     return frozenset(found)
 
 
-def _topological(names: Iterable[str], edges: Sequence[Edge]) -> tuple[str, ...]:
-    sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(names, ()))
-    for edge in edges:
-        sorter.add(edge.effect, edge.cause)
-    try:
-        return tuple(sorter.static_order())
-    except CycleError:
-        graph = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
-        raise CyclicModel(_cycles(graph)) from None
+def _topological(
+    names: Iterable[str], edges: Sequence[tuple[str, str, str | None]]
+) -> tuple[str, ...]:
+    """Order variables so that causes come before effects, and else as they are declared.
+
+    Source:
+        Kahn, *Topological sorting of large networks*, 1962.
+    """
+    effects: dict[str, list[str]] = {name: [] for name in names}
+    waiting = dict.fromkeys(effects, 0)
+    for cause, effect, _ in edges:
+        effects[cause].append(effect)
+        waiting[effect] += 1
+    order = [name for name, causes in waiting.items() if not causes]
+    for name in order:  # it grows
+        for effect in effects[name]:
+            waiting[effect] -= 1
+            if not waiting[effect]:
+                order.append(effect)
+    if len(order) < len(waiting):
+        raise CyclicModel(_cycles(nx.DiGraph(edge[:2] for edge in edges)))
+    return tuple(order)
 
 
 def _cycles(graph: nx.DiGraph) -> Iterable[list[str]]:
@@ -157,12 +176,13 @@ def _cycles(graph: nx.DiGraph) -> Iterable[list[str]]:
             yield [cause for cause, _ in nx.find_cycle(part)]
 
 
-def _parent_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    causes = variable.all_parents
+def _parent_problems(
+    variable: Variable, causes: tuple[Parent, ...], known: Mapping[str, Variable]
+) -> Iterable[str]:
     names = set(map(_NAME, causes))
     unique = len(names) == len(causes) or len(set(map(_KEY, causes))) == len(causes)
     if unique and known.keys() >= names:
-        return  # nearly always, and there are many
+        return  # nearly always
     for (name, lag), times in Counter(map(_KEY, causes)).items():
         if name not in known:
             hint = nearest(name, known)
@@ -173,8 +193,7 @@ def _parent_problems(variable: Variable, known: Mapping[str, Variable]) -> Itera
 
 
 def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    spaces = {"bounds": variable.bounds, "space A": variable.a, "space B": variable.b}
-    for label, space in spaces.items():
+    for label, space in zip(_SPACES, (variable.bounds, variable.a, variable.b), strict=True):
         for name in () if space is None else space.parents():
             if name not in known:
                 yield f"{label} of {variable.name!r} depends on the unknown variable {name!r}"
@@ -189,9 +208,8 @@ def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Ite
 
 
 def _bundle_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    mechanism: Any = getattr(variable, "mechanism", None)
     for index, name in enumerate(variable.parts):
-        part, shape = known.get(name), mechanism.shapes[index]
+        part, shape = known.get(name), variable.mechanism.shapes[index]  # type: ignore[attr-defined]
         if part is not None and part.shape != shape:
             yield f"the bundle {variable.name!r} has {name!r} as {shape}, not {part.shape}"
         if part is not None and (part.parts or getattr(part, "inverse", None)):
@@ -216,10 +234,14 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
     parents = {name: variable.all_parents for name, variable in by_name.items()}
     sound: set[int] = set()  # parents that several variables share are checked once
     for variable in by_name.values():
-        if id(parents[variable.name]) not in sound:
-            found = tuple(_parent_problems(variable, by_name))
+        causes = parents[variable.name]
+        shared = causes.shared if isinstance(causes, Coupled) else causes
+        if id(shared) not in sound:
+            found = tuple(_parent_problems(variable, causes, by_name))
             problems.extend(found)
-            sound |= set() if found else {id(parents[variable.name])}
+            sound |= set() if found else {id(shared)}
+        elif shared is not causes:
+            problems.extend(_parent_problems(variable, _own(causes), by_name))
         problems.extend(_variable_problems(variable, by_name))
         problems.extend(_bundle_problems(variable, by_name))
     if problems:  # of parents that there are, cycles are told as well

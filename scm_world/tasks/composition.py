@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, final
 
 from numba import njit
@@ -24,6 +25,7 @@ from scm_world.models import (
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Overlap
 from scm_world.variables import Box, Function, Integers, Measured, Parent, Space, Variable
+from scm_world.variables.kinds import Coupled, parent_of
 from scm_world.variables.reserved import CONTROL_INDEX
 
 Numbers = float | tuple[float, ...]
@@ -75,11 +77,18 @@ class State:
             inputs: All quantities of the world that physics knows, by name, as causes that act
                 where there is contact.
         """
-        always = tuple(Parent(name, 1) for name in self.always)
-        contact = dict(inputs)
-        for name in self.always:
-            contact.pop(name, None)
-        on_set = tuple(Parent(name, 0, "set") for name in self.on_set)
+        always, on_set = self._edges
+        return self._alone.model_copy(update={"parents": Coupled(always, inputs, on_set)})
+
+    @cached_property
+    def _edges(self) -> tuple[tuple[Parent, ...], tuple[Parent, ...]]:
+        """What always acts, and what acts when it is set."""
+        always = tuple(parent_of(name, 1) for name in self.always)
+        return always, tuple(parent_of(name, 0, "set") for name in self.on_set)
+
+    @cached_property
+    def _alone(self) -> Measured:
+        """The declaration without what acts by contact: bodies come and go, the rest stays."""
         return Measured(
             name=self.name,
             unit=self.unit,
@@ -89,7 +98,6 @@ class State:
             b=self.b,
             default=self.default,
             doc=self.doc,
-            parents=(*always, *contact.values(), *on_set),
             start=self.start,
             carry=self.carry,
             restart=self.restart,
@@ -105,6 +113,11 @@ class Entity(ABC):  # every hook has a sensible empty default
     """
 
     name: str
+
+    @cached_property
+    def declared(self) -> tuple[tuple[Variable, ...], tuple[State, ...]]:
+        """Its variables and its states, which are the same in every structure that it is in."""
+        return tuple(self.variables()), tuple(self.states())
 
     def variables(self) -> Iterable[Variable]:
         """Declare everything but the states."""
@@ -240,6 +253,10 @@ class Composition(ABC):
     @abstractmethod
     def slices(self) -> Mapping[str, slice]:
         """Say where each state stands in the state vector."""
+
+    @abstractmethod
+    def empty_state(self) -> Any:
+        """Give a state to read into; it is the same in whatever structure."""
 
     def timestep(self, values: Values) -> float:
         """Give the physics step [s]."""

@@ -16,7 +16,7 @@ from scm_world.backends import Backend, read_model
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry import chains
 from scm_world.graph import SCM
-from scm_world.models import Model, ParameterKey, Readout, Row
+from scm_world.models import Model, ParameterKey, Readout, Row, State
 from scm_world.tasks.base import Task, Timing
 from scm_world.tasks.composition import Clock, Composition
 from scm_world.tasks.observed import Observed
@@ -76,6 +76,10 @@ class ModelComposition(Composition):
     def slices(self) -> Mapping[str, slice]:
         """Say where each state stands in the state vector."""
         return self._model.layout.slices
+
+    def empty_state(self) -> State:
+        """Give a state to read into."""
+        return self._model.empty_state()
 
 
 class DeclaredTask(Task):

@@ -12,7 +12,7 @@ from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
-from scm_world.models import ParameterKey
+from scm_world.models import ParameterKey, State
 from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Clock, Commands, Composition
 from scm_world.tasks.model import DeclaredTask, _numbers, beginning, check_observed
@@ -82,6 +82,10 @@ class StepComposition(Composition):
     def slices(self) -> Mapping[str, slice]:
         """Say where each state stands in the state vector."""
         return self._system.layout.slices
+
+    def empty_state(self) -> State:
+        """Give a state to read into."""
+        return self._system.empty_state()
 
 
 class StepTask(DeclaredTask):

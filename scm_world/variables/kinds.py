@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any, Literal, final, get_args
 
@@ -65,6 +65,43 @@ class Parent(Frozen):
         super().__init__(name=name, lag=lag, when=when)  # type: ignore[call-arg]
 
 
+@final
+class Coupled(tuple[Parent, ...]):
+    """The edges into a state: its own, and those of lag 1 that very many states share.
+
+    What is known of the shared ones need not be looked up for each state.
+
+    Args:
+        before: Its own that come first.
+        shared: By name. Where one of its own has the same cause at the same lag, it counts.
+        after: Its own that come last.
+
+    Attributes:
+        own: Those that are not shared.
+        shared: As it was given.
+    """
+
+    own: tuple[Parent, ...]
+    shared: Mapping[str, Parent]
+
+    def __new__(
+        cls, before: Iterable[Parent], shared: Mapping[str, Parent], after: Iterable[Parent]
+    ) -> Coupled:
+        """Put the edges in a row."""
+        own = (*before, *after)
+        others = {**shared}
+        for parent in own:
+            if parent.lag:
+                others.pop(parent.name, None)
+        made = super().__new__(cls, (*before, *others.values(), *after))
+        made.own, made.shared = own, shared
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle it as a plain tuple."""
+        return tuple, ((*self,),)
+
+
 def _without(space: Space | None, other: Space | None) -> Space | None:
     """Leave out of a set of whole numbers those that another one has too."""
     match space, other:
@@ -84,12 +121,13 @@ def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
         raise ValueError(f"parents must be a sequence of names, got the text {value!r}")
     if isinstance(value, tuple) and set(map(type, value)) <= {Parent}:
         return value  # variables with the same parents share one tuple of them
-    return validate(tuple(_instantly(p) if isinstance(p, str) else p for p in value))
+    return validate(tuple(parent_of(p) if isinstance(p, str) else p for p in value))
 
 
 @lru_cache(maxsize=2**14)
-def _instantly(name: str) -> Parent:
-    return Parent(name)
+def parent_of(name: str, lag: int = 0, when: str | None = None) -> Parent:
+    """Give an edge; many variables have the same ones, which are one object then."""
+    return Parent(name, lag, when)
 
 
 AsParents = Annotated[tuple[Parent, ...], WrapValidator(_as_parents)]
@@ -332,7 +370,8 @@ class Measured(Variable):
 
     def set_parents(self) -> tuple[str, ...]:
         """Name the parents that act when the state is set."""
-        return tuple(p.name for p in self.parents if p.when == "set")
+        parents = self.parents.own if isinstance(self.parents, Coupled) else self.parents
+        return tuple(p.name for p in parents if p.when == "set")
 
 
 @final

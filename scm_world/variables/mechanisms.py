@@ -11,7 +11,7 @@ import importlib
 from collections.abc import Callable, Iterable
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -163,8 +163,18 @@ class Function(Frozen):
             self._function = self._look_up()
         return self._function
 
+    def __copy__(self) -> Self:
+        """Copy it without what was bound: the copy may get other constants."""
+        copied = super().__copy__()
+        copied.__dict__.pop("_bound", None)
+        return copied
+
     def bind(self) -> Callable[..., Any]:
-        """Give a callable with the constants filled in."""
+        """Give a callable with the constants filled in; always the same one."""
+        return self._bound
+
+    @cached_property
+    def _bound(self) -> Callable[..., Any]:
         function = self.resolve()
         if hasattr(function, "py_func") and function.__module__.partition(".")[0] != PACKAGE:
             function = Unboxed(function)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property, lru_cache
 from math import prod
+from operator import gt
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
 
 import numpy as np
@@ -181,18 +182,17 @@ class Box(_Space):
     def __init__(self, low: Any, high: Any, **fields: Any) -> None:
         super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
 
-    @model_validator(mode="after")
-    def _is_not_empty(self) -> Self:
+    def model_post_init(self, context: Any) -> None:
+        """Refuse an empty box; a validator would do so again in every declaration that has it."""
         ends = (bound if isinstance(bound, tuple) else (bound,) for bound in (self.low, self.high))
         low, high = (
-            np.array([np.nan if isinstance(part, Affine | Switch) else part for part in end])
-            for end in ends
+            [np.nan if isinstance(part, Affine | Switch) else part for part in end] for end in ends
         )
-        if low.shape != high.shape and min(low.size, high.size) != 1:
-            raise ValueError(f"a box has corners of one shape; these have {low.size}, {high.size}")
-        if (low > high).any():
+        if len(low) != len(high) and min(len(low), len(high)) != 1:
+            raise ValueError(f"a box has corners of one shape; these have {len(low)}, {len(high)}")
+        n = max(len(low), len(high))
+        if any(map(gt, low if len(low) == n else n * low, high if len(high) == n else n * high)):
             raise ValueError(f"a box is empty where low > high: {self.low} and {self.high}")
-        return self
 
     @cached_property
     def _followed(self) -> frozenset[str]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from math import prod
 from typing import Any, final
 
 import numpy as np
@@ -32,7 +33,7 @@ def slices_of(model: SCM, names: Iterable[str]) -> dict[str, slice]:
     """Return the place of each variable in one vector of all."""
     found, end = dict[str, slice](), 0
     for name in names:
-        start, end = end, end + int(np.prod(model.declared(name).shape, dtype=int))
+        start, end = end, end + prod(model.declared(name).shape)
         found[name] = slice(start, end)
     return found
 
@@ -253,8 +254,7 @@ class CompiledTask(ActionVector):
 
     @cached_property
     def _start(self) -> State:
-        roots = self.model.solve(only=self.static_names)
-        found: State = self.structure(roots).empty_state()
+        found: State = self.composition.empty_state()
         return found
 
     def empty_state(self, vector: Floats | None = None) -> State:

@@ -13,7 +13,7 @@ from typing import Any
 from numba import njit, types
 from numba.core import cgutils
 from numba.core.errors import NumbaError
-from numba.extending import intrinsic, is_jitted
+from numba.extending import intrinsic
 
 from scm_world._types import Floats, Integers
 
@@ -119,16 +119,14 @@ def addresses(function: Any, kinds: tuple[Any, ...], *, is_vector: bool) -> tupl
     """Give the addresses of a compiled function and of what calls it on a row.
 
     Args:
-        function: Compiled by numba or not. The caller keeps it.
+        function: Compiled by numba. The caller keeps it.
         kinds: Of its arguments: ``NUMBER``, ``WHOLE`` or ``VECTOR``.
         is_vector: Whether a vector is wanted; else a number.
 
     Returns:
-        The adapter and the function; None where it is not compiled, cannot be compiled for these
-        arguments, or gives something else.
+        The adapter and the function; None where it cannot be compiled for these arguments, or
+        gives something else.
     """
-    if not is_jitted(function):
-        return None
     try:
         function.compile(kinds)
         made: Any = function.overloads[kinds]

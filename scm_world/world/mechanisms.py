@@ -11,11 +11,12 @@ from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
-from math import isfinite
+from math import isfinite, prod
 from typing import Any, final
 
 import numpy as np
 from numba.core.errors import NumbaError
+from numba.extending import is_jitted
 
 from scm_world._types import Floats, Integers, Value
 from scm_world.errors import ModelError, ScmWorldError, in_one_line
@@ -127,10 +128,12 @@ class Mechanisms:
         columns = [(self.earlier if p.lag else self.where)[p.name] for p in parents]
         if variable.parts:
             return [_copy(columns, [self.where[name]])]
-        shapes = [self._model.declared(p.name).shape for p in parents]
-        numbers = [self._model.declared(p.name).dtype == "real" for p in parents]
         function, constants = _positional(variable.mechanism, len(parents))
         called: Any = function.kernel if isinstance(function, Stacked | Unboxed) else function
+        if not is_jitted(called):
+            return [_Python(self, name, variable, parents, columns)]
+        shapes = [self._model.declared(p.name).shape for p in parents]
+        numbers = [self._model.declared(p.name).dtype == "real" for p in parents]
         scalars = [WHOLE if not real else NUMBER for real in numbers]
         kinds = [VECTOR if shape else kind for shape, kind in zip(shapes, scalars, strict=True)]
         flat = all(len(shape) <= 1 for shape in shapes)
@@ -302,7 +305,7 @@ def places(slices: Iterable[slice]) -> Integers:
 
 
 def _size(shape: tuple[int, ...]) -> int:
-    return int(np.prod(shape))
+    return prod(shape)
 
 
 def _positional(mechanism: Any, count: int) -> tuple[Any, tuple[Any, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, ClassVar, Unpack
 
 import numpy as np
@@ -130,10 +130,7 @@ class TriFingerTask(Task):
         torques = timing.action_mode == "joint_torques"
         mode = ControlMode.JOINT_TORQUES if torques else ControlMode.JOINT_POSITIONS
         entities: tuple[Entity, ...] = (
-            Robot(timing.action_mode, self.start, timing.resolution),
-            Stage(timing.preset),
-            LightAndCameras(),
-            Clock(timing.steps, timing.control_period),
+            *_always_there(timing, self.start),
             *self.entities(),
         )
         there = tuple(entity for entity in entities if entity.name not in self.absent)
@@ -147,10 +144,21 @@ class TriFingerTask(Task):
                 return made, variables
             variables = _computable(variables)
             names = {variable.name for variable in variables}
-            whole = tuple(e for e in there if all(v.name in names for v in e.variables()))
+            whole = tuple(e for e in there if all(v.name in names for v in e.declared[0]))
             if len(whole) == len(there):
                 return made, variables
             there = whole
+
+
+@lru_cache(maxsize=32)
+def _always_there(timing: Timing, start: tuple[float, ...]) -> tuple[Entity, ...]:
+    """List what stands in the world whatever the goal family: none of it follows from the plan."""
+    return (
+        Robot(timing.action_mode, start, timing.resolution),
+        Stage(timing.preset),
+        LightAndCameras(),
+        Clock(timing.steps, timing.control_period),
+    )
 
 
 def _computable(variables: list[Variable]) -> list[Variable]:

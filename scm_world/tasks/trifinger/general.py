@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import cache
 from typing import Any, Unpack, final
 
 import numpy as np
@@ -16,6 +17,8 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, piles
 from scm_world.tasks.trifinger.building import Building
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
+from scm_world.tasks.trifinger.entities.blocks import ToolBlock
+from scm_world.tasks.trifinger.entities.goals import GoalBlock
 from scm_world.tasks.trifinger.generated import MASS, blocks_mass, part_goal, part_tool
 from scm_world.variables import Box, Derived, Exogenous, Function, Variable
 
@@ -61,6 +64,32 @@ def start(size: Floats, orientation: Floats, *, index: float) -> Floats:
     """
     x, y = STARTS[int(index)]
     return np.array([STEP * x, STEP * y, lowest_point(size, orientation)])
+
+
+@cache
+def block(index: int, *, airborne: bool) -> tuple[ToolBlock, GoalBlock]:
+    """Describe a block, and its place in the pile.
+
+    Args:
+        index: Which block.
+        airborne: Whether its spaces reach into the air, as in the predecessor.
+    """
+    which = {"index": float(index)}
+    size = ((SIZE,), Function(cube))
+    return (
+        part_tool(
+            f"tool_{index}",
+            size=size,
+            spawn=((), Function(start, constants=which)),
+            airborne=airborne,
+        ),
+        part_goal(
+            f"goal_{index}",
+            size=size,
+            position=((PILE,), Function(piles.part_of, constants=which)),
+            orientation=((PILE,), Function(piles.turn_of, constants=which)),
+        ),
+    )
 
 
 @final
@@ -149,20 +178,11 @@ class General(Building):
 
     def entities(self) -> Iterable[Entity]:
         """Blocks, the pile, and a goal for each block of it."""
-        size = ((SIZE,), Function(cube))
         airborne = self.conventions.published_spaces
-        for index in self._indices():
-            first = ((), Function(start, constants={"index": float(index)}))
-            yield part_tool(f"tool_{index}", size=size, spawn=first, airborne=airborne)
-        yield Pile(len(self._indices()))
-        for index in self._indices():
-            which = {"index": float(index)}
-            yield part_goal(
-                f"goal_{index}",
-                size=size,
-                position=((PILE,), Function(piles.part_of, constants=which)),
-                orientation=((PILE,), Function(piles.turn_of, constants=which)),
-            )
+        dropped = [block(index, airborne=airborne) for index in self._indices()]
+        yield from (tool for tool, _ in dropped)
+        yield Pile(len(dropped))
+        yield from (goal for _, goal in dropped)
 
     def shared(self) -> Iterable[Variable]:
         """Declare the blocks, and how they are dropped."""

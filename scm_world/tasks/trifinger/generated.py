@@ -10,6 +10,10 @@ from scm_world.variables import Derived, Exogenous, Function
 
 MASS = "blocks_mass"
 
+MOST_PARTS = 512
+"""Of how many parts block and goal are kept for when they come again: they are immutable, and most
+structures of a family have them."""
+
 Mechanism = tuple[tuple[str, ...], Function]
 """Parents, and the function of them."""
 

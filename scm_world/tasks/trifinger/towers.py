@@ -16,7 +16,15 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.building import Building
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
-from scm_world.tasks.trifinger.generated import MASS, blocks_mass, part_goal, part_tool
+from scm_world.tasks.trifinger.entities.blocks import ToolBlock
+from scm_world.tasks.trifinger.entities.goals import GoalBlock
+from scm_world.tasks.trifinger.generated import (
+    MASS,
+    MOST_PARTS,
+    blocks_mass,
+    part_goal,
+    part_tool,
+)
 from scm_world.variables import Exogenous, Function, Variable
 
 DIMS = "tower_dims"
@@ -94,6 +102,29 @@ def start(
     return np.array([i * step[0] - first[0], j * step[1] - first[1], height])
 
 
+@lru_cache(maxsize=MOST_PARTS)
+def piece(
+    name: str, *, level: float, col: float, row: float, airborne: bool
+) -> tuple[ToolBlock, GoalBlock]:
+    """Describe a block of a tower, and its place in it.
+
+    Args:
+        name: Of the two, without what tells them apart.
+        level: Which part it is, along z.
+        col: Along y.
+        row: Along x.
+        airborne: Whether its spaces reach into the air, as in the predecessor.
+    """
+    which = {"level": level, "col": col, "row": row}
+    size = ((DIMS, NUMBER), Function(part))
+    where = ((DIMS, NUMBER, CENTER), Function(place, constants=which))
+    first = ((NUMBER,), Function(start, constants=which))
+    return (
+        part_tool(f"tool_{name}", size=size, spawn=first, airborne=airborne),
+        part_goal(f"goal_{name}", size=size, position=where),
+    )
+
+
 @final
 class Towers(Building):
     """A cuboid on the floor, cut into equal blocks.
@@ -160,14 +191,10 @@ class Towers(Building):
 
     def entities(self) -> Iterable[Entity]:
         """A block and a goal for each part of the tower."""
-        size = ((DIMS, NUMBER), Function(part))
         airborne = self.conventions.published_spaces
-        for name, which in self._parts():
-            first = ((NUMBER,), Function(start, constants=which))
-            yield part_tool(f"tool_{name}", size=size, spawn=first, airborne=airborne)
-        for name, which in self._parts():
-            where = ((DIMS, NUMBER, CENTER), Function(place, constants=which))
-            yield part_goal(f"goal_{name}", size=size, position=where)
+        parts = [piece(name, **which, airborne=airborne) for name, which in self._parts()]
+        yield from (tool for tool, _ in parts)
+        yield from (goal for _, goal in parts)
 
     def shared(self) -> Iterable[Variable]:
         """Declare the tower."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any, ClassVar, Unpack
 
 import numpy as np
@@ -15,7 +16,15 @@ from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, layouts
 from scm_world.tasks.trifinger.building import Building
-from scm_world.tasks.trifinger.generated import MASS, blocks_mass, part_goal, part_tool
+from scm_world.tasks.trifinger.entities.blocks import ToolBlock
+from scm_world.tasks.trifinger.entities.goals import GoalBlock
+from scm_world.tasks.trifinger.generated import (
+    MASS,
+    MOST_PARTS,
+    blocks_mass,
+    part_goal,
+    part_tool,
+)
 from scm_world.variables import Box, Categories, Derived, Exogenous, Function, Integers, Variable
 from scm_world.variables.kinds import SpaceName
 
@@ -28,6 +37,27 @@ LAYOUT = "wall.layout"
 RANDOM = 1  # the category of ``wall_pattern``
 
 LOW = 0.25  # [m] what is lower fits under the raised fingers
+
+
+@lru_cache(maxsize=MOST_PARTS)
+def brick(name: str, *, level: float, num: float, airborne: bool) -> tuple[ToolBlock, GoalBlock]:
+    """Describe a block of a wall, and its place in it.
+
+    Args:
+        name: Of the two, without what tells them apart.
+        level: In which level it is.
+        num: Which of it.
+        airborne: Whether it begins in the air, as in the predecessor.
+    """
+    which = {"level": level, "num": num}
+    size = ((LAYOUT, SIZE), Function(layouts.brick_size, constants=which))
+    where = ((LAYOUT, SIZE), Function(layouts.brick_place, constants=which))
+    first = Function(layouts.start, constants={**which, "airborne": float(airborne)})
+    spawn = ((LAYOUT, SIZE, PATTERN), first)
+    return (
+        part_tool(f"tool_{name}", size=size, spawn=spawn, airborne=airborne),
+        part_goal(f"goal_{name}", size=size, position=where),
+    )
 
 
 class Walls(Building):
@@ -117,16 +147,11 @@ class Walls(Building):
     def entities(self) -> Iterable[Entity]:
         """A block, and perhaps a goal, for each place in the wall."""
         airborne = self.conventions.published_spaces
-        for name, which in self._bricks():
-            size = ((LAYOUT, SIZE), Function(layouts.brick_size, constants=which))
-            first = Function(layouts.start, constants={**which, "airborne": float(airborne)})
-            spawn = ((LAYOUT, SIZE, PATTERN), first)
-            yield part_tool(f"tool_{name}", size=size, spawn=spawn, airborne=airborne)
-        for name, which in self._bricks():
-            if self.wanted(int(which["level"])):
-                size = ((LAYOUT, SIZE), Function(layouts.brick_size, constants=which))
-                where = ((LAYOUT, SIZE), Function(layouts.brick_place, constants=which))
-                yield part_goal(f"goal_{name}", size=size, position=where)
+        bricks = [
+            (brick(name, **which, airborne=airborne), which) for name, which in self._bricks()
+        ]
+        yield from (tool for (tool, _), _ in bricks)
+        yield from (goal for (_, goal), which in bricks if self.wanted(int(which["level"])))
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Build the wall: all of it, so that it stands, with the fingers out of its way."""

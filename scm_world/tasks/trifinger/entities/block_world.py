@@ -23,9 +23,10 @@ from scm_world.tasks.trifinger.hardware import (
 )
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.presets import PRESET_NAMES, preset
-from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
+from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
 from scm_world.tasks.trifinger.structure import Structure
-from scm_world.variables import Parent, Variable
+from scm_world.variables import Variable
+from scm_world.variables.kinds import parent_of
 from scm_world.variables.reserved import PRESET
 
 
@@ -119,11 +120,12 @@ class BlockWorld(Composition):
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
         names = [name for entity in self.entities for name in entity.inputs()]
-        inputs = {name: Parent(name, 1, "contact") for name in (*names, *self.deciding)}
+        inputs = {name: parent_of(name, 1, "contact") for name in (*names, *self.deciding)}
         declared: list[Variable] = list(self.shared)
         for entity in self.entities:
-            declared.extend(entity.variables())
-            declared.extend(state.declare(inputs) for state in entity.states())
+            variables, states = entity.declared
+            declared.extend(variables)
+            declared.extend(state.declare(inputs) for state in states)
         return tuple(declared)
 
     def parameters(self) -> dict[str, ParameterKey]:
@@ -137,6 +139,10 @@ class BlockWorld(Composition):
             block = self.blocks.index(entity.name) if entity.is_block else -1
             found.update(entity.slices(block))
         return found
+
+    def empty_state(self) -> PhysicalState:
+        """Give a state to read into."""
+        return PhysicalState(len(self.blocks))
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals that lie in an obstacle."""

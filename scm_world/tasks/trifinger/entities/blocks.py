@@ -15,7 +15,7 @@ from scm_world.models import ParameterKey
 from scm_world.tasks.composition import Entity, State
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.block_world import block_slice, lowest_point
-from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Parent, Variable
+from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Variable
 from scm_world.variables.reserved import PRESET
 
 CUBOID = 1  # the published type ids
@@ -56,6 +56,10 @@ def keep_lowest_point(position: Floats, *parents: Floats) -> Floats:
     return np.array([position[0], position[1], position[2] + lift])
 
 
+_KEEP, _CYLINDRICAL = Function(keep_lowest_point), Function(to_cylindrical)
+_TO_VECTOR, _FROM_VECTOR = Function(to_rotation_vector), Function(from_rotation_vector)
+
+
 def coordinates(
     entity: str,
     *,
@@ -82,7 +86,7 @@ def coordinates(
         a=a,
         b=b,
         parents=(f"{entity}.cartesian_position",),
-        mechanism=to_cylindrical,
+        mechanism=_CYLINDRICAL,
         inverse=inverse,
         doc="Position as radius, angle and height; setting it sets the Cartesian position.",
     )
@@ -94,8 +98,8 @@ def coordinates(
             a=numbers.YAW if yaw else None,
             b=numbers.YAW if yaw else None,
             parents=(f"{entity}.orientation",),
-            mechanism=to_rotation_vector,
-            inverse=from_rotation_vector,
+            mechanism=_TO_VECTOR,
+            inverse=_FROM_VECTOR,
             doc="Orientation as a rotation vector; setting it sets the quaternion.",
         )
 
@@ -187,7 +191,7 @@ class ToolBlock(Entity):
             always=(position, linear, *always),
             on_set=(self._v("size"), orientation, *self._spawn_from),
             start=self._spawn,
-            carry=Function(keep_lowest_point),
+            carry=_KEEP,
             restart=self._restart,
         )
         yield State(
@@ -230,7 +234,7 @@ class ToolBlock(Entity):
 
     def inputs(self) -> Iterable[str]:
         """Pose, velocities, mass, size and friction matter to physics; the color does not."""
-        yield from (state.name for state in self.states())
+        yield from (state.name for state in self.declared[1])
         yield from (self._v("mass"), self._v("friction"))
         if self._hull is None:
             yield self._v("size")
@@ -253,6 +257,9 @@ class ToolBlock(Entity):
 def same(parent: Floats) -> Floats:
     """Copy the value of the parent."""
     return parent
+
+
+_COPY = Function(same)
 
 
 def block_size(
@@ -281,7 +288,7 @@ def block_size(
     }
     if size_from is None:
         return Exogenous(default=default, **common)
-    return Derived(parents=(Parent(size_from),), mechanism=Function(same), **common)
+    return Derived(parents=(size_from,), mechanism=_COPY, **common)
 
 
 def block_mass(
@@ -304,7 +311,7 @@ def block_mass(
     }
     if mass_from is None:
         return Exogenous(default=default, **common)
-    return Derived(parents=(Parent(mass_from),), mechanism=Function(same), **common)
+    return Derived(parents=(mass_from,), mechanism=_COPY, **common)
 
 
 def hull_size(name: str, size: tuple[float, float, float]) -> Fixed:

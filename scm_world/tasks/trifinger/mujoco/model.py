@@ -47,8 +47,9 @@ def compiled(structure: Structure) -> mujoco.MjModel:
     _add_robot(spec, structure.preset)
     for name in structure.blocks:
         _add_block(spec, name, structure.hull(name))
-    for first, second, sliding in contact_pairs(structure):
-        _add_pair(spec, first, second, settings(structure.preset), sliding=sliding)
+    gripping, sliding = _pair_classes(spec, settings(structure.preset))
+    for first, second, slides in contact_pairs(structure):
+        spec.add_pair(sliding if slides else gripping, geomname1=first, geomname2=second)
     return spec.compile()
 
 
@@ -116,19 +117,20 @@ def contact_pairs(structure: Structure) -> Iterator[tuple[str, str, bool]]:
             )
 
 
-def _add_pair(
-    spec: mujoco.MjSpec, first: str, second: str, chosen: Settings, *, sliding: bool
-) -> None:
-    spec.add_pair(
-        geomname1=first,
-        geomname2=second,
-        condim=4,
-        solref=chosen.contact,
-        solreffriction=chosen.sliding if sliding else chosen.contact,
-        friction=(1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION),
-        margin=0.0,
-        gap=0.0,
-    )
+def _pair_classes(
+    spec: mujoco.MjSpec, chosen: Settings
+) -> tuple[mujoco.MjsDefault, mujoco.MjsDefault]:
+    """Declare what contact pairs have in common: those that grip, and those that slide."""
+    gripping = spec.default
+    sliding = spec.add_default("sliding", gripping)
+    for kind, friction in ((gripping, chosen.contact), (sliding, chosen.sliding)):
+        pair = kind.pair
+        pair.condim = 4
+        pair.solref = chosen.contact
+        pair.solreffriction = friction
+        pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
+        pair.margin = pair.gap = 0.0
+    return gripping, sliding
 
 
 def _add_arena(spec: mujoco.MjSpec) -> None:
