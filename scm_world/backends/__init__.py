@@ -6,8 +6,7 @@ import importlib
 import inspect
 from typing import Any, TypeVar
 
-from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
-from scm_world.backends.wrapper import BackendWrapper
+from scm_world.backends.base import Backend, BackendWrapper, Capabilities, Contact, EngineSnapshot
 from scm_world.errors import MissingEngine, ModelError, UnknownOption
 from scm_world.models import Model
 

@@ -11,17 +11,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
+import numpy as np
+
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure
+from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption, WrongShape
 from scm_world.models.scene import (
     ControlMode,
     Difference,
     ParameterKey,
     Parameters,
     Scene,
+    State,
     Structure,
+    complete,
 )
-from scm_world.models.state import State
 
 
 @final
@@ -239,3 +242,178 @@ class OneByOne(EngineBatch):
             backend.read(State(layout, into[index, : layout.size]))
         if failed is not None:
             raise failed
+
+
+class BackendWrapper(Backend, ABC):
+    """Asks another engine for everything; derive from it and override what should differ.
+
+    A class of one's own needs a ``name``. If it remembers something between two steps, it has to
+    be forgotten in ``build`` and to be a part of ``snapshot`` and ``restore``.
+
+    Args:
+        engine: That does the work, empty and not used elsewhere.
+
+    Attributes:
+        engine: The same.
+    """
+
+    capabilities: ClassVar[Capabilities] = Capabilities()
+
+    def __init__(self, engine: Backend) -> None:
+        self.engine = engine
+
+    @property
+    def version(self) -> str:
+        """Name and version of the engine inside."""
+        return f"{self.engine.name} {self.engine.version}"
+
+    @property
+    def structure(self) -> Structure:
+        """What was compiled."""
+        return self.engine.structure
+
+    def build(self, scene: Scene) -> None:
+        """Realise a scene from nothing."""
+        self.engine.build(scene)
+
+    def apply(self, difference: Difference) -> None:
+        """Change structure, parameters and state without advancing time."""
+        self.engine.apply(difference)
+
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Read parameters back from the engine."""
+        return self.engine.parameters(keys)
+
+    def inertia(self, body: str) -> Floats:
+        """Read the principal moments of inertia of a body, shape (3,) [kg m²]."""
+        return self.engine.inertia(body)
+
+    def read(self, into: State) -> None:
+        """Write the present state into an existing vector."""
+        self.engine.read(into)
+
+    def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
+        """Hold a command for some physics steps."""
+        self.engine.step(mode, command, substeps)
+
+    def contacts(self) -> tuple[Contact, ...]:
+        """List the contact points of the last physics step."""
+        return self.engine.contacts()
+
+    def snapshot(self) -> EngineSnapshot:
+        """Save everything."""
+        return EngineSnapshot(f"{self.name} {self.version}", self.engine.snapshot())
+
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Go back to a snapshot.
+
+        Raises:
+            SnapshotMismatch: It was taken by another engine, or by the one inside alone.
+        """
+        here = f"{self.name} {self.version}"
+        if snapshot.engine != here:
+            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
+        self.engine.restore(snapshot.payload)
+
+    def close(self) -> None:
+        """Free what the engine holds."""
+        self.engine.close()
+
+
+class InMemory(Backend, ABC):
+    """What keeps a scene in memory: parameters in a dict, the state in a vector.
+
+    Only ``step`` and ``inertia`` are left to a class that derives from it.
+    """
+
+    @property
+    def version(self) -> str:
+        """Version of the backend."""
+        return "1"
+
+    @property
+    def structure(self) -> Any:
+        """The structure of the scene."""
+        return self._structure
+
+    def build(self, scene: Scene) -> None:
+        """Remember the scene."""
+        self._structure, self._state = scene.structure, scene.structure.empty_state()
+        self._parameters: dict[ParameterKey, Floats] = {}
+        self._keep(scene.parameters)
+        self._place(scene.state)
+
+    def apply(self, difference: Difference) -> None:
+        """Change structure, parameters and state without advancing time.
+
+        Raises:
+            UnknownOption: There is no such parameter. Nothing has changed.
+            WrongShape: A parameter has another shape. Nothing has changed.
+        """
+        structure = difference.structure
+        if structure is not None:
+            now = Scene(self._structure, self._parameters, self._state)
+            difference = complete(now, structure, difference)
+            self._structure, self._state = structure, structure.empty_state()
+            structure.carried(self._state, now)  # what is reported stays
+            self._parameters = {}
+        else:
+            self._check(difference.parameters)
+            for key, value in difference.parameters.items():
+                if np.shape(value) != self._parameters[key].shape:
+                    name, shape = ".".join(key).strip("."), self._parameters[key].shape
+                    raise WrongShape(name, value, shape, np.shape(value))
+        self._keep(difference.parameters)
+        if difference.state is not None:
+            self._place(difference.state)
+
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Give the parameters that were set.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+        """
+        keys = tuple(keys)
+        self._check(keys)
+        return {key: self._parameters[key].copy() for key in keys}
+
+    def read(self, into: State) -> None:
+        """Write the present state into an existing vector."""
+        into.vector[:] = self._state.vector
+
+    def contacts(self) -> tuple[Contact, ...]:
+        """Nothing ever touches anything."""
+        return ()
+
+    def snapshot(self) -> EngineSnapshot:
+        """Save everything."""
+        scene = Scene(self._structure, dict(self._parameters), self._state.copy())
+        return EngineSnapshot(f"{self.name} {self.version}", scene)
+
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Go back to a snapshot.
+
+        Raises:
+            SnapshotMismatch: It was taken by another engine.
+        """
+        here = f"{self.name} {self.version}"
+        if snapshot.engine != here:
+            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
+        scene: Scene = snapshot.payload
+        self._structure, self._state = scene.structure, scene.state.copy()
+        self._parameters = {}
+        self._keep(scene.parameters)
+
+    def _keep(self, parameters: Parameters) -> None:
+        for key, value in parameters.items():
+            self._parameters[key] = np.array(value, dtype=np.float64)
+
+    def _place(self, state: State) -> None:
+        """Put everything where a state says; what is only reported stays."""
+        np.copyto(self._state.vector, state.vector, where=self._state.layout.can_be_set)
+
+    def _check(self, keys: Iterable[ParameterKey]) -> None:
+        for key in keys:
+            if key not in self._parameters:
+                known = (".".join(known).strip(".") for known in self._parameters)
+                raise UnknownOption("parameter", ".".join(key).strip("."), known)

@@ -7,11 +7,9 @@ from typing import ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Capabilities
-from scm_world.backends.memory import InMemory
+from scm_world.backends.base import Capabilities, InMemory
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode
-from scm_world.models.state import State
+from scm_world.models.scene import ControlMode, State
 
 
 @final

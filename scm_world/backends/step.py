@@ -13,12 +13,10 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 
 from scm_world._types import Floats, Integers, Value
-from scm_world.backends.base import Backend, Capabilities, EngineBatch
-from scm_world.backends.memory import InMemory
+from scm_world.backends.base import Backend, Capabilities, EngineBatch, InMemory
 from scm_world.errors import EngineFailure, ModelError, UnknownOption
 from scm_world.models.model import Numbers
-from scm_world.models.scene import ControlMode, ParameterKey, Parameters, Scene
-from scm_world.models.state import State, StateLayout
+from scm_world.models.scene import ControlMode, ParameterKey, Parameters, Scene, State, StateLayout
 
 
 @final

@@ -10,7 +10,7 @@ from scm_world.errors import EngineError
 from scm_world.models import Scene
 
 if TYPE_CHECKING:
-    from scm_world.backends.mujoco.viewer import Viewer
+    from scm_world.backends.mujoco.opengl import Viewer
 
 
 @final
@@ -40,7 +40,7 @@ class Window:
     def show(self, scene: Scene) -> None:
         """Show a scene; the first time, the window opens."""
         if self._viewer is None:
-            from scm_world.backends.mujoco.viewer import Viewer
+            from scm_world.backends.mujoco.opengl import Viewer
 
             self._viewer = Viewer()
         self._viewer.show(scene)

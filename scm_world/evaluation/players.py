@@ -27,7 +27,7 @@ from scm_world.policies.scripted import NAMED, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
-from scm_world.tasks.policies import Blind
+from scm_world.tasks.base import Blind
 from scm_world.variables import Function
 from scm_world.world import World
 

@@ -9,11 +9,12 @@ from scm_world.models.scene import (
     ParameterKey,
     Parameters,
     Scene,
+    State,
+    StateLayout,
     Structure,
     complete,
     diff,
 )
-from scm_world.models.state import State, StateLayout
 
 __all__ = [
     "ControlMode",

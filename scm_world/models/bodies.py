@@ -170,7 +170,7 @@ class Coupling:
     ratio: float
 
 
-class Part(NamedTuple):
+class RowPart(NamedTuple):
     """Where a number of a parameter stands in a row.
 
     Attributes:
@@ -196,7 +196,7 @@ class Place(NamedTuple):
 
     table: str
     row: int
-    parts: tuple[Part, ...]
+    parts: tuple[RowPart, ...]
 
 
 @final
@@ -216,7 +216,6 @@ class Bodies:
         places: Where the parameters of the model stand in here; those that are missing have no
             meaning to this description.
         missing: What acts in the model and has no words here, one sentence each.
-        notes: What is left out because it matters little, one sentence each.
     """
 
     bodies: tuple[Body, ...]
@@ -229,7 +228,6 @@ class Bodies:
     timestep: float
     places: Mapping[ParameterKey, Place] = field(default_factory=dict, repr=False)
     missing: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
 
     def with_parameters(self, values: Mapping[ParameterKey, Any]) -> Bodies:
         """Give the same bodies with other values of some parameters, which have a place here.
@@ -270,16 +268,8 @@ class Bodies:
         """List the joints between a body and its parent."""
         return (number for number, joint in enumerate(self.joints) if joint.body == body)
 
-    def friction(self, first: int, second: int) -> float:
-        """Give the sliding coefficient of contacts between two geoms."""
-        one, other = self.geoms[first], self.geoms[second]
-        if one.priority != other.priority:
-            decides = one if one.priority > other.priority else other
-            return 0.0 if decides.slippery else decides.friction
-        return 0.0 if one.slippery and other.slippery else max(one.friction, other.friction)
 
-
-def _with_part(row: Any, part: Part, value: Any) -> Any:
+def _with_part(row: Any, part: RowPart, value: Any) -> Any:
     """Give a field of a row with another value, or with one other number in it.
 
     Raises:

@@ -62,25 +62,6 @@ class Camera:
         unit: Floats = axes / lengths
         return unit
 
-    def view_matrix(self) -> Floats:
-        """Map homogeneous world points to the camera (x right, y up, z back), shape (4, 4)."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.axes()
-        matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(self.eye)
-        return matrix
-
-    def projection_matrix(self) -> Floats:
-        """Map the camera's homogeneous points to clip space as OpenGL defines it, shape (4, 4)."""
-        focal = 1.0 / math.tan(math.radians(self.field_of_view) / 2.0)
-        depth = self.near - self.far
-        matrix = np.zeros((4, 4))
-        matrix[0, 0] = focal * self.height / self.width
-        matrix[1, 1] = focal
-        matrix[2, 2] = (self.far + self.near) / depth
-        matrix[2, 3] = 2.0 * self.far * self.near / depth
-        matrix[3, 2] = -1.0
-        return matrix
-
     def project(self, points: ArrayLike) -> Floats:
         """Find where points appear in the picture.
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from scm_world.errors import ModelError
 from scm_world.models.bodies import Bodies
-from scm_world.models.scene import ParameterKey, Scene
-from scm_world.models.state import State, StateLayout
+from scm_world.models.scene import ParameterKey, Scene, State, StateLayout
 
 Numbers = float | tuple[float, ...]
 """One number, or one for each component."""

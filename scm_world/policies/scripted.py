@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.policies.planning import CrossEntropy
 from scm_world.tasks import TASKS
-from scm_world.tasks.policies import Blind, action_range, kept_rows
+from scm_world.tasks.base import Blind, action_range, kept_rows
 from scm_world.world import World
 
 Policy = Callable[[Any], Any]

@@ -6,24 +6,21 @@ import inspect
 from typing import Any, TypeVar
 
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.base import TIME, Observed, Task, Timing
 from scm_world.tasks.conventions import CONVENTIONS, Conventions, conventions
 from scm_world.tasks.model import ModelTask, model_task
-from scm_world.tasks.observed import TIME, Observed
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.step import StepTask
-from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.base import HEAD, TriFingerTask
 from scm_world.tasks.trifinger.building import Building
-from scm_world.tasks.trifinger.creative_stacked_blocks import CreativeStackedBlocks
 from scm_world.tasks.trifinger.general import General
-from scm_world.tasks.trifinger.observed import HEAD
 from scm_world.tasks.trifinger.pick_and_place import PickAndPlace
 from scm_world.tasks.trifinger.picking import Picking
 from scm_world.tasks.trifinger.pushing import Pushing
 from scm_world.tasks.trifinger.reaching import Reaching
-from scm_world.tasks.trifinger.stacked_blocks import StackedBlocks
 from scm_world.tasks.trifinger.stacking2 import Stacking2
 from scm_world.tasks.trifinger.towers import Towers
+from scm_world.tasks.trifinger.walls import CreativeStackedBlocks, StackedBlocks
 
 TASKS: dict[str, type[Task]] = {
     task.name: task

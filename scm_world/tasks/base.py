@@ -1,8 +1,9 @@
-"""What a task is: what there is, what is shared, and what counts."""
+"""What a task is: what there is, what is observed, what counts, and how it is experimented with."""
 
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,10 +16,173 @@ from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.tasks.composition import Composition
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
-from scm_world.tasks.experiments import Scenario
-from scm_world.tasks.observed import Observed
-from scm_world.variables import Draw, Integers, Measured, Variable
+from scm_world.variables import Box, Draw, Integers, Measured, Noise, Variable
 from scm_world.variables.kinds import SpaceName
+
+TIME = "time_left_for_task"
+
+
+@final
+@dataclass(frozen=True)
+class Observed:
+    """A part of the structured observation.
+
+    Attributes:
+        variable: What is observed.
+        low: Lower bound of each component; the declared one if None.
+        high: Upper bound.
+        published: Lower and upper bound of the predecessor's normalisation.
+    """
+
+    variable: str
+    published: tuple[Any, Any]
+    low: Any = None
+    high: Any = None
+
+
+def numbers_of(value: Any) -> Floats | None:
+    """Read finite numbers; None if these are none."""
+    try:
+        found = np.asarray(value)
+    except ValueError:  # a ragged list
+        return None
+    numeric = np.issubdtype(found.dtype, np.number) and np.isfinite(found).all()
+    return found.astype(np.float64) if numeric else None
+
+
+def checked(
+    option: str, value: Any, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
+) -> Any:
+    """Check an argument of a task against the bounds of the variable that it is the default of.
+
+    Args:
+        option: Its name.
+        value: What was given.
+        allowed: The bounds.
+        shape: Of the variable.
+
+    Returns:
+        What was given.
+
+    Raises:
+        UnknownOption: It is no number, of another shape, or out of bounds.
+    """
+    number = numbers_of(value)
+    if number is None or number.shape != shape or not allowed.contains(number):
+        many = f"{shape[0]} numbers in " if shape else "a number in "
+        raise UnknownOption(option, value, (many + allowed.describe(shape, {}),))
+    return value
+
+
+def checked_weight(name: str, weight: Any) -> float:
+    """Check the weight of a reward term.
+
+    Raises:
+        UnknownOption: It is no finite number.
+    """
+    try:
+        number = float(weight)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise UnknownOption(f"weight of {name}", weight, ("any finite number",))
+    return number
+
+
+_DRAWS = 96
+
+
+@final
+class Dice:
+    """The random numbers of one probe state.
+
+    They depend on seed, probe and attempt only, not on what was drawn before.
+
+    Args:
+        noise: The seed's noise.
+        probe: Number of the probe state.
+        attempt: Counts up where a choice was not feasible.
+    """
+
+    def __init__(self, noise: Noise, probe: int, attempt: int = 0) -> None:
+        self._noise, self._probe, self._attempt = noise, probe, attempt
+        self._numbers = self.of("probe", _DRAWS)
+        self._used = 0
+
+    def between(self, low: float, high: float, n: int | None = None) -> Any:
+        """Draw one number, or an array of ``n``; at most 96 in all."""
+        count = 1 if n is None else n
+        drawn = self._numbers[self._used : self._used + count]
+        self._used += count
+        scaled = low + (high - low) * drawn
+        return float(scaled[0]) if n is None else scaled
+
+    def of(self, stream: str, n: int) -> Floats:
+        """Draw numbers in [0, 1) that belong to a name, shape (n,)."""
+        drawn = self._noise.uniforms(stream, n=n, episode=self._probe, step=self._attempt)
+        found: Floats = drawn[0]
+        return found
+
+
+@final
+@dataclass(frozen=True)
+class Scenario:
+    """A kind of probe state.
+
+    Attributes:
+        name: How the state comes about.
+        prepare: Chooses what to set in a world that has just been reset. It may let the world go
+            on before. What else it gives is handed to ``act``.
+        act: Gives an action, shape (n_actions,).
+        steps: How many control steps are taken before the experiments; drawn from 0 to 2 if None.
+        fresh: Whether what was set counts as what was there: experiments then do not add up with
+            it to one intervention, and are faster.
+    """
+
+    name: str
+    prepare: Callable[[Any, Dice], tuple[dict[str, Value], Any]]
+    act: Callable[[Any, Any, Dice], Floats]
+    steps: int | None = None
+    fresh: bool = False
+
+
+class Blind(ABC):
+    """A policy that does not look at what happens: all its actions are known beforehand."""
+
+    @abstractmethod
+    def ahead(self, world: Any, first: int, count: int) -> Floats:
+        """Give the actions of some control steps.
+
+        Args:
+            world: As it is now. A policy asked for the first time may look at it.
+            first: The first control step.
+            count: How many.
+
+        Returns:
+            Shape (count, n_actions).
+        """
+
+    def __call__(self, world: Any) -> Floats:
+        """Give the action of the present step."""
+        action: Floats = self.ahead(world, world.index, 1)[0]
+        return action
+
+
+def kept_rows(actions: Floats, first: int, count: int) -> Floats:
+    """Take rows of actions; after the last one it is kept."""
+    found: Floats = actions[np.minimum(np.arange(first, first + count), len(actions) - 1)]
+    return found
+
+
+def action_range(world: Any) -> tuple[Floats, Floats]:
+    """Return the lower and upper end of all actions, shape (n_actions,) each.
+
+    An action without an end is drawn from [-1, 1], or as far beyond the end that it has.
+    """
+    low, high = world.action_low, world.action_high
+    low = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2.0))
+    high = np.where(np.isfinite(high), high, np.maximum(1.0, low + 2.0))
+    return low, high
 
 
 @final

@@ -17,9 +17,8 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry import chains
 from scm_world.graph import SCM
 from scm_world.models import Model, ParameterKey, Readout, Row, State
-from scm_world.tasks.base import Task, Timing
+from scm_world.tasks.base import Observed, Task, Timing
 from scm_world.tasks.composition import Clock, Composition
-from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import (
     Action,

@@ -12,7 +12,7 @@ from numba import njit
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.scalars import scalar
-from scm_world.tasks.arguments import checked_weight
+from scm_world.tasks.base import checked_weight
 from scm_world.variables import Box, Function, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"

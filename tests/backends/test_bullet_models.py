@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from scm_world import World
 from scm_world.backends import Backend, make_backend, read_model
-from scm_world.backends.bullet import (
-    BulletBackend,
-    deviations,
-    parameters_without,
+from scm_world.backends.bullet import BulletBackend
+from scm_world.backends.bullet.model.support import (
+    shares,
     supports,
     unsupported,
+    usual_friction,
 )
-from scm_world.backends.bullet.model.friction import shares, usual_friction
 from scm_world.backends.mujoco.reading import compiled, permutation
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models import ControlMode, Difference, Model, Parameter, Scene
@@ -422,8 +421,8 @@ def test_friction_of_pairs() -> None:
     for first, second in bodies.touching:
         if "cube" in (names[first], names[second]) and names[first] != "floor":
             continue  # softer than usual: the floor's coefficient stands in for its own
-        assert numbers[first] * numbers[second] == pytest.approx(bodies.friction(first, second))
-    assert any("cube" in sentence for sentence in deviations(model))
+        wanted = max(bodies.geoms[first].friction, bodies.geoms[second].friction)
+        assert numbers[first] * numbers[second] == pytest.approx(wanted)
     rough = bodies.with_parameters({("sphere", "friction"): 1.5})
     changed = shares(rough, usual_friction(bodies))
     assert [a != b for a, b in zip(numbers, changed, strict=True)] == [n == "sphere" for n in names]
@@ -626,7 +625,7 @@ def test_armature_is_refused(backend: BulletBackend) -> None:
 def test_parameters_that_bullet_lacks(backend: BulletBackend) -> None:
     """They keep their defaults; setting one is an error that changes nothing."""
     model = described("pile")
-    lacking = set(parameters_without(model))
+    lacking = {row.key for row in model.parameters if not supports(model, row.key)}
     assert {("cube", "solref"), ("", "impratio"), ("elbow", "stiffness")} <= lacking
     assert not {("box", "mass"), ("cube", "color"), ("", "gravity")} & lacking
     scene = model.default_scene()
@@ -676,13 +675,6 @@ def test_a_world_leaves_out_what_bullet_lacks() -> None:
     assert world.backend.parameters([("pole", "mass")])["pole", "mass"] == 0.3
     with pytest.raises(NotIntervenable, match="no parameter of bullet"):
         world.do({"cart_to_pole.armature": 0.3})
-
-
-def test_deviations_are_said() -> None:
-    """What is done in another way than the file says is listed."""
-    said = " ".join(deviations(described("inverted_pendulum")))
-    assert "Runge-Kutta" in said
-    assert "Limits" in said
 
 
 def test_a_state_that_is_not_finite_is_an_error(backend: BulletBackend) -> None:

@@ -17,8 +17,8 @@ from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import ControlMode, Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.bullet import arena
-from scm_world.tasks.trifinger.bullet.description import PARTS, link_index
-from scm_world.tasks.trifinger.bullet.law import compile_law
+from scm_world.tasks.trifinger.bullet.arena import PARTS, link_index
+from scm_world.tasks.trifinger.bullet.client import compile_law
 from scm_world.tasks.trifinger.bullet.passive import MASSES, inverse_dynamics, mass_matrix
 from scm_world.tasks.trifinger.controller import ControllerSpec
 from scm_world.tasks.trifinger.kinematics import link_frames

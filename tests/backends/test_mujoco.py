@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from scm_world.backends import BACKENDS, EngineSnapshot, make_backend
-from scm_world.backends.mujoco import MujocoBackend
-from scm_world.backends.mujoco.installation import judge
+from scm_world.backends.mujoco import MujocoBackend, judge
 from scm_world.errors import MissingEngine, MixedInstallation, SnapshotMismatch, UnknownOption
 from scm_world.geometry.hulls import hull_of
 from scm_world.models import ControlMode, Difference

@@ -18,7 +18,6 @@ from scm_world.backends.renderer import (
     RenderedImage,
     body_names,
     render,
-    render_views,
     write_png,
 )
 from scm_world.errors import UnknownOption
@@ -145,8 +144,8 @@ COLORED = ["floor", "stage", "tool_block", *hardware.LINK_NAMES]
 @pytest.mark.parametrize("body", COLORED)
 def test_every_color_can_be_seen(scene: Scene, body: str) -> None:
     """Each color parameter changes the pixels of its own body, in some published view, only."""
-    before = render_views(scene, CAMERAS)
-    after = render_views(painted(scene, body, (0.2, 0.9, 0.9)), CAMERAS)
+    before = [render(scene, camera) for camera in CAMERAS]
+    after = [render(painted(scene, body, (0.2, 0.9, 0.9)), camera) for camera in CAMERAS]
     seen = 0
     for was, now in zip(before, after, strict=True):
         changed = (was.rgb != now.rgb).any(axis=2)
@@ -299,7 +298,7 @@ def test_many_blocks(scene: Scene) -> None:
 
 def test_one_call_equals_several(scene: Scene) -> None:
     """Several cameras at once take the pictures each would take."""
-    for image, camera in zip(render_views(scene, CAMERAS), CAMERAS, strict=True):
+    for image, camera in zip([render(scene, camera) for camera in CAMERAS], CAMERAS, strict=True):
         np.testing.assert_array_equal(image.rgb, render(scene, camera).rgb)
 
 

@@ -9,11 +9,10 @@ import pytest
 
 from scm_world._types import Floats
 from scm_world.backends.renderer.kernels import Canvas
+from scm_world.backends.renderer.picture import following, framing
 from scm_world.backends.renderer.shapes import (
     SKY,
     draw_shapes,
-    following,
-    framing,
     goal_shapes,
 )
 from scm_world.geometry import rotation_matrix

@@ -25,8 +25,7 @@ from scm_world.errors import (
     UnknownOption,
     WrongShape,
 )
-from scm_world.models.scene import ControlMode, Difference
-from scm_world.models.state import State
+from scm_world.models.scene import ControlMode, Difference, State
 from scm_world.tasks.trifinger.structure import Structure, default_scene
 
 CONTROLS = ControlMode.CONTROLS

@@ -450,7 +450,7 @@ def test_a_window_shows_a_model(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
     """The window shows states, colors and goals; a change of colors keeps it open."""
     import mujoco.viewer
 
-    from scm_world.backends.mujoco.viewer import Viewer
+    from scm_world.backends.mujoco.opengl import Viewer
 
     windows: list[SimpleNamespace] = []
 

@@ -15,9 +15,9 @@ from scm_world.queries import World
 from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Grasp, Pace
-from scm_world.tasks.trifinger.grasping.bodies import Body, body_of, smallest, turns
-from scm_world.tasks.trifinger.grasping.grips import grips
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, body_of, smallest, turns
 from scm_world.tasks.trifinger.grasping.hand import Hand
+from scm_world.tasks.trifinger.grasping.ways import grips
 
 MODE = "end_effector_positions"
 ENGINES = [
@@ -174,7 +174,7 @@ def test_strength_ends_where_a_joint_does_all_it_can() -> None:
 
 def test_grips_are_balanced() -> None:
     """Fingers press against one another, at the faces, and do not turn the block."""
-    block = Body("block", np.array([0.03, 0.035, 0.0325]), np.zeros(3), 0.0)
+    block = Cuboid("block", np.array([0.03, 0.035, 0.0325]), np.zeros(3), 0.0)
     listed = list(grips(block))
     assert {sum(grip.used) for grip in listed} == {2, 3}
     for grip in listed:
@@ -187,7 +187,7 @@ def test_a_cube_has_four_ways_to_stand() -> None:
     """A longer box has two, and a turn is never longer than half of what brings it back."""
     names = ("size", "cartesian_position", "orientation")
 
-    def box(size: list[float], yaw: float) -> Body:
+    def box(size: list[float], yaw: float) -> Cuboid:
         orientation = from_rotation_vector([0.0, 0.0, yaw])
         values = zip(names, (size, np.zeros(3), orientation), strict=True)
         return body_of("b", {f"b.{name}": np.array(value) for name, value in values})

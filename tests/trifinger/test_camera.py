@@ -22,32 +22,6 @@ def test_axes_are_a_rotation(camera: Camera) -> None:
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("camera", EVERY, ids=lambda camera: camera.name)
-def test_projection_is_that_of_the_matrices(camera: Camera) -> None:
-    """``project`` says in pixels what the two matrices say in clip space."""
-    points = np.random.default_rng(0).uniform(-0.1, 0.1, size=(50, 3))
-    homogeneous = np.column_stack([points, np.ones(50)])
-    clip = homogeneous @ (camera.projection_matrix() @ camera.view_matrix()).T
-    screen = clip[:, :2] / clip[:, 3:]
-    expected = np.column_stack(
-        [
-            (1.0 + screen[:, 0]) * camera.width / 2.0,
-            (1.0 - screen[:, 1]) * camera.height / 2.0,
-            clip[:, 3],
-        ]
-    )
-
-    np.testing.assert_allclose(camera.project(points), expected, atol=1e-10)
-
-
-def test_near_and_far_bound_the_clip_space() -> None:
-    """Points on the near and far planes have clip depths -1 and 1."""
-    matrix = OVERVIEW.projection_matrix()
-    for distance, depth in ((OVERVIEW.near, -1.0), (OVERVIEW.far, 1.0)):
-        clip = matrix @ [0.0, 0.0, -distance, 1.0]
-        assert clip[2] / clip[3] == pytest.approx(depth)
-
-
 def test_target_is_in_the_middle() -> None:
     """The optical axis goes through the center of the picture."""
     column, row, _ = OVERVIEW.project(OVERVIEW.target)
@@ -92,7 +66,8 @@ def test_camera_from_numbers_is_the_published_one(camera: Camera) -> None:
     assert camera_from(camera.name, position, orientation) == camera
     for factor in (-1.0, 3.0):
         made = camera_from(camera.name, position, factor * orientation)
-        np.testing.assert_allclose(made.view_matrix(), camera.view_matrix(), atol=1e-12)
+        np.testing.assert_allclose(made.axes(), camera.axes(), atol=1e-12)
+        assert made.eye == camera.eye
 
     assert np.linalg.norm(orientation) == pytest.approx(1.0, abs=1e-15)
     np.testing.assert_allclose(position, camera.eye, atol=1e-15)

@@ -11,7 +11,7 @@ import pytest
 from worlds import PUSHING, REST, begin, play, same
 
 from scm_world.backends import make_backend
-from scm_world.backends.wrapper import BackendWrapper
+from scm_world.backends.base import BackendWrapper
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     EngineFailure,

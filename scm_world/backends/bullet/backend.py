@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+import weakref
+from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import ClassVar, final
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, final
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
 from scm_world.backends.bullet import values
-from scm_world.backends.bullet.client import Client
-from scm_world.backends.bullet.engine import load, version
-from scm_world.backends.bullet.history import History, Record, SavedState, relive
+from scm_world.backends.bullet.client import Client, load, version
 from scm_world.backends.bullet.model.client import ModelClient
 from scm_world.backends.bullet.model.support import supports
 from scm_world.backends.bullet.values import Instant, Values
@@ -26,12 +27,90 @@ from scm_world.models.scene import (
     ParameterKey,
     Parameters,
     Scene,
+    State,
     Structure,
     complete,
 )
-from scm_world.models.state import State
 
 LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper than a replay
+MODES = tuple(ControlMode)
+AHEAD = 2  # numbers of each step before its command: mode and substeps
+
+
+@final
+class SavedState:
+    """A claim on a state that a client keeps; the client forgets it when the claim is dropped."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.generation = client.generation
+        self.ticket = client.save()
+        weakref.finalize(self, client.forget, self.ticket).atexit = False
+
+    def usable(self) -> bool:
+        """Tell whether the client still stands where the state is exact."""
+        return self.client.handle is not None and self.client.generation == self.generation
+
+
+@final
+@dataclass
+class History:
+    """What a world has been through since its last canonical state; enough to live it again.
+
+    Attributes:
+        origin: The last canonical state.
+        rows: The steps: mode, substeps and command of each.
+        edits: Changes of parameters: the length of ``rows`` at that moment, and the new values.
+        substeps: How many physics steps a replay takes.
+    """
+
+    origin: Instant
+    rows: array[float] = field(default_factory=lambda: array("d"))
+    edits: list[tuple[int, Values]] = field(default_factory=list)
+    substeps: int = 0
+
+    def relive(self, client: Client) -> None:
+        """Go through it again, from the canonical state to the end."""
+        client.canonicalize(self.origin)
+        edits, row = list(reversed(self.edits)), AHEAD + self.origin.structure.n_commands
+        for start in range(0, len(self.rows), row):
+            while edits and edits[-1][0] == start:
+                client.edit(edits.pop()[1])
+            mode, substeps, *command = self.rows[start : start + row]
+            client.stepped(MODES[int(mode)], command, int(substeps))
+        for _, values_ in reversed(edits):
+            client.edit(values_)
+
+
+@final
+@dataclass(frozen=True)
+class Record:
+    """What a snapshot of Bullet holds. It can be pickled; the saved state then stays behind.
+
+    Attributes:
+        origin: See ``History``.
+        rows: The same. They are shared, so that taking them costs little: it may go on.
+        length: How many of its numbers belong to this record.
+        edits: See ``History``.
+        reported: What nobody can set, after the last step.
+        present: The world now, if anything was changed since.
+        light: Whether the present differs from the last step in nothing but light parameters.
+        resting: The state after the last step.
+        saved: The engine's own state after the last step, if one was kept.
+    """
+
+    origin: Instant
+    rows: array[float]
+    length: int
+    edits: tuple[tuple[int, Values], ...]
+    reported: list[float]
+    present: Instant | None
+    light: bool
+    resting: list[float]
+    saved: SavedState | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "rows": self.rows[: self.length], "saved": None}
 
 
 @final
@@ -100,7 +179,7 @@ class BulletBackend(Backend):
         if base is not self._base:
             self._base, self._lost = base, True
         if self._lost:
-            relive(base, history.past(self._reported))
+            history.relive(base)
             self._lost = False
         return base
 
@@ -272,7 +351,8 @@ class BulletBackend(Backend):
             client.close()  # torques that were not stepped would count twice
             self._base = None
             raise EngineFailure(f"Bullet could not step: {error}", self.name) from error
-        history.step(mode, numbers, substeps)
+        history.rows.extend((MODES.index(mode), substeps, *numbers))
+        history.substeps += substeps
         self._reported, self._resting, self._saved = reported, None, None
 
     def _commit(self) -> None:
@@ -280,17 +360,17 @@ class BulletBackend(Backend):
         if self._present is None:
             return
         if self._light:
-            self._lived().edit(self._pending(self._present.parameters))
+            history, before = self._lived(), self._before
+            now = self._present.parameters
+            pending = {key: value for key, value in now.items() if value != before[key]}
+            if pending:
+                history.edits.append((len(history.rows), pending))
         else:
             self._history = History(self._present)
             self._base, self._spare, self._lost = self._spare, self._base, False
             self._resting = self._saved = None
         self._before = self._present.parameters
         self._present, self._light = None, True
-
-    def _pending(self, parameters: Values) -> Values:
-        """List the parameters that differ from those of the last step."""
-        return {key: value for key, value in parameters.items() if value != self._before[key]}
 
     def contacts(self) -> tuple[Contact, ...]:
         """List the contact points of the last physics step."""
@@ -305,8 +385,17 @@ class BulletBackend(Backend):
         history, resting = self._lived(), self._described_base().state
         if history.substeps >= LONG and self._saved is None and not self._lost:
             self._saved = SavedState(self._last())
-        past = history.past(self._reported)
-        record = Record(past, self._present, self._light, resting, self._saved)
+        record = Record(
+            history.origin,
+            history.rows,
+            len(history.rows),
+            tuple(history.edits),
+            self._reported,
+            self._present,
+            self._light,
+            resting,
+            self._saved,
+        )
         return EngineSnapshot(f"{self.name} {self._version}", record)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
@@ -318,9 +407,13 @@ class BulletBackend(Backend):
         mine, record = f"{self.name} {self._version}", snapshot.payload
         if snapshot.engine != mine or not isinstance(record, Record):
             raise SnapshotMismatch(f"this is a snapshot of {snapshot.engine!r}, not of {mine!r}")
-        self._history, self._before = History.of(record.past), record.past.parameters()
+        rows, row = record.rows[: record.length], AHEAD + record.origin.structure.n_commands
+        self._history = History(record.origin, rows, list(record.edits), int(sum(rows[1::row])))
+        self._before = dict(record.origin.parameters)
+        for _, edit in record.edits:
+            self._before.update(edit)
         self._present, self._light = record.present, record.light
-        self._reported, self._resting = record.past.reported, record.resting
+        self._reported, self._resting = record.reported, record.resting
         self._lost, self._saved = True, None
         try:
             self._recall(record.saved)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+import math
 import operator
+import os
+import sys
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib import metadata
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,12 +19,12 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.base import Contact
 from scm_world.backends.bullet.values import Instant, Values
-from scm_world.errors import EngineFailure
-from scm_world.models.scene import ControlMode, ParameterKey
-from scm_world.models.state import State
+from scm_world.errors import EngineFailure, MissingEngine
+from scm_world.models.scene import ControlMode, ParameterKey, State
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
 TOLERANCE = 1e-6  # how far a state that was set may read back from what was asked
+UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
 
 
 class Client(ABC):
@@ -30,6 +35,7 @@ class Client(ABC):
 
     Attributes:
         modes: What a command can mean.
+        signed: Whether the quaternions of a state that is set have a w that is not negative.
         engine: The module ``pybullet``.
         handle: The number of the client; None once it is closed.
         applied: The value of each parameter that is in force.
@@ -37,6 +43,7 @@ class Client(ABC):
     """
 
     modes: ClassVar[tuple[ControlMode, ...]]
+    signed: ClassVar[bool] = False
 
     def __init__(self, engine: Any) -> None:
         self.engine = engine
@@ -60,8 +67,7 @@ class Client(ABC):
     def keys(structure: Any) -> Iterable[ParameterKey]:
         """List every parameter of a structure, in the order in which they are set."""
 
-    @staticmethod
-    @abstractmethod
+    @staticmethod  # noqa: B027 # most can honour all
     def check(structure: Any, parameters: Values) -> None:
         """Say what the engine cannot honour, before anything is made.
 
@@ -77,24 +83,47 @@ class Client(ABC):
 
     @staticmethod
     @abstractmethod
-    def settle(structure: Any, given: State) -> list[float]:
+    def rotations(structure: Any) -> Sequence[int]:
+        """List where in the state the quaternions (x, y, z, w) begin."""
+
+    @classmethod
+    def settle(cls, structure: Any, given: State) -> list[float]:
         """Turn a state into plain numbers: unit quaternions, and 0 for what nobody can set.
 
         Raises:
             ValueError: It is a state of another structure.
             EngineFailure: A number is not finite.
         """
-
-    @staticmethod
-    @abstractmethod
-    def rotations(structure: Any) -> Sequence[int]:
-        """List where in the state the quaternions (x, y, z, w) begin."""
+        plain: list[float] = given.vector.tolist()
+        if len(plain) != structure.layout.size:
+            raise ValueError(f"expected a state of {structure.layout.size} numbers, got {given!r}")
+        if not math.isfinite(sum(plain)):
+            raise EngineFailure(f"a state must be finite, got {given!r}", "bullet")
+        for name in structure.layout.reported:
+            where = structure.layout.slices[name]
+            plain[where] = [0.0] * (where.stop - where.start)
+        for start in cls.rotations(structure):
+            turn = plain[start : start + 4]
+            square = sum(part * part for part in turn)
+            if abs(square - 1.0) >= UNIT and square != 0.0:
+                scale = math.sqrt(square)
+                turn = plain[start : start + 4] = [part / scale for part in turn]
+            if cls.signed and turn[3] < 0.0:
+                plain[start : start + 4] = [-part for part in turn]
+        return plain
 
     # --- what is done in the engine -------------------------------------------------------------
 
-    @abstractmethod
     def furnish(self) -> None:
-        """Add what stands in every scene, and set how the engine works."""
+        """Add what stands in every scene, and set how the engine solves for contacts."""
+        self.engine.setPhysicsEngineParameter(
+            numSolverIterations=SOLVER_ITERATIONS,
+            # An early end, decided for all bodies together, would let bodies act on each other
+            # without touching.
+            solverResidualThreshold=0.0,
+            deterministicOverlappingPairs=1,
+            physicsClientId=self.handle,
+        )
 
     @abstractmethod
     def construct(self, structure: Any, parameters: Values) -> None:
@@ -120,8 +149,12 @@ class Client(ABC):
         """Ask the engine for a parameter, in the units of the scene."""
 
     @abstractmethod
-    def inertia(self, body: str) -> Floats:
-        """Ask the engine for principal moments of inertia, shape (3,) [kg m²]."""
+    def carrier(self, body: str) -> tuple[int, int]:
+        """Give multibody and link that carry the mass of a body.
+
+        Raises:
+            UnknownOption: There is no such body.
+        """
 
     @abstractmethod
     def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
@@ -132,26 +165,42 @@ class Client(ABC):
         """Ask the engine for the state, with 0 for what nobody can set."""
 
     @abstractmethod
-    def contacts(self) -> tuple[Contact, ...]:
-        """List the contact points of the last physics step."""
+    def owner(self, multibody: int, link: int) -> str:
+        """Name the body that a shape of the engine belongs to."""
 
     # --- the same for all -----------------------------------------------------------------------
+
+    def contacts(self) -> tuple[Contact, ...]:
+        """List the points of the last physics step that touch or press.
+
+        The engine also keeps points of bodies that only came near; they are left out.
+        """
+        return tuple(
+            Contact(
+                bodies=(self.owner(point[1], point[3]), self.owner(point[2], point[4])),
+                position=(np.array(point[5]) + np.array(point[6])) / 2,
+                normal=-np.array(point[7]),  # the engine's points to the first body
+                depth=-point[8],
+                force=point[9],
+            )
+            for point in self.engine.getContactPoints(physicsClientId=self.handle)
+            if point[8] <= 0.0 or point[9] > 0.0
+        )
+
+    def inertia(self, body: str) -> Floats:
+        """Ask the engine for principal moments of inertia, shape (3,) [kg m²]."""
+        info = self.engine.getDynamicsInfo(*self.carrier(body), physicsClientId=self.handle)
+        return np.array(info[2])
+
+    def gravity(self) -> Floats:
+        """Ask the engine for gravity, shape (3,) [m/s²]."""
+        physics = self.engine.getPhysicsEngineParameters(physicsClientId=self.handle)
+        return np.array([physics[f"gravityAcceleration{axis}"] for axis in "XYZ"])
 
     def close(self) -> None:
         """Disconnect. Closing twice is harmless."""
         self._close()
         self.handle = None
-
-    def set_solver(self) -> None:
-        """Set how the engine solves for contacts."""
-        self.engine.setPhysicsEngineParameter(
-            numSolverIterations=SOLVER_ITERATIONS,
-            # An early end, decided for all bodies together, would let bodies act on each other
-            # without touching.
-            solverResidualThreshold=0.0,
-            deterministicOverlappingPairs=1,
-            physicsClientId=self.handle,
-        )
 
     def canonicalize(self, instant: Instant) -> None:
         """Bring about the one world that has these parameters and this state, whatever was before.
@@ -243,3 +292,66 @@ class Client(ABC):
 def _disconnect(engine: Any, handle: int) -> None:
     with suppress(engine.error):
         engine.disconnect(physicsClientId=handle)
+
+
+INSTALL = 'pip install "pybullet==3.2.7"'
+REASON = "wheels exist for Linux and Python < 3.12 only"
+
+
+def load() -> Any:
+    """Import pybullet.
+
+    Its import writes to the C library's streams, past ``sys.stdout``; nothing of it gets through.
+
+    Raises:
+        MissingEngine: It is not installed.
+    """
+    if sys.modules.get("pybullet") is not None:
+        return sys.modules["pybullet"]
+    try:
+        with silence():
+            import pybullet
+    except ImportError as error:
+        raise MissingEngine("bullet", INSTALL, f"{error}; {REASON}") from error
+    return pybullet
+
+
+def version() -> str:
+    """Give the version of pybullet.
+
+    Raises:
+        MissingEngine: It is not installed.
+    """
+    try:
+        return metadata.version("pybullet")
+    except metadata.PackageNotFoundError as error:
+        raise MissingEngine("bullet", INSTALL, REASON) from error
+
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Send what is written to the file descriptors of stdout and stderr nowhere."""
+    _flush()
+    saved: dict[int, int] = {}
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            with suppress(OSError):  # a daemon may have closed it
+                saved[stream] = os.dup(stream)
+                os.dup2(nowhere, stream)
+        yield
+    finally:
+        _flush()
+        for stream, copy in saved.items():
+            os.dup2(copy, stream)
+            os.close(copy)
+        os.close(nowhere)
+
+
+def _flush() -> None:
+    """Empty the buffers of Python and of C, so that nothing crosses the border late."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):
+            stream.flush()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).fflush(None)

@@ -11,15 +11,10 @@ import numpy as np
 
 from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.models.scene import ParameterKey, Parameters, Structure
-from scm_world.models.state import State
 
-Plain = float | list[float]
-"""The value of a parameter."""
-
-Values = dict[ParameterKey, Plain]
-"""All parameters, or some. Neither they nor their values are ever changed in place."""
-
-UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
+Values = dict[ParameterKey, Any]
+"""All parameters, or some: numbers, or lists of them. Neither they nor their values are ever
+changed in place."""
 
 
 @final
@@ -36,22 +31,6 @@ class Instant:
     structure: Structure
     parameters: Values
     state: list[float]
-
-
-def number(parameters: Values, key: ParameterKey) -> float:
-    """Give a parameter that is one number."""
-    value = parameters[key]
-    if isinstance(value, list):
-        raise EngineFailure(f"{'.'.join(key)} must be one number, got {value}", "bullet")
-    return value
-
-
-def numbers(parameters: Values, key: ParameterKey) -> list[float]:
-    """Give a parameter that is several numbers."""
-    value = parameters[key]
-    if isinstance(value, float):
-        raise EngineFailure(f"{'.'.join(key)} must be several numbers, got {value}", "bullet")
-    return value
 
 
 def known(there: Mapping[ParameterKey, object], keys: Iterable[ParameterKey]) -> list[ParameterKey]:
@@ -76,7 +55,7 @@ def some(there: Mapping[ParameterKey, object], parameters: Parameters) -> Values
     """
     plain: Values = {}
     for key in known(there, parameters):
-        value: Plain = np.asarray(parameters[key], dtype=np.float64).tolist()
+        value = np.asarray(parameters[key], dtype=np.float64).tolist()
         if not math.isfinite(value if isinstance(value, float) else sum(value)):
             raise EngineFailure(f"{'.'.join(key)} must be finite, got {value}", "bullet")
         plain[key] = value
@@ -96,31 +75,6 @@ def complete(parameters: Parameters, keys: Iterable[ParameterKey]) -> Values:
     """
     wanted = known(parameters, keys)
     return some(parameters, {key: parameters[key] for key in wanted})
-
-
-def plain_state(structure: Structure, given: State) -> list[float]:
-    """Turn a state into plain numbers.
-
-    Raises:
-        ValueError: It is a state of another structure.
-        EngineFailure: A number is not finite.
-    """
-    plain: list[float] = given.vector.tolist()
-    if len(plain) != structure.layout.size:
-        raise ValueError(f"expected a state of {structure.layout.size} numbers, got {given!r}")
-    if not math.isfinite(sum(plain)):
-        raise EngineFailure(f"a state must be finite, got {given!r}", "bullet")
-    return plain
-
-
-def normalize(state: list[float], rotations: Iterable[int]) -> None:
-    """Scale the quaternions that begin at some places of a state to unit length, in place."""
-    for start in rotations:
-        turn = state[start : start + 4]
-        square = sum(part * part for part in turn)
-        if abs(square - 1.0) >= UNIT and square != 0.0:
-            scale = math.sqrt(square)
-            state[start : start + 4] = [part / scale for part in turn]
 
 
 def arrays(parameters: Values) -> Parameters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Sequence
-from typing import Any, Protocol, final
+from typing import TYPE_CHECKING, Any, final
 
 import mujoco
 import numpy as np
@@ -17,24 +17,14 @@ from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost
 from scm_world.errors import EngineFailure
 from scm_world.models.scene import ControlMode
 
+if TYPE_CHECKING:
+    from scm_world.backends.mujoco.backend import MujocoBackend
+
 KEPT = 4
 """Structures whose simulations are kept although no scene is in them at the moment."""
 
 _STRANDED: list[_Room] = []
 """Simulations whose threads were left behind by a fork."""
-
-
-class Guest(Protocol):
-    """A scene that can be stepped elsewhere; see ``MujocoBackend``."""
-
-    seat: Seat | None
-
-    @property
-    def realization(self) -> Realization:
-        """The compiled model with the present parameters."""
-
-    def depart(self, seat: Seat, mode: ControlMode) -> bool:
-        """Let a seat have the state; tell whether the model has changed since the last time."""
 
 
 @final
@@ -87,17 +77,13 @@ class _Room:
         self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
         self.seats = [Seat(self, index) for index in range(n)]
         # Scenes that are as the first one was share a copy of its model: it stays in the cache.
-        self._usual = scene.fingerprint(), copy.copy(scene.model)
-        self.models: list[mujoco.MjModel] = [self._usual[1]] * n
+        self.usual = scene.fingerprint(), copy.copy(scene.model)
+        self.models: list[mujoco.MjModel] = [self.usual[1]] * n
         self.read = scene.rows(self.batch)
         self.began: list[Floats | None] = [None] * n  # see ``Realization``
         self._staged = scene.staged
         self._width = len(scene.command)
         self._commands = self.batch.bind("ctrl")
-
-    def model_of(self, scene: Realization) -> mujoco.MjModel:
-        """Give the model with which a scene is stepped: its own, or one that is exactly alike."""
-        return self._usual[1] if scene.fingerprint() == self._usual[0] else scene.model
 
     def step(self, which: Integers, commands: Floats, substeps: int) -> None:
         """Hold commands, shape (n, at least n_commands), in some of the simulations."""
@@ -123,7 +109,7 @@ class MujocoBatch(EngineBatch):
         threads: That step them; the results do not depend on how many.
     """
 
-    def __init__(self, guests: Sequence[Guest], threads: int) -> None:
+    def __init__(self, guests: Sequence[MujocoBackend], threads: int) -> None:
         self._guests = tuple(guests)
         self._threads = max(1, min(threads, len(self._guests)))
         self._rooms: dict[Any, _Room] = {}
@@ -141,7 +127,13 @@ class MujocoBatch(EngineBatch):
                 stepped. Or a callback of the user is in use; none was.
         """
         if self._process != os.getpid():
-            self._leave_threads()
+            # Everything is made anew after a fork: threads stay in the process that started them.
+            # What they worked for cannot be freed here: that would wait for them for ever.
+            self._process, self._last = os.getpid(), None
+            _STRANDED.extend(self._rooms.values())
+            _STRANDED.extend(seat.room for seat in self._seats if seat is not None)
+            self._rooms.clear()
+            self._seats = [None] * len(self._guests)
         refuse_callbacks()
         if self._last is not None and len(which) == len(self._guests):
             room, last = self._last
@@ -157,7 +149,9 @@ class MujocoBatch(EngineBatch):
             key = id(seat.room)
             rooms.setdefault(key, (seat.room, []))[1].append(index)
             if self._guests[index].depart(seat, mode):
-                seat.room.models[index] = seat.room.model_of(self._guests[index].realization)
+                scene, (fingerprint, model) = self._guests[index].realization, seat.room.usual
+                alike = scene.fingerprint() == fingerprint
+                seat.room.models[index] = model if alike else scene.model
                 changed.add(key)
         problems = []
         everyone = len(rooms) == 1 and len(which) == len(self._guests)
@@ -173,36 +167,18 @@ class MujocoBatch(EngineBatch):
     def _seat(self, index: int) -> Seat:
         """Give the seat of a scene in the room of its structure."""
         scene, seat = self._guests[index].realization, self._seats[index]
-        if seat is None or seat.room.structure != scene.structure:
-            self._seats[index] = None
-            seat = self._seats[index] = self._room(scene).seats[index]
+        if seat is not None and seat.room.structure == scene.structure:
+            return seat
+        self._seats[index], room = None, self._rooms.get(scene.structure)
+        if room is None:
+            used = {id(seat.room) for seat in self._seats if seat is not None}
+            unused = [key for key, other in self._rooms.items() if id(other) not in used]
+            for key in unused[: max(0, len(self._rooms) + 1 - KEPT)]:
+                del self._rooms[key]
+            room = _Room(scene, len(self._guests), self._threads)
+            self._rooms[scene.structure] = room
+        seat = self._seats[index] = room.seats[index]
         return seat
-
-    def _room(self, scene: Realization) -> _Room:
-        found = self._rooms.get(scene.structure)
-        if found is None:
-            self._leave_unused()
-            found = _Room(scene, len(self._guests), self._threads)
-            self._rooms[scene.structure] = found
-        return found
-
-    def _leave_threads(self) -> None:
-        """Make everything anew after a fork: threads stay in the process that started them.
-
-        What they worked for cannot be freed here: that would wait for them for ever.
-        """
-        self._process = os.getpid()
-        _STRANDED.extend(self._rooms.values())
-        _STRANDED.extend(seat.room for seat in self._seats if seat is not None)
-        self._rooms.clear()
-        self._seats = [None] * len(self._guests)
-        self._last = None
-
-    def _leave_unused(self) -> None:
-        used = {id(seat.room) for seat in self._seats if seat is not None}
-        unused = [key for key, room in self._rooms.items() if id(room) not in used]
-        for key in unused[: max(0, len(self._rooms) + 1 - KEPT)]:
-            del self._rooms[key]
 
 
 def _step(room: _Room, which: Any, commands: Floats, substeps: int, into: Floats) -> str:

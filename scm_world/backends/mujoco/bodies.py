@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -18,14 +18,14 @@ from scm_world.models.bodies import (
     Coupling,
     Geom,
     Joint,
-    Part,
     Place,
     Rotation,
+    RowPart,
     Vector,
 )
 from scm_world.models.scene import ParameterKey
 
-_OFF, _JNT, _GEOM, _TRN, _GAIN, _BIAS, _DYN, _INT = (
+_OFF, _JNT, _GEOM, _TRN, _GAIN, _BIAS, _DYN = (
     mujoco.mjtDisableBit,
     mujoco.mjtJoint,
     mujoco.mjtGeom,
@@ -33,7 +33,6 @@ _OFF, _JNT, _GEOM, _TRN, _GAIN, _BIAS, _DYN, _INT = (
     mujoco.mjtGain,
     mujoco.mjtBias,
     mujoco.mjtDyn,
-    mujoco.mjtIntegrator,
 )
 _JOINTS: dict[int, Any] = {
     int(_JNT.mjJNT_FREE): "free",
@@ -96,61 +95,52 @@ _TABLES = {
 @lru_cache(maxsize=32)
 def describe(mj: mujoco.MjModel) -> Bodies:
     """Describe the bodies of a compiled model, which must not be changed afterwards."""
-    names = element_names(mj)
-    couplings = Couplings(mj)
+    names, couplings = element_names(mj), Couplings(mj)
     joints, start = [], 0
-    for number in range(mj.njnt):
-        joint = _joint(mj, number, names["joint"][number], start)
-        joints.append(joint)
-        start += _NUMBERS[joint.kind]
-    shapes = _touching(mj, couplings)
-    number_of = {shape: number for number, shape in enumerate(shapes)}
-    actuators = {
-        number: _actuator(mj, number, names["actuator"][number])
-        for number in range(mj.nactuator)
-        if not _odd_actuator(mj, number) and _works(mj, number)
-    }
-    rows = {
-        "geom": number_of,
-        "actuator": {number: row for row, number in enumerate(actuators)},
-    }
-    gravity = (0.0, 0.0, 0.0) if disabled(mj, _OFF.mjDSBL_GRAVITY) else _vector(mj.opt.gravity)
+    for number, name in enumerate(names["joint"]):
+        joints.append(_joint(mj, number, name, start))
+        start += _NUMBERS[joints[-1].kind]
+    touching = np.flatnonzero(couplings.touches.any(axis=1)).tolist()
+    shapes = [shape for shape in touching if int(mj.geom_type[shape]) in _SHAPES]
+    row = {shape: number for number, shape in enumerate(shapes)}
+    driven = [i for i in range(mj.nactuator) if not _odd_actuator(mj, i) and _works(mj, i)]
+    rows = {"geom": row, "actuator": {number: i for i, number in enumerate(driven)}}
+    followed = [i for i in range(mj.neq) if _acts(mj, i) and _is_linear(mj, i)]
     return Bodies(
-        bodies=tuple(_body(mj, number, names["body"][number]) for number in range(mj.nbody)),
+        bodies=tuple(
+            Body(
+                name,
+                int(mj.body_parentid[i]),
+                _vector(mj.body_pos[i]),
+                _rotation(mj.body_quat[i]),
+                float(mj.body_mass[i]),
+                _vector(mj.body_inertia[i]),
+                _vector(mj.body_ipos[i]),
+                _rotation(mj.body_iquat[i]),
+            )
+            for i, name in enumerate(names["body"])
+        ),
         joints=tuple(joints),
         geoms=tuple(_geom(mj, shape, names["geom"][shape]) for shape in shapes),
-        actuators=tuple(actuators.values()),
+        actuators=tuple(_actuator(mj, number, names["actuator"][number]) for number in driven),
         couplings=tuple(
-            _coupling(mj, equality, names["equality"][equality])
-            for equality in range(mj.neq)
-            if _acts(mj, equality) and _is_linear(mj, equality)
+            Coupling(
+                names["equality"][i],
+                int(mj.eq_obj1id[i]),
+                int(mj.eq_obj2id[i]),
+                *mj.eq_data[i, :2].tolist(),
+            )
+            for i in followed
         ),
         touching=tuple(
-            (number_of[int(first)], number_of[int(second)])
+            (row[int(first)], row[int(second)])
             for first, second in np.argwhere(np.triu(couplings.touches))
-            if int(first) in number_of and int(second) in number_of
+            if int(first) in row and int(second) in row
         ),
-        gravity=gravity,
+        gravity=_vector(np.zeros(3) if disabled(mj, _OFF.mjDSBL_GRAVITY) else mj.opt.gravity),
         timestep=float(mj.opt.timestep),
         places=dict(_places(mj, names, rows)),
-        missing=tuple(_missing(mj, names)),
-        notes=tuple(_notes(mj)),
-    )
-
-
-# --- rows --------------------------------------------------------------------------------------
-
-
-def _body(mj: mujoco.MjModel, body: int, name: str) -> Body:
-    return Body(
-        name,
-        int(mj.body_parentid[body]),
-        _vector(mj.body_pos[body]),
-        _rotation(mj.body_quat[body]),
-        float(mj.body_mass[body]),
-        _vector(mj.body_inertia[body]),
-        _vector(mj.body_ipos[body]),
-        _rotation(mj.body_iquat[body]),
+        missing=tuple(_missing(mj, names, touching)),
     )
 
 
@@ -180,14 +170,18 @@ def _joint(mj: mujoco.MjModel, joint: int, name: str, start: int) -> Joint:
     )
 
 
-def _touching(mj: mujoco.MjModel, couplings: Couplings) -> list[int]:
-    """List the geoms that may touch something and have a word."""
-    touches = np.flatnonzero(couplings.touches.any(axis=1)).tolist()
-    return [shape for shape in touches if int(mj.geom_type[shape]) in _SHAPES]
-
-
 def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
     kind, numbers = _SHAPES[int(mj.geom_type[geom])]
+    corners: tuple[Vector, ...] = ()
+    if kind == "mesh":  # the corners of its convex hull
+        mesh = int(mj.geom_dataid[geom])
+        first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
+        vertices = mj.mesh_vert[first : first + count].astype(np.float64)
+        graph = int(mj.mesh_graphadr[mesh])
+        if graph >= 0:  # number of corners and faces, where their edges begin, which vertices
+            n = int(mj.mesh_graph[graph])
+            vertices = vertices[mj.mesh_graph[graph + 2 + n : graph + 2 + 2 * n]]
+        corners = tuple(map(_vector, vertices))
     return Geom(
         name,
         kind,
@@ -195,27 +189,18 @@ def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
         _vector(mj.geom_pos[geom]),
         _rotation(mj.geom_quat[geom]),
         tuple(mj.geom_size[geom, :numbers].tolist()),
-        _hull(mj, int(mj.geom_dataid[geom])) if kind == "mesh" else (),
+        corners,
         float(mj.geom_friction[geom, 0]),
         bool(mj.geom_condim[geom] == 1),
         int(mj.geom_priority[geom]),
     )
 
 
-def _hull(mj: mujoco.MjModel, mesh: int) -> tuple[Vector, ...]:
-    """Copy the corners of the convex hull of a mesh [m]."""
-    first, count = int(mj.mesh_vertadr[mesh]), int(mj.mesh_vertnum[mesh])
-    vertices = mj.mesh_vert[first : first + count].astype(np.float64)
-    graph = int(mj.mesh_graphadr[mesh])
-    if graph >= 0:  # number of corners and faces, where their edges begin, which vertices they are
-        corners = int(mj.mesh_graph[graph])
-        numbers = mj.mesh_graph[graph + 2 + corners : graph + 2 + 2 * corners]
-        vertices = vertices[numbers]
-    return tuple(map(_vector, vertices))
-
-
 def _actuator(mj: mujoco.MjModel, actuator: int, name: str) -> Actuator:
-    joint, control = int(mj.actuator_trnid[actuator, 0]), _control(mj, actuator)
+    joint = int(mj.actuator_trnid[actuator, 0])
+    # Since MuJoCo 4 an actuator may have several controls and several rows of gears.
+    control = int(mj.actuator_ctrladr[actuator]) if hasattr(mj, "actuator_ctrladr") else actuator
+    output = int(mj.actuator_outadr[actuator]) if hasattr(mj, "actuator_outadr") else actuator
     gears = 3 if mj.jnt_type[joint] == int(_JNT.mjJNT_BALL) else 1
     gain, bias = mj.actuator_gainprm[actuator], mj.actuator_biasprm[actuator]
     affine = mj.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_AFFINE)
@@ -225,22 +210,12 @@ def _actuator(mj: mujoco.MjModel, actuator: int, name: str) -> Actuator:
         name,
         joint,
         control,
-        tuple(mj.actuator_gear[_output(mj, actuator), :gears].tolist()),
+        tuple(mj.actuator_gear[output, :gears].tolist()),
         _vector(gain[:3]) if affine else (float(gain[0]), 0.0, 0.0),
         _vector(bias[:3]) if biased else (0.0, 0.0, 0.0),
         _pair(mj.actuator_ctrlrange[control]) if clipped else None,
         _pair(mj.actuator_forcerange[actuator]) if mj.actuator_forcelimited[actuator] else None,
     )
-
-
-def _control(mj: mujoco.MjModel, actuator: int) -> int:
-    """Give the number of the control of an actuator; since MuJoCo 4 there may be several."""
-    return int(mj.actuator_ctrladr[actuator]) if hasattr(mj, "actuator_ctrladr") else actuator
-
-
-def _output(mj: mujoco.MjModel, actuator: int) -> int:
-    """Give the row of the gear of an actuator."""
-    return int(mj.actuator_outadr[actuator]) if hasattr(mj, "actuator_outadr") else actuator
 
 
 def _works(mj: mujoco.MjModel, actuator: int) -> bool:
@@ -260,12 +235,6 @@ def _is_linear(mj: mujoco.MjModel, equality: int) -> bool:
     """Tell whether an equality constraint lets a joint follow another one in proportion."""
     joints = mj.eq_type[equality] == int(mujoco.mjtEq.mjEQ_JOINT) and mj.eq_obj2id[equality] >= 0
     return bool(joints and not mj.eq_data[equality, 2:5].any())
-
-
-def _coupling(mj: mujoco.MjModel, equality: int, name: str) -> Coupling:
-    joint, leader = int(mj.eq_obj1id[equality]), int(mj.eq_obj2id[equality])
-    offset, ratio = mj.eq_data[equality, :2].tolist()
-    return Coupling(name, joint, leader, offset, ratio)
 
 
 # --- what there is no word for -----------------------------------------------------------------
@@ -299,7 +268,9 @@ def _odd_actuator(mj: mujoco.MjModel, actuator: int) -> str:
     return ""
 
 
-def _missing(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+def _missing(
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], touching: Sequence[int]
+) -> Iterator[str]:
     """List what acts in a model and has no words."""
     yield from (f"the flex {names['flex'][i]!r}" for i in range(mj.nflex))
     yield from (f"the pair {names['pair'][i]!r}" for i in range(mj.npair))
@@ -316,10 +287,12 @@ def _missing(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterat
     for i in range(mj.nactuator):
         if _works(mj, i) and _odd_actuator(mj, i):
             yield f"the actuator {names['actuator'][i]!r}, which {_odd_actuator(mj, i)}"
-    yield from _missing_of_bodies(mj, names)
+    yield from _missing_of_bodies(mj, names, touching)
 
 
-def _missing_of_bodies(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+def _missing_of_bodies(
+    mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], touching: Sequence[int]
+) -> Iterator[str]:
     """List what bodies, joints and shapes do that has no words."""
     for i in range(mj.nbody):
         if mj.body_gravcomp[i] != 0.0:
@@ -332,10 +305,9 @@ def _missing_of_bodies(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]])
             yield f"the nonlinear stiffness or damping of the joint {name!r}"
         if mj.jnt_actgravcomp[i]:
             yield f"gravity compensation by the actuators of the joint {name!r}"
-    touches = np.flatnonzero(Couplings(mj).touches.any(axis=1)).tolist()
     for i in range(mj.ngeom):
         name, kind = names["geom"][i], int(mj.geom_type[i])
-        if i in touches and kind not in _SHAPES:
+        if i in touching and kind not in _SHAPES:
             yield f"the {mujoco.mjtGeom(kind).name.removeprefix('mjGEOM_').lower()} {name!r}"
         if _has(mj, "geom_adhesion", i) or _has(mj, "geom_surfacevel", i):
             yield f"adhesion or moving surface of the geom {name!r}"
@@ -345,16 +317,6 @@ def _has(mj: mujoco.MjModel, array: str, row: int) -> bool:
     """Tell whether a row of an array, which old versions of MuJoCo do not have, is not zero."""
     numbers = getattr(mj, array, None)
     return numbers is not None and bool(np.any(numbers[row]))
-
-
-def _notes(mj: mujoco.MjModel) -> Iterator[str]:
-    """List what is left out because it matters little."""
-    if mj.opt.integrator == int(_INT.mjINT_RK4):
-        yield "The Runge-Kutta integrator of the file is left out."
-    if mj.ngeom and (mj.geom_condim > 3).any():
-        yield "Friction against turning and rolling (condim 4 and 6) is left out."
-    if mj.ngeom and (mj.geom_margin > 0.0).any():
-        yield "Margins of shapes are left out: they touch where they are."
 
 
 # --- places of parameters ----------------------------------------------------------------------
@@ -369,40 +331,30 @@ def _places(
             continue
         number = names[field.kind].index(field.element) if field.element else 0
         row = rows[field.kind].get(number) if field.kind in rows else number
-        parts = _parts(mj, field, number)
+        parts = tuple(_parts(mj, field, number))
         if row is not None and parts:
             yield field.key, Place(_TABLES[field.kind], row, parts)
 
 
-def _parts(mj: mujoco.MjModel, field: Field, number: int) -> tuple[Part, ...]:
+def _parts(mj: mujoco.MjModel, field: Field, number: int) -> Iterator[RowPart]:
     """Say which numbers of a row a parameter is; none if it has no meaning here."""
-    if field.kind == "actuator" and field.attribute in ("kp", "kv"):
-        return tuple(_servo(mj, number, field.attribute))
     name = _FIELDS.get((field.kind, field.attribute))
-    if name is None:
-        return ()
-    if field.attribute == "size" and mj.geom_type[number] == int(_GEOM.mjGEOM_SPHERE):
-        return (Part(name, 0),)
-    if field.attribute == "gain":
-        return (Part(name, 0),)
-    if field.attribute == "gear" and mj.jnt_type[mj.actuator_trnid[number, 0]] != int(
-        _JNT.mjJNT_BALL
-    ):
-        return (Part(name, 0),)
-    return (Part(name),)
-
-
-def _servo(mj: mujoco.MjModel, actuator: int, attribute: str) -> Iterator[Part]:
-    """Say where the gains of a servo stand."""
-    bias = mj.actuator_biasprm[actuator]
-    if mj.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_AFFINE):
-        yield Part("gain", 2, -1.0)
-    elif attribute == "kp":
-        yield from (Part("gain", 0), Part("bias", 1, -1.0))
-    elif bias[1] != 0.0:
-        yield Part("bias", 2, -1.0)
-    else:
-        yield from (Part("gain", 0), Part("bias", 2, -1.0))
+    if name is not None:
+        whole = field.attribute != "gain"
+        if field.attribute == "size":
+            whole = mj.geom_type[number] != int(_GEOM.mjGEOM_SPHERE)
+        elif field.attribute == "gear":
+            whole = mj.jnt_type[mj.actuator_trnid[number, 0]] == int(_JNT.mjJNT_BALL)
+        yield RowPart(name) if whole else RowPart(name, 0)
+    elif field.kind == "actuator" and field.attribute in ("kp", "kv"):
+        damped = mj.actuator_biasprm[number, 1] != 0.0
+        if mj.actuator_gaintype[number] == int(_GAIN.mjGAIN_AFFINE):
+            yield RowPart("gain", 2, -1.0)
+        elif field.attribute == "kp":
+            yield from (RowPart("gain", 0), RowPart("bias", 1, -1.0))
+        else:
+            yield from (() if damped else (RowPart("gain", 0),))
+            yield RowPart("bias", 2, -1.0)
 
 
 # --- conversions -------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from typing import Any, final
+from weakref import WeakKeyDictionary
 
 import mujoco
 import numpy as np
@@ -41,7 +42,7 @@ _KINDS: dict[int, Kind] = {
 
 
 @final
-class Drawing:
+class VisibleModel:
     """What can be seen of a compiled model.
 
     Where a model says of a body how it looks besides how it collides, in groups of geoms that are
@@ -216,8 +217,12 @@ class Drawing:
         return self._meshes[key]
 
 
-def drawn(scene: Scene) -> tuple[Drawing, mujoco.MjData]:
-    """Put the scene of a ``Model`` into MuJoCo.
+_local = threading.local()
+"""What each thread has drawn last."""
+
+
+def drawn(scene: Scene) -> tuple[VisibleModel, mujoco.MjData]:
+    """Put the scene of a ``Model`` into MuJoCo; where it was built before, that costs little.
 
     Args:
         scene: Whose structure is a ``Model`` that was read by MuJoCo.
@@ -225,32 +230,18 @@ def drawn(scene: Scene) -> tuple[Drawing, mujoco.MjData]:
     Returns:
         What is drawn, and the coordinates. They are valid until the next call in this thread.
     """
-    stages: OrderedDict[Any, _Stage] = _local.__dict__.setdefault("stages", OrderedDict())
-    stage = stages.pop(scene.structure, None) or _Stage()
-    stages[scene.structure] = stage
+    stages: OrderedDict[Any, MujocoBackend] = _local.__dict__.setdefault("stages", OrderedDict())
+    shown: WeakKeyDictionary[Any, VisibleModel]
+    shown = _local.__dict__.setdefault("shown", WeakKeyDictionary())
+    backend = stages.pop(scene.structure, None) or MujocoBackend()
+    stages[scene.structure] = backend
     if len(stages) > MOST_STAGES:
         stages.popitem(last=False)
-    return stage.show(scene)
-
-
-class _Stage:
-    """A backend that only draws."""
-
-    def __init__(self) -> None:
-        self._backend = MujocoBackend()
-        self._drawing: Drawing | None = None
-
-    def show(self, scene: Scene) -> tuple[Drawing, mujoco.MjData]:
-        """Build a scene; where its structure was built before, that costs little."""
-        self._backend.build(scene)
-        now = self._backend.realization
-        if self._drawing is None or self._drawing.model is not now.model:
-            self._drawing = Drawing(now.model)
-        return self._drawing, now.data
-
-
-_local = threading.local()
-"""What each thread has drawn last."""
+    backend.build(scene)
+    now = backend.realization
+    if now not in shown:
+        shown[now] = VisibleModel(now.model)
+    return shown[now], now.data
 
 
 def draw_goals(scene: mujoco.MjvScene, goals: Iterable[Goal]) -> None:

@@ -9,14 +9,17 @@ import os
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from functools import lru_cache
-from typing import final
+from typing import Any, final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.backends.mujoco.drawing import Drawing, draw_goals, drawn
+from scm_world.backends.mujoco.backend import MujocoBackend
+from scm_world.backends.mujoco.drawing import VisibleModel, draw_goals, drawn
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Light, Scene
 
@@ -119,7 +122,7 @@ def _light(abstract: mujoco.MjvScene, light: Light, camera: Camera, extent: floa
 class _Canvas:
     """An OpenGL context with the meshes and textures of a model."""
 
-    def __init__(self, drawing: Drawing, size: tuple[int, int], library: str) -> None:
+    def __init__(self, drawing: VisibleModel, size: tuple[int, int], library: str) -> None:
         self._of = drawing, size, library
         _drew.add(os.getpid())
         height, width = size
@@ -131,7 +134,7 @@ class _Canvas:
         mujoco.mjr_resizeOffscreen(width, height, self._renderer)
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._renderer)
 
-    def fits(self, drawing: Drawing, size: tuple[int, int], library: str) -> bool:
+    def fits(self, drawing: VisibleModel, size: tuple[int, int], library: str) -> bool:
         """Tell whether it was made for this."""
         mine, *rest = self._of
         return mine is drawing and rest == [size, library]
@@ -160,7 +163,7 @@ _local = threading.local()
 """The canvas of each thread: an OpenGL context belongs to one."""
 
 
-def _canvas(drawing: Drawing, size: tuple[int, int], library: str) -> _Canvas:
+def _canvas(drawing: VisibleModel, size: tuple[int, int], library: str) -> _Canvas:
     """Give the canvas of this thread, a new one if the last one does not fit."""
     canvas: _Canvas | None = getattr(_local, "canvas", None)
     if canvas is None or not canvas.fits(drawing, size, library):
@@ -177,3 +180,45 @@ def _close() -> None:
     _local.canvas = None
     if canvas is not None:
         canvas.close()
+
+
+@final
+class Viewer:
+    """A window that shows what it is given; it simulates nothing."""
+
+    def __init__(self) -> None:
+        self._backend = MujocoBackend()
+        self._shown: Realization | None = None
+        self._handle: Any = None
+
+    def show(self, scene: Scene) -> None:
+        """Show a scene; the first one, and one with other bodies, opens the window.
+
+        Once someone has closed the window, nothing is shown.
+        """
+        engine, handle = self._backend, self._handle
+        with nullcontext() if handle is None else handle.lock():
+            engine.build(scene)
+            now = engine.realization
+            mujoco.mj_forward(now.model, now.data)
+        if now is not self._shown:
+            self.close()
+            from mujoco import viewer  # loads a window system, so only when a window is wanted
+
+            self._shown = now
+            self._handle = viewer.launch_passive(
+                now.model, now.data, show_left_ui=False, show_right_ui=False
+            )
+        handle = self._handle
+        if not handle.is_running():
+            return
+        with handle.lock():
+            handle.user_scn.ngeom = 0
+            draw_goals(handle.user_scn, scene.goals)
+        handle.sync()
+
+    def close(self) -> None:
+        """Close the window, if it is open."""
+        if self._handle is not None:
+            self._handle.close()
+        self._handle = None

@@ -96,9 +96,10 @@ def read_model(
     chosen = _exposed(fields, patterns)
     data = mujoco.MjData(mj) if mj.nmocap else None
     parameters = tuple(_parameter(mj, data, field) for field in fields if field.name in chosen)
+    keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
     return Model(
         name=name or own_name or "model",
-        digest=_digest(sealed, parameters),
+        digest=hashlib.sha256(f"{sealed.digest}\0{keys}".encode()).hexdigest(),
         source=sealed,
         timestep=float(mj.opt.timestep),
         parameters=parameters,
@@ -140,8 +141,10 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
         problems.append(f"{where} has no joint, so that nothing in it can move; {hint}")
     if mj.nplugin:
-        named = sorted({p.plugin_name for p in _spec(source).plugins}) if source.text else []
-        shown = f" ({', '.join(named)})" if named else ""
+        shown = ""
+        if source.text:
+            spec = mujoco.MjSpec.from_string(source.text, assets=dict(source.assets))
+            shown = f" ({', '.join(sorted({p.plugin_name for p in spec.plugins}))})"
         problems.append(
             f"{where} uses {mj.nplugin} plugin(s){shown}: what they act on is unknown; remove them"
         )
@@ -169,10 +172,6 @@ def _check(mj: mujoco.MjModel, source: Source, where: str) -> None:
         raise ModelError(problems)
 
 
-def _spec(source: Source) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_string(source.text, assets=dict(source.assets))
-
-
 def _notes(mj: mujoco.MjModel) -> Iterator[str]:
     """Say what acts without having a variable, and what is not used."""
     if mj.nflex:
@@ -181,12 +180,6 @@ def _notes(mj: mujoco.MjModel) -> Iterator[str]:
         yield f"{mj.nskin} skin(s) act on pictures only."
     if mj.nkey:
         yield f"{mj.nkey} keyframe(s) are not used: episodes begin in the pose of the file."
-
-
-def _digest(source: Source, parameters: Sequence[Parameter]) -> str:
-    """Hash what decides what an engine makes of a model."""
-    keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
-    return hashlib.sha256(f"{source.digest}\0{keys}".encode()).hexdigest()
 
 
 # --- parameters --------------------------------------------------------------------------------
@@ -345,17 +338,13 @@ def _moving(mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]]) -> Iterato
         )  # fmt: skip
 
 
-def _repeated(names: Iterable[str]) -> set[str]:
-    return {name for name, n in Counter(names).items() if n > 1}
-
-
 def _states(
     mj: mujoco.MjModel, names: Mapping[str, tuple[str, ...]], trees: Couplings
 ) -> Iterator[StateRow]:
     """Describe what moves, in the order of the state vector."""
     data = mujoco.MjData(mj)
     states = list(_moving(mj, names))
-    repeated = _repeated(f"{state.element}.{state.attribute}" for state in states)
+    named = Counter(f"{state.element}.{state.attribute}" for state in states)
     for state in states:
         plain = f"{state.element}.{state.attribute}"
         default = getattr(data, state.array)[state.numbers]
@@ -367,7 +356,7 @@ def _states(
         scalar = len(state.numbers) == 1
         rotation = state.attribute == "orientation"
         yield StateRow(
-            name=f"{state.kind}:{plain}" if plain in repeated else plain,
+            name=f"{state.kind}:{plain}" if named[plain] > 1 else plain,
             unit=state.unit,
             shape=() if scalar else (len(state.numbers),),
             default=_numbers(default[0] if scalar else default),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -52,21 +51,26 @@ def _scratch(
     return mj, data, other, slots(compiled, keys, mj, data) if keys else {}
 
 
+@final
 @dataclass(frozen=True)
-class _Computed(ABC):
-    """A function of states and parameters, in this order.
+class Computed:
+    """A function of states and parameters, in this order: a pose, a velocity, or a sensor.
 
     Attributes:
         source: Of the model.
         states: For each state, which numbers of ``"qpos"``, ``"qvel"`` or ``"act"`` it is.
         keys: Of the parameters.
+        kind: Of the element: ``"site"``, ``"body"``, ``"geom"`` or ``"sensor"``.
         index: Of the element.
+        attribute: What is asked for.
     """
 
     source: Source
     states: tuple[tuple[str, tuple[int, ...]], ...]
     keys: tuple[ParameterKey, ...]
+    kind: str
     index: int
+    attribute: str
 
     def __call__(self, *values: Any) -> Floats | float:
         """Compute the value from those of the parents."""
@@ -78,56 +82,28 @@ class _Computed(ABC):
             slots[key].write(np.asarray(value, dtype=np.float64))
         if any(slots[key].constant for key in self.keys):
             mujoco.mj_setConst(mj, scratch)
-        return self._value(mj, data)
-
-    @abstractmethod
-    def _value(self, mj: mujoco.MjModel, data: mujoco.MjData) -> Floats | float:
-        """Compute it from positions and velocities."""
-
-
-@final
-@dataclass(frozen=True)
-class Pose(_Computed):
-    """Where a site, body or shape is, or how it moves.
-
-    Attributes:
-        kind: Of the element.
-        attribute: What is asked for.
-    """
-
-    kind: str
-    attribute: str
-
-    def _value(self, mj: mujoco.MjModel, data: mujoco.MjData) -> Floats:
+        if self.kind == "sensor":
+            mujoco.mj_fwdPosition(mj, data)
+            mujoco.mj_sensorPos(mj, data)
+            if mj.sensor_needstage[self.index] == int(_STAGE.mjSTAGE_VEL):
+                mujoco.mj_fwdVelocity(mj, data)
+                mujoco.mj_sensorVel(mj, data)
+            first, size = int(mj.sensor_adr[self.index]), int(mj.sensor_dim[self.index])
+            found = data.sensordata[first : first + size].copy()
+            return found if size > 1 else float(found[0])
         mujoco.mj_kinematics(mj, data)
         if self.attribute.endswith("velocity"):
             mujoco.mj_comPos(mj, data)
             mujoco.mj_comVel(mj, data)
-            found = np.empty(6)
-            mujoco.mj_objectVelocity(mj, data, _OBJECTS[self.kind], self.index, found, 0)
-            return found[:3] if self.attribute == "angular_velocity" else found[3:]
+            speeds = np.empty(6)
+            mujoco.mj_objectVelocity(mj, data, _OBJECTS[self.kind], self.index, speeds, 0)
+            return speeds[:3] if self.attribute == "angular_velocity" else speeds[3:]
         prefix = {"site": "site_x", "body": "x", "geom": "geom_x"}[self.kind]
         if self.attribute == "position":
             return np.array(getattr(data, f"{prefix}pos")[self.index])
         turned = np.empty(4)
         mujoco.mju_mat2Quat(turned, getattr(data, f"{prefix}mat")[self.index])
         return turned[[1, 2, 3, 0]] * (-1.0 if turned[0] < 0.0 else 1.0)
-
-
-@final
-@dataclass(frozen=True)
-class Sensed(_Computed):
-    """What a sensor of positions or velocities measures."""
-
-    def _value(self, mj: mujoco.MjModel, data: mujoco.MjData) -> Floats | float:
-        mujoco.mj_fwdPosition(mj, data)
-        mujoco.mj_sensorPos(mj, data)
-        if mj.sensor_needstage[self.index] == int(_STAGE.mjSTAGE_VEL):
-            mujoco.mj_fwdVelocity(mj, data)
-            mujoco.mj_sensorVel(mj, data)
-        first, size = int(mj.sensor_adr[self.index]), int(mj.sensor_dim[self.index])
-        found = data.sensordata[first : first + size].copy()
-        return found if size > 1 else float(found[0])
 
 
 # --- finding -----------------------------------------------------------------------------------
@@ -209,13 +185,12 @@ class _Finder:
         )
 
     def _pose(self, name: str, kind: str, index: int, attribute: str) -> Readout:
-        unit, shape, doc = _POSES[attribute]
         states, keys = self._parents([(kind, index)], attribute.endswith("velocity"))
-        function: Callable[..., Any]
-        function = Pose(self._source, self._places(states), keys, index, kind, attribute)
+        function: Callable[..., Any] | None = None
         if not keys and attribute in ("position", "orientation"):
             function = self._chain(kind, index, states, turn=attribute == "orientation")
-        return self._row(name, unit, shape, states, keys, function, doc.format(kind=kind))
+        row = (name, *_POSES[attribute])
+        return self._row(*row, states, keys, (kind, index, attribute), function)
 
     def _chain(self, kind: str, index: int, states: Sequence[str], *, turn: bool) -> Chain:
         """Write a pose down as a chain of joints, which is computed faster than by MuJoCo."""
@@ -251,18 +226,18 @@ class _Finder:
         name: str,
         unit: str,
         shape: tuple[int, ...],
-        states: Sequence[str],
-        keys: Sequence[ParameterKey],
-        function: Callable[..., Any],
         doc: str,
+        states: Sequence[str],
+        keys: tuple[ParameterKey, ...],
+        what: tuple[str, int, str],
+        function: Callable[..., Any] | None = None,
     ) -> Readout:
         named = {row.key: row.name for row in self._parameters}
-        parents = (*states, *(named[key] for key in keys))
-        return Readout(name, unit, shape, parents, function, doc)
-
-    def _places(self, states: Iterable[str]) -> tuple[tuple[str, tuple[int, ...]], ...]:
         where = {row.name: (array, tuple(numbers)) for row, array, numbers, _ in self._states}
-        return tuple(where[name] for name in states)
+        places = tuple(where[state] for state in states)
+        parents = (*states, *(named[key] for key in keys))
+        function = function or Computed(self._source, places, keys, *what)
+        return Readout(name, unit, shape, parents, function, doc.format(kind=what[0]))
 
     def _parents(
         self, objects: Iterable[tuple[str, int]], velocity: bool
@@ -287,7 +262,8 @@ class _Finder:
         keys = tuple(
             row.key
             for row in self._parameters
-            if row.key[1] in _MOVING and any(_belongs(row.key, *element) for element in elements)
+            if row.key[1] in _MOVING
+            and any(row.key[0] in (name, f"{kind}:{name}") for kind, name in elements)
         )
         return states, keys
 
@@ -316,13 +292,11 @@ class _Finder:
             keys = tuple(row.key for row in self._parameters)
         else:
             states, keys = self._parents(objects, velocity)
-        function = Sensed(self._source, self._places(states), keys, index)
         size = int(mj.sensor_dim[index])
         shape = (size,) if size > 1 else ()
-        what = kind.name.removeprefix("mjSENS_").lower()
-        return self._row(
-            name, self._unit(index, kind), shape, states, keys, function, f"The {what} sensor."
-        )
+        doc = f"The {kind.name.removeprefix('mjSENS_').lower()} sensor."
+        what = "sensor", index, "value"
+        return self._row(name, self._unit(index, kind), shape, doc, states, keys, what)
 
     def _hidden(self, index: int, kind: mujoco.mjtSensor) -> str:
         """Say why a sensor is no function of states and parameters, if it is none."""
@@ -346,32 +320,15 @@ class _Finder:
     def _objects(self, index: int, kind: mujoco.mjtSensor) -> list[tuple[str, int]] | None:
         """List what decides the value of a sensor; None where that may be anything."""
         mj = self._mj
-        target = int(mj.sensor_objid[index])
-        match kind:
-            case (
-                _SENS.mjSENS_FRAMEPOS
-                | _SENS.mjSENS_FRAMEQUAT
-                | _SENS.mjSENS_FRAMEXAXIS
-                | _SENS.mjSENS_FRAMEYAXIS
-                | _SENS.mjSENS_FRAMEZAXIS
-                | _SENS.mjSENS_FRAMELINVEL
-                | _SENS.mjSENS_FRAMEANGVEL
-                | _SENS.mjSENS_VELOCIMETER
-                | _SENS.mjSENS_GYRO
-            ):
-                ends = [(int(mj.sensor_objtype[index]), target)]
-                if mj.sensor_refid[index] >= 0:
-                    ends.append((int(mj.sensor_reftype[index]), int(mj.sensor_refid[index])))
-                kinds = {
-                    int(_OBJ.mjOBJ_SITE): "site",
-                    int(_OBJ.mjOBJ_GEOM): "geom",
-                    int(_OBJ.mjOBJ_XBODY): "body",
-                }
-                if any(obj not in kinds for obj, _ in ends):
-                    return None  # inertial frames and cameras follow more
-                return [(kinds[obj], end) for obj, end in ends]
-            case _:
-                return None
+        if kind not in _OF_FRAMES:
+            return None
+        ends = [(int(mj.sensor_objtype[index]), int(mj.sensor_objid[index]))]
+        if mj.sensor_refid[index] >= 0:
+            ends.append((int(mj.sensor_reftype[index]), int(mj.sensor_refid[index])))
+        kinds = {int(obj): name for name, obj in _OBJECTS.items()}
+        if any(obj not in kinds for obj, _ in ends):
+            return None  # inertial frames and cameras follow more
+        return [(kinds[obj], end) for obj, end in ends]
 
     def _unit(self, index: int, kind: mujoco.mjtSensor) -> str:
         """Give the unit of a sensor; ``"1"`` where it mixes or has none."""
@@ -387,6 +344,17 @@ class _Finder:
         return f"{unit}/s" if speed and unit != "1" else unit
 
 
+_OF_FRAMES = (
+    _SENS.mjSENS_FRAMEPOS,
+    _SENS.mjSENS_FRAMEQUAT,
+    _SENS.mjSENS_FRAMEXAXIS,
+    _SENS.mjSENS_FRAMEYAXIS,
+    _SENS.mjSENS_FRAMEZAXIS,
+    _SENS.mjSENS_FRAMELINVEL,
+    _SENS.mjSENS_FRAMEANGVEL,
+    _SENS.mjSENS_VELOCIMETER,
+    _SENS.mjSENS_GYRO,
+)
 _OF_JOINTS = (
     _SENS.mjSENS_JOINTPOS,
     _SENS.mjSENS_JOINTVEL,
@@ -424,8 +392,3 @@ def _joint_step(mj: mujoco.MjModel, joint: int, first: int) -> tuple[float, ...]
         case mujoco.mjtJoint.mjJNT_BALL:
             return (BALL, first, *anchor)
     return (FREE, first)
-
-
-def _belongs(key: ParameterKey, kind: str, element: str) -> bool:
-    """Tell whether a parameter is one of an element."""
-    return key[0] in (element, f"{kind}:{element}")

@@ -1,26 +1,139 @@
 """A structure as MuJoCo realizes it: one class for each kind of structure.
 
-``Realization`` holds a compiled model with its parameters and its state. ``articulated`` has
-the one of any ``Model``; a structure can bring its own (``Structure.realization``).
+``Realization`` holds a compiled model with its parameters and its state. ``backend`` has the one
+of any ``Model``; a structure can bring its own (``Structure.realization``).
 """
 
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 import mujoco
+import numba
 import numpy as np
 from mujoco.batch import Batch
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.contacts import Touches, earlier_stages, has_stages, touches
 from scm_world.backends.mujoco.slots import Slot
-from scm_world.backends.mujoco.state import sensible, sound
 from scm_world.errors import EngineFailure, Infeasible, UnknownOption
 from scm_world.models.scene import ControlMode, ParameterKey, Parameters
+
+
+@numba.njit("b1(f8[::1], f8[::1], f8[::1], i4[:])", cache=True)
+def sound(positions: Floats, velocities: Floats, activations: Floats, counts: Any) -> bool:
+    """Tell whether all numbers are finite, and no contact or constraint was left out.
+
+    Args:
+        positions: Shape (nq,).
+        velocities: Shape (nv,).
+        activations: Shape (na,).
+        counts: Of MuJoCo's warnings, which begin with 1; the second is of contacts for which
+            there was no memory, the third of constraints.
+    """
+    total = 0.0
+    for value in positions:
+        total += value * 0.0
+    for value in velocities:
+        total += value * 0.0
+    for value in activations:
+        total += value * 0.0
+    return total == 0.0 and counts[1] + counts[2] == 2
+
+
+@numba.njit("void(f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])", cache=True)
+def read_vector(
+    positions: Floats, velocities: Floats, activations: Floats, places: Integers, into: Floats
+) -> None:
+    """Copy MuJoCo's coordinates into a state vector.
+
+    Args:
+        positions: Shape (nq,).
+        velocities: Shape (nv,).
+        activations: Shape (na,).
+        places: Where in the vector each of them stands, in this order, shape (nq + nv + na,).
+        into: Written, shape (nq + nv + na,).
+    """
+    nq, nv = positions.shape[0], velocities.shape[0]
+    for i in range(nq):
+        into[places[i]] = positions[i]
+    for i in range(nv):
+        into[places[nq + i]] = velocities[i]
+    for i in range(activations.shape[0]):
+        into[places[nq + nv + i]] = activations[i]
+
+
+@numba.njit("void(f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])", cache=True)
+def write_vector(
+    positions: Floats, velocities: Floats, activations: Floats, places: Integers, vector: Floats
+) -> None:
+    """Copy a state vector into MuJoCo's coordinates; see ``read_vector``."""
+    nq, nv = positions.shape[0], velocities.shape[0]
+    for i in range(nq):
+        positions[i] = vector[places[i]]
+    for i in range(nv):
+        velocities[i] = vector[places[nq + i]]
+    for i in range(activations.shape[0]):
+        activations[i] = vector[places[nq + nv + i]]
+
+
+@numba.njit("i8(f8[:, ::1], i8[::1], i4[::1], f8[:, ::1])", cache=True)
+def read_rows(states: Floats, places: Integers, which: Any, into: Floats) -> int:
+    """Copy some rows of MuJoCo's states (time, positions, velocities, activations, ...).
+
+    Args:
+        states: Of all simulations, one to a row.
+        places: See ``read_vector``.
+        which: The rows, shape (m,).
+        into: The first columns of these rows are written.
+
+    Returns:
+        A row in which something is not finite; -1 if there is none.
+    """
+    wrong = -1
+    for row in which:
+        total = 0.0
+        for i in range(places.shape[0]):
+            value = states[row, 1 + i]
+            into[row, places[i]] = value
+            total += value * 0.0
+        if total != 0.0:
+            wrong = row
+    return wrong
+
+
+@numba.njit("b1(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", cache=True)
+def sensible(
+    masses: Floats, moments: Floats, inertia: Floats, dof_weights: Floats, body_weights: Floats
+) -> bool:
+    """Tell whether masses and what MuJoCo derives from them are those of something that can move.
+
+    Args:
+        masses: Of the bodies, shape (nbody,).
+        moments: Their principal moments of inertia, shape (nbody, 3).
+        inertia: Diagonal of the inertia matrix, shape (nv,).
+        dof_weights: Inverse weights, shape (nv,).
+        body_weights: Inverse weights, shape (nbody, 2).
+    """
+    for body in range(masses.shape[0]):
+        a, b, c = moments[body]
+        least, most = min(a, b, c), max(a, b, c)
+        if not (0.0 <= masses[body] < math.inf and least >= 0.0 and most < math.inf):
+            return False
+        if not a + b + c - 2.0 * most >= -1e-6 * most:  # the triangle inequality
+            return False
+        for weight in body_weights[body]:
+            if not 0.0 <= weight < math.inf:
+                return False
+    for dof in range(inertia.shape[0]):
+        if not (0.0 < inertia[dof] < math.inf and 0.0 <= dof_weights[dof] < math.inf):
+            return False
+    return True
+
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides how MuJoCo goes on."""
@@ -304,7 +417,12 @@ class Realization(ABC):
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])
         except BaseException:
-            self._take_back(before)
+            self._numbers = None
+            for key, old in before.items():
+                if old is not None:  # where there is none, the model is new and is given up
+                    kept[key] = old
+                    slots[key].write(old)
+            self.followed(before)
             raise
 
     def followed(self, keys: Iterable[ParameterKey]) -> str:
@@ -328,19 +446,8 @@ class Realization(ABC):
         constant = [key for key in keys if key in self._constant]
         wrong = []
         for key in constant:
-            value = self._slots[key].read()
+            value, most = self._slots[key].read(), self._slots[key].read().max()
             bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
-            if bad or (
-                key[1] == "inertia" and 2.0 * value.max() - value.sum() > 1e-6 * value.max()
-            ):
+            if bad or (key[1] == "inertia" and 2.0 * most - value.sum() > 1e-6 * most):
                 wrong.append(key)
         return wrong or constant
-
-    def _take_back(self, before: Mapping[ParameterKey, Floats | None]) -> None:
-        """Write old values again; where there is none, the model is new and is given up."""
-        self._numbers = None
-        for key, value in before.items():
-            if value is not None:
-                self.kept[key] = value
-                self._slots[key].write(value)
-        self.followed(before)

@@ -9,7 +9,6 @@ from scm_world.backends.renderer.picture import (
     following_camera,
     picture,
     render,
-    render_views,
     scene_camera,
     write_png,
 )
@@ -42,7 +41,6 @@ __all__ = [
     "picture",
     "pixels",
     "render",
-    "render_views",
     "resized",
     "scene_camera",
     "write_png",

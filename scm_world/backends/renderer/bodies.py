@@ -18,7 +18,7 @@ from scm_world.models.scene import Goal, Scene
 from scm_world.models.shapes import Shape
 
 if TYPE_CHECKING:
-    from scm_world.backends.mujoco.drawing import Drawing
+    from scm_world.backends.mujoco.drawing import VisibleModel
 
 BOX, ELLIPSOID, CAPSULE, HULL, CYLINDER = range(5)
 GOAL_SHAPES = {"box": BOX, "sphere": ELLIPSOID, "hull": HULL}
@@ -27,7 +27,7 @@ NOTHING = -1
 """What a pixel shows where there is no body."""
 
 
-class Bodies(NamedTuple):
+class SolidTable(NamedTuple):
     """Solids: one row each, in the order in which they are drawn.
 
     Capsules and cylinders lie along the third axis of their own frame.
@@ -84,7 +84,7 @@ def model_camera(scene: Scene, name: str, size: tuple[int, int]) -> Camera:
     return drawing.camera(data, name, size)
 
 
-def _drawn(scene: Scene) -> tuple[Drawing, Any]:
+def _drawn(scene: Scene) -> tuple[VisibleModel, Any]:
     """Put a scene of a ``Model`` into MuJoCo, which is imported only where it is needed."""
     if not isinstance(scene.structure, Model):
         kind = type(scene.structure).__name__
@@ -94,7 +94,7 @@ def _drawn(scene: Scene) -> tuple[Drawing, Any]:
     return drawn(scene)
 
 
-def goal_bodies(goals: tuple[Goal, ...], eye: tuple[float, float, float]) -> Bodies:
+def goal_bodies(goals: tuple[Goal, ...], eye: tuple[float, float, float]) -> SolidTable:
     """List silhouettes from the farthest to the nearest: each is drawn over those behind."""
     ordered = sorted(goals, key=lambda goal: -float(np.linalg.norm(goal.position - eye)))
     bodies = empty_bodies(len(goals), [goal.hull for goal in ordered])
@@ -125,9 +125,9 @@ def _hull_parts(hull: Hull) -> tuple[Floats, Floats]:
     return parts.planes, halves
 
 
-def empty_bodies(n: int, hulls: list[Hull | None]) -> Bodies:
+def empty_bodies(n: int, hulls: list[Hull | None]) -> SolidTable:
     """Make room for n bodies; the last ones are boxes, or hulls where one is given."""
-    bodies = Bodies(
+    bodies = SolidTable(
         np.full(n, BOX), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3)),
         np.empty((n, 3)), np.empty(n, dtype=np.int64), np.empty((0, 4)),
         np.zeros(n + 1, dtype=np.int64),

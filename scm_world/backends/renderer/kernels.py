@@ -7,6 +7,7 @@ which covers a pinhole camera (one origin) as well as parallel light (one direct
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.renderer.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, HULL, Bodies
+from scm_world.backends.renderer.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, HULL, SolidTable
 from scm_world.backends.renderer.rays import (
     Hit,
     Triple,
@@ -24,6 +25,7 @@ from scm_world.backends.renderer.rays import (
     hit_cylinder,
     hit_hull,
 )
+from scm_world.models.camera import Camera
 
 Depths = NDArray[np.float32]
 Owners = NDArray[np.int32]
@@ -66,7 +68,7 @@ class Canvas(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _rectangle(
-    bodies: Bodies, n: int, view: View, width: int, height: int
+    bodies: SolidTable, n: int, view: View, width: int, height: int
 ) -> tuple[int, int, int, int]:
     """Bound the pixels a body can cover: first and last column plus one, the same for rows."""
     left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
@@ -214,7 +216,7 @@ def _opacity(shape: int, facets: Floats, point: Triple, n: Triple) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _scale(bodies: Bodies, n: int) -> tuple[Floats, float]:
+def _scale(bodies: SolidTable, n: int) -> tuple[Floats, float]:
     """Give the unit of length in the frame of a body, and half the length of what is round."""
     scale = bodies.halves[n].copy()
     if bodies.shapes[n] == HULL:
@@ -311,7 +313,7 @@ def blend(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float
 
 @njit(cache=True, error_model="numpy")
 def _draw_body(
-    bodies: Bodies, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
+    bodies: SolidTable, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
 ) -> None:
     """Draw one body where it is nearer than what is there; see ``draw``."""
     depth, owners, rgb = canvas
@@ -347,7 +349,7 @@ def _draw_body(
 
 
 @njit(cache=True, error_model="numpy")
-def draw(bodies: Bodies, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
+def draw(bodies: SolidTable, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
     """Draw solids over what is there, where they are nearer.
 
     Args:
@@ -359,3 +361,38 @@ def draw(bodies: Bodies, view: View, light: Floats, alpha: float, canvas: Canvas
     """
     for n in range(len(bodies.shapes)):
         _draw_body(bodies, n, view, light, alpha, canvas)
+
+
+@lru_cache(maxsize=64)
+def camera_view(camera: Camera, samples: int) -> View:
+    """Give every sample of a pinhole camera its ray. The arrays are shared."""
+    width, height = camera.width * samples, camera.height * samples
+    step = 2.0 * math.tan(math.radians(camera.field_of_view) / 2.0) / height  # per pixel
+    right, up, back = camera.axes()
+    middle_u, middle_v = (width - 1) / 2.0, (height - 1) / 2.0
+    corner = -back - right * (step * middle_u) + up * (step * middle_v)
+    eye, zero = np.array(camera.eye, dtype=np.float64), np.zeros(3)
+    rays = np.stack([eye, zero, zero, corner, right * step, -up * step])
+    linear = np.stack([right / step - middle_u * back, -up / step - middle_v * back, -back])
+    return View(rays, np.column_stack([linear, -linear @ eye]), float(camera.near))
+
+
+def parallel_view(slope: Floats, half: float, n: int) -> View:
+    """Give every point of a grid on the floor a ray towards the light.
+
+    Args:
+        slope: Towards the light, at height one, shape (3,).
+        half: Half the edge of the grid [m].
+        n: Points along an edge.
+    """
+    step = 2.0 * half / (n - 1)
+    zero = np.zeros(3)
+    rays = np.array([[-half, -half, 0.0], [step, 0.0, 0.0], [0.0, step, 0.0], slope, zero, zero])
+    projection = np.array(
+        [
+            [1.0 / step, 0.0, -slope[0] / step, half / step],
+            [0.0, 1.0 / step, -slope[1] / step, half / step],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    return View(rays, projection, 0.0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import final
@@ -10,15 +11,24 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._types import Floats
 from scm_world.backends.renderer.bodies import model_camera, model_shapes
 from scm_world.backends.renderer.drawing import drawing_of
-from scm_world.backends.renderer.shapes import AUTOMATIC, SKY, following, framing
+from scm_world.backends.renderer.shapes import SKY, corners_of_what_moves
 from scm_world.errors import EngineError, UnknownOption
 from scm_world.models.camera import Camera
 from scm_world.models.model import Model
 from scm_world.models.scene import Scene
+from scm_world.models.shapes import Shape
 
 USUAL_SIZE = 480, 640  # [pixels] height and width of a picture for people
+THREE_QUARTER = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
+"""From what is seen towards an automatic camera."""
+
+AUTOMATIC = "automatic"
+FIELD_OF_VIEW = 40.0  # [deg] of an automatic camera
+MARGIN = 1.3  # how much more an automatic camera sees than it has to
+STILL = 0.05  # of the distance: how far from the middle of a picture is near it
 
 RENDERERS = ("software", "mujoco")
 
@@ -78,25 +88,14 @@ def render(scene: Scene, camera: Camera, *, samples: int = 1) -> RenderedImage:
         >>> picture.rgb.shape, bool(picture.shows("tool_block").any())
         ((480, 640, 3), True)
     """
-    return render_views(scene, (camera,), samples=samples)[0]
-
-
-def render_views(
-    scene: Scene, cameras: Iterable[Camera], *, samples: int = 1
-) -> tuple[RenderedImage, ...]:
-    """Take pictures of a scene with several cameras; see ``render``."""
     if samples < 1:
         raise ValueError(f"samples: expected a positive number, got {samples}")
     drawing = drawing_of(scene.structure)
     content, names = drawing.content(scene, shadows=True), drawing.names(scene.structure)
-    pictures = []
-    for camera in cameras:
-        canvas = drawing.draw(scene, content, camera)
-        fine = canvas if samples == 1 else drawing.draw(scene, content, camera, samples=samples)
-        rgb = fine.rgb
-        shown = _average(np.ascontiguousarray(rgb.transpose(1, 2, 0)), samples)
-        pictures.append(RenderedImage(shown, canvas.depth, canvas.owners, names))
-    return tuple(pictures)
+    canvas = drawing.draw(scene, content, camera)
+    fine = canvas if samples == 1 else drawing.draw(scene, content, camera, samples=samples)
+    shown = _average(np.ascontiguousarray(fine.rgb.transpose(1, 2, 0)), samples)
+    return RenderedImage(shown, canvas.depth, canvas.owners, names)
 
 
 def picture(
@@ -207,6 +206,32 @@ def automatic_camera(*scenes: Scene, size: tuple[int, int] = (480, 640)) -> Came
     return framing([shape for scene in scenes for shape in model_shapes(scene)[0]], size)
 
 
+def framing(shapes: Sequence[Shape], size: tuple[int, int]) -> Camera:
+    """Place a camera as ``automatic_camera`` does."""
+    points = corners_of_what_moves(shapes)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    height, width = size
+    slope = math.tan(math.radians(FIELD_OF_VIEW) / 2.0) / MARGIN
+    right, up, back = _looking(middle, THREE_QUARTER, size).axes() @ (points - middle).T
+    distance = float((back + np.maximum(np.abs(right) * height / width, np.abs(up)) / slope).max())
+    return _looking(middle, max(distance, 1e-6) * THREE_QUARTER, size)
+
+
+def _looking(at: Floats, offset: Floats, size: tuple[int, int]) -> Camera:
+    """Place a camera at an offset from what it looks at."""
+    distance = float(np.linalg.norm(offset))
+    return Camera(
+        AUTOMATIC,
+        tuple((at + offset).tolist()),
+        tuple(at.tolist()),
+        field_of_view=FIELD_OF_VIEW,
+        height=size[0],
+        width=size[1],
+        near=0.01 * distance,
+        far=100.0 * distance,
+    )
+
+
 def following_camera(camera: Camera, scene: Scene) -> Camera:
     """Move a camera along with what moves in the scene of a model, for the next picture of a film.
 
@@ -221,6 +246,18 @@ def following_camera(camera: Camera, scene: Scene) -> Camera:
         ModelError: The structure says nothing about shapes.
     """
     return following(camera, model_shapes(scene)[0])
+
+
+def following(camera: Camera, shapes: Sequence[Shape]) -> Camera:
+    """Move a camera as ``following_camera`` does."""
+    points = corners_of_what_moves(shapes)
+    eye, target = np.array(camera.eye), np.array(camera.target)
+    away = (points.min(axis=0) + points.max(axis=0)) / 2.0 - target
+    free, off = STILL * np.linalg.norm(eye - target), np.linalg.norm(away)
+    if off <= free:
+        return camera
+    step = away * (1.0 - free / off)
+    return replace(camera, eye=tuple((eye + step).tolist()), target=tuple((target + step).tolist()))
 
 
 def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -15,19 +14,21 @@ from scm_world.backends.renderer.bodies import (
     CYLINDER,
     ELLIPSOID,
     NOTHING,
-    Bodies,
+    SolidTable,
 )
-from scm_world.backends.renderer.kernels import Canvas, View, draw
-from scm_world.backends.renderer.light import (
+from scm_world.backends.renderer.kernels import Canvas, View, camera_view, draw
+from scm_world.backends.renderer.meshes import (
     LOWEST,
     NO_COLORS,
     NO_OWNERS,
     NO_SHADOW,
+    Ground,
+    Triangles,
+    draw_ground,
+    draw_mesh,
     lamp,
     shadow_map,
 )
-from scm_world.backends.renderer.meshes import Ground, Triangles, draw_ground, draw_mesh
-from scm_world.backends.renderer.views import camera_view
 from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Goal, Light
@@ -44,16 +45,7 @@ SHADOW_TEXELS = 256
 GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 SKY = (178, 199, 222)  # red, green, blue
 
-THREE_QUARTER = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
-"""From what is seen towards an automatic camera."""
-
-AUTOMATIC = "automatic"
-"""The name of a camera that is placed here."""
-
-FIELD_OF_VIEW = 40.0  # [deg] of an automatic camera
-MARGIN = 1.3  # how much more an automatic camera sees than it has to
 AROUND = 2.0  # how much larger the square of a shadow is than that of what moves
-STILL = 0.05  # of the distance: how far from the middle of a picture is near it
 
 
 def draw_shapes(
@@ -129,11 +121,11 @@ def _draw_clear(shape: Shape, view: View, towards: Floats, canvas: Canvas) -> No
         draw_mesh(mesh, view, towards, alpha, nearest)
 
 
-def _table(shapes: Sequence[Shape]) -> Bodies:
+def _table(shapes: Sequence[Shape]) -> SolidTable:
     """Collect the shapes that are neither meshes nor planes."""
     round_ = [shape for shape in shapes if shape.kind in SOLIDS]
     n = len(round_)
-    return Bodies(
+    return SolidTable(
         np.array([SOLIDS[shape.kind] for shape in round_], dtype=np.int64),
         np.array([shape.position for shape in round_]).reshape(n, 3),
         np.array([shape.rotation for shape in round_]).reshape(n, 3, 3),
@@ -182,7 +174,7 @@ def _shadow(plane: Shape, others: Sequence[Shape], light: Light) -> tuple[Floats
     above = [shape for shape in above if corners(shape)[:, 2].max() > 0.0]
     if not above or towards[2] < LOWEST:
         return NO_SHADOW, np.zeros(3)
-    points = _corners_of_what_moves(above)
+    points = corners_of_what_moves(above)
     feet = points[:, :2] - np.maximum(points[:, 2:], 0.0) * towards[:2] / towards[2]
     low, high = feet.min(axis=0), feet.max(axis=0)
     middle, half = (low + high) / 2.0, max(AROUND * float((high - low).max()) / 2.0, 1e-6)
@@ -198,62 +190,7 @@ def _shadow(plane: Shape, others: Sequence[Shape], light: Light) -> tuple[Floats
     return map_, np.array([*middle, half])
 
 
-def framing(
-    shapes: Sequence[Shape], size: tuple[int, int], direction: Floats = THREE_QUARTER
-) -> Camera:
-    """Place a camera so that it sees everything that moves, or all there is if nothing does.
-
-    Planes do not count.
-
-    Args:
-        shapes: What there is; the same shape can be there at several places.
-        size: Height and width of the picture [pixels].
-        direction: Unit vector from what is seen towards the camera, shape (3,).
-    """
-    points = _corners_of_what_moves(shapes)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    height, width = size
-    camera = _looking(AUTOMATIC, middle, direction, size)
-    right, up, back = camera.axes() @ (points - middle).T
-    slope = math.tan(math.radians(camera.field_of_view) / 2.0) / MARGIN
-    distance = float((back + np.maximum(np.abs(right) * height / width, np.abs(up)) / slope).max())
-    distance = max(distance, 1e-6)
-    return _looking(AUTOMATIC, middle, distance * direction, size)
-
-
-def following(camera: Camera, shapes: Sequence[Shape]) -> Camera:
-    """Move a camera along with what moves, once that is away from the middle of the picture.
-
-    Args:
-        camera: That of the last picture; it keeps its direction.
-        shapes: What there is now.
-    """
-    points = _corners_of_what_moves(shapes)
-    eye, target = np.array(camera.eye), np.array(camera.target)
-    away = (points.min(axis=0) + points.max(axis=0)) / 2.0 - target
-    free, off = STILL * np.linalg.norm(eye - target), np.linalg.norm(away)
-    if off <= free:
-        return camera
-    step = away * (1.0 - free / off)
-    return replace(camera, eye=tuple((eye + step).tolist()), target=tuple((target + step).tolist()))
-
-
-def _looking(name: str, at: Floats, offset: Floats, size: tuple[int, int]) -> Camera:
-    """Place a camera at an offset from what it looks at."""
-    distance = float(np.linalg.norm(offset))
-    return Camera(
-        name,
-        tuple((at + offset).tolist()),
-        tuple(at.tolist()),
-        field_of_view=FIELD_OF_VIEW,
-        height=size[0],
-        width=size[1],
-        near=0.01 * distance,
-        far=100.0 * distance,
-    )
-
-
-def _corners_of_what_moves(shapes: Sequence[Shape]) -> Floats:
+def corners_of_what_moves(shapes: Sequence[Shape]) -> Floats:
     """Give the corners of everything that moves, of all there is if nothing does, (n, 3) [m]."""
     seen = [shape for shape in shapes if shape.kind != "plane" and shape.color[3] > 0.0]
     seen = [shape for shape in seen if shape.moves] or seen

@@ -15,7 +15,7 @@ from scm_world.graph import flatten
 from scm_world.policies.planning.model import Model
 from scm_world.policies.planning.scores import Score, as_score, nearness
 from scm_world.policies.planning.search import Found, Search, search
-from scm_world.tasks.policies import action_range
+from scm_world.tasks.base import action_range
 from scm_world.world import World
 
 

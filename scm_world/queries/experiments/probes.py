@@ -16,8 +16,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
-from scm_world.tasks.experiments import Dice, Scenario
-from scm_world.tasks.policies import action_range
+from scm_world.tasks.base import Dice, Scenario, action_range
 from scm_world.variables import Box, Exogenous, Measured, Noise, Rotations, Variable
 from scm_world.world import World, WorldSnapshot
 

@@ -13,13 +13,17 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.filling import overlap_fraction_kernel
 from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.geometry.rotations import rotation_matrix
+from scm_world.tasks.base import Observed
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import FRACTION, FULFILLED, SUCCESS, UNIT, above, reward
 from scm_world.tasks.trifinger import hardware, kernels
-from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.base import (
+    TriFingerTask,
+    observe_goal,
+    observe_obstacle,
+    observe_tool,
+)
 from scm_world.tasks.trifinger.feasibility import fingers_reach
-from scm_world.tasks.trifinger.observed import observe_goal, observe_obstacle, observe_tool
 from scm_world.variables import Function, Integers, Measured, Variable
 from scm_world.variables.mechanisms import Stacked
 

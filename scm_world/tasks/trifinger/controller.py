@@ -1,4 +1,4 @@
-"""The joint controller, specified once; every engine realises it and must match it."""
+"""The joint controller and how finely time is cut, specified once for every engine."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scm_world._types import Floats
+from scm_world.errors import UnknownOption
 from scm_world.models.scene import ControlMode
 
 TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, whatever the preset
@@ -59,3 +60,37 @@ class ControllerSpec:
         damped = inner - np.tile(self.safety, 3) * velocities
         safe: Floats = np.clip(damped, -self.limit, self.limit)
         return safe
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Numerical settings that every engine understands in its own way.
+
+    Attributes:
+        name: ``"fast"`` or ``"precise"``.
+        timestep: Physics step [s].
+    """
+
+    name: str
+    timestep: float
+
+
+FAST = Preset("fast", 0.004)
+PRECISE = Preset("precise", 0.002)
+
+PRESETS = {preset.name: preset for preset in (FAST, PRECISE)}
+
+PRESET_NAMES = tuple(PRESETS)
+"""What the categories of ``timestep_preset`` stand for."""
+
+
+def preset(name: str) -> Preset:
+    """Look a preset up by its name.
+
+    Raises:
+        UnknownOption: There is no such preset.
+    """
+    try:
+        return PRESETS[name]
+    except KeyError:
+        raise UnknownOption("preset", name, PRESETS) from None

@@ -15,11 +15,12 @@ from scm_world.backends.renderer.bodies import (
     CAPSULE,
     ELLIPSOID,
     NOTHING,
-    Bodies,
+    SolidTable,
     empty_bodies,
     goal_bodies,
     turn_kernel,
 )
+from scm_world.backends.renderer.drawing import Drawing
 from scm_world.backends.renderer.kernels import (
     SHADOW,
     Canvas,
@@ -29,12 +30,12 @@ from scm_world.backends.renderer.kernels import (
     View,
     brightness,
     byte,
+    camera_view,
     draw,
     shade_at,
 )
-from scm_world.backends.renderer.light import NO_COLORS, NO_SHADOW, lamp, shadow_map
+from scm_world.backends.renderer.meshes import NO_COLORS, NO_SHADOW, lamp, shadow_map
 from scm_world.backends.renderer.shapes import GOAL_OPACITY
-from scm_world.backends.renderer.views import camera_view
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Light, Scene
@@ -67,12 +68,12 @@ class Content(NamedTuple):
         shadow: How dark the floor is; None where shadows are not drawn.
     """
 
-    bodies: Bodies
+    bodies: SolidTable
     shadow: Floats | None
 
 
-class TriFingerDrawing:
-    """How scenes of the robot are drawn; see ``backends.renderer.drawing.Drawing``."""
+class TriFingerDrawing(Drawing):
+    """How scenes of the robot are drawn."""
 
     overview = OVERVIEW
     cameras = CAMERAS
@@ -236,7 +237,7 @@ def lit_arena(camera: Camera, light: Light, colors: Palette) -> Colors:
     return paint_arena(empty_arena(camera), camera_view(camera, 1), light, colors)
 
 
-def solid_bodies(scene: Scene) -> Bodies:
+def solid_bodies(scene: Scene) -> SolidTable:
     """List the hub, the links, the blocks and the obstacles of a scene."""
     structure, parameters, state = scene.structure, scene.parameters, scene.state
     names = (*structure.blocks, *structure.obstacles)
@@ -287,7 +288,7 @@ _ROBOT_OWNERS = np.array([ROBOT, *(_LINKS + ROBOT + 1)])
 
 @njit(cache=True)
 def _hang(
-    origins: Floats, orientations: Floats, centers: Floats, turns: Floats, bodies: Bodies
+    origins: Floats, orientations: Floats, centers: Floats, turns: Floats, bodies: SolidTable
 ) -> None:
     """Hang one capsule into each frame of the fingers, behind the hub."""
     frame = np.empty((3, 3))
@@ -303,7 +304,7 @@ def _hang(
                     bodies.rotations[n + 1, i, j] += frame[i, k] * turns[kind, k, j]
 
 
-def _place_robot(bodies: Bodies, scene: Scene) -> None:
+def _place_robot(bodies: SolidTable, scene: Scene) -> None:
     """Write the first rows: the hub and the fingers."""
     height = float(scene.parameters["robot", "height"])
     bodies.shapes[:N_ROBOT] = _ROBOT_SHAPES

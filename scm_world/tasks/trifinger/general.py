@@ -10,7 +10,7 @@ from typing import Any, Unpack, final
 import numpy as np
 
 from scm_world._types import Floats, Values
-from scm_world.tasks.arguments import checked
+from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -19,7 +19,7 @@ from scm_world.tasks.trifinger.building import Building
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
-from scm_world.tasks.trifinger.generated import MASS, blocks_mass, part_goal, part_tool
+from scm_world.tasks.trifinger.shapes import MASS, blocks_mass, part_goal, part_tool
 from scm_world.variables import Box, Derived, Exogenous, Function, Variable
 
 COUNT = "nums_objects"

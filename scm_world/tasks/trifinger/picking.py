@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.geometry.coordinates import from_cylindrical
-from scm_world.tasks.arguments import checked
+from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, term
 from scm_world.tasks.trifinger import catalogue as numbers

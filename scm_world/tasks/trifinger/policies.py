@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
-from scm_world.tasks.policies import Blind, kept_rows
+from scm_world.tasks.base import Blind, kept_rows
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Grasp
 from scm_world.tasks.trifinger.kinematics import forward, inverse

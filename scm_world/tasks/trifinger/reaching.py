@@ -11,16 +11,14 @@ from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.geometry.scalars import fused, scalar
-from scm_world.tasks.arguments import checked
+from scm_world.tasks.base import Observed, checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.observed import Observed
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, term
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, kernels, shaping
-from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.base import TriFingerTask, observe_obstacle, observe_position
 from scm_world.tasks.trifinger.entities.goals import GoalSphere
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.observed import observe_obstacle, observe_position
 from scm_world.tasks.trifinger.scattered import COUNT, MOST, obstacle_names, scattered, scattering
 from scm_world.variables import Cylinder, Draw, Function, Integers, Measured, Parent, Variable
 from scm_world.variables.kinds import SpaceName

@@ -12,7 +12,7 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ModelError
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull, extents
-from scm_world.tasks.arguments import checked
+from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, UNIT, Common, term
 from scm_world.tasks.trifinger import catalogue as numbers

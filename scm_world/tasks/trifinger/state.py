@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any, final
 
 from scm_world._types import Floats
-from scm_world.models.state import State, StateLayout
+from scm_world.models.scene import State, StateLayout
 from scm_world.tasks.trifinger.hardware import N_JOINTS
 
 ROBOT_SIZE = 3 * N_JOINTS

@@ -12,11 +12,9 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.geometry.hulls import Hull
-from scm_world.models.scene import ParameterKey, Parameters, Scene
-from scm_world.models.state import State, StateLayout
+from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.controller import ControllerSpec
-from scm_world.tasks.trifinger.presets import FAST, Preset
+from scm_world.tasks.trifinger.controller import FAST, ControllerSpec, Preset
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState, state_layout
 
 ARENA_HALF_WIDTH = 0.15  # [m]

@@ -9,7 +9,7 @@ from typing import Any, Unpack, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.tasks.arguments import checked
+from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -18,7 +18,7 @@ from scm_world.tasks.trifinger.building import Building
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
-from scm_world.tasks.trifinger.generated import (
+from scm_world.tasks.trifinger.shapes import (
     MASS,
     MOST_PARTS,
     blocks_mass,

@@ -4,60 +4,143 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Contact
 from scm_world.backends.bullet.client import Client
 from scm_world.backends.bullet.model.build import Built, build, solid
 from scm_world.backends.bullet.model.forces import Forces
-from scm_world.backends.bullet.model.frames import Ball, Frame
-from scm_world.backends.bullet.model.friction import shares, usual_friction
-from scm_world.backends.bullet.model.support import changes, unsupported
-from scm_world.backends.bullet.values import Values, normalize, plain_state
+from scm_world.backends.bullet.model.support import changes, shares, unsupported, usual_friction
+from scm_world.backends.bullet.values import Values
 from scm_world.errors import ModelError, NotIntervenable, UnknownOption
 from scm_world.models.bodies import Bodies
 from scm_world.models.model import Model
 from scm_world.models.scene import ControlMode, ParameterKey
-from scm_world.models.state import State
+
+Numbers = Sequence[float]
 
 
-class Scalars(NamedTuple):
-    """Hinges and slides of one multibody.
+@final
+class Frame:
+    """The frame of a free body.
 
-    Attributes:
-        multibody: Its number.
-        links: Their links.
-        places: Where they begin in the state, and their references.
+    Args:
+        multibody: Its number in the engine.
+        start: Where its joint begins in the state.
+        center: Center of mass in the frame of the body [m].
+        axes: From the principal axes of inertia to the frame of the body (x, y, z, w).
     """
 
-    multibody: int
-    links: list[int]
-    places: list[tuple[int, float]]
+    def __init__(self, multibody: int, start: int, center: Numbers, axes: Numbers) -> None:
+        self.multibody, self.start = multibody, start
+        self._center, self._axes = center, axes
+        self._back = (-axes[0], -axes[1], -axes[2], axes[3])
+
+    def to_engine(self, state: list[float]) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+        """Turn the state of the body into what the engine has.
+
+        Returns:
+            Position of the center and orientation of the principal axes, velocity of the center
+            and angular velocity, all in the world.
+        """
+        at = self.start
+        turn, linear = state[at + 3 : at + 7], state[at + 7 : at + 10]
+        arm, spin = rotated(turn, self._center), rotated(turn, state[at + 10 : at + 13])
+        return (
+            [state[at + k] + arm[k] for k in range(3)],
+            composed(turn, self._axes),
+            _carried(linear, spin, arm, 1.0),
+            spin,
+        )
+
+    def from_engine(
+        self, pose: tuple[Numbers, Numbers], twist: tuple[Numbers, Numbers]
+    ) -> list[float]:
+        """Turn what the engine has into the state of the body, with a quaternion whose w >= 0.
+
+        The engine keeps a matrix: which of two quaternions it makes of it has no meaning.
+        """
+        (position, orientation), (linear, spin) = pose, twist
+        turn = composed(orientation, self._back)
+        if turn[3] < 0.0:
+            turn = [-part for part in turn]
+        arm = rotated(turn, self._center)
+        back = (-turn[0], -turn[1], -turn[2], turn[3])
+        return [
+            position[0] - arm[0],
+            position[1] - arm[1],
+            position[2] - arm[2],
+            *turn,
+            *_carried(linear, spin, arm, -1.0),
+            *rotated(back, spin),
+        ]
 
 
-class Drive(NamedTuple):
-    """Hinges and slides of one multibody that are told forces.
+@final
+class Ball:
+    """A ball joint. The engine has it about the principal axes of the body.
 
-    Attributes:
-        multibody: Its number.
-        links: Their links.
-        dofs: Their degrees of freedom.
+    Args:
+        multibody: Its number in the engine.
+        link: Its link.
+        start: Where it begins in the state.
+        axes: From the principal axes of inertia to the frame of the body (x, y, z, w).
     """
 
-    multibody: int
-    links: list[int]
-    dofs: list[int]
+    def __init__(self, multibody: int, link: int, start: int, axes: Numbers) -> None:
+        self.multibody, self.link, self.start = multibody, link, start
+        self._axes = axes
+        self._back = (-axes[0], -axes[1], -axes[2], axes[3])
+
+    def to_engine(self, state: list[float]) -> tuple[Numbers, Numbers]:
+        """Turn the state of the joint into orientation and angular velocity in the engine."""
+        at = self.start
+        turn, spin = state[at : at + 4], state[at + 4 : at + 7]
+        return composed(composed(self._back, turn), self._axes), rotated(self._back, spin)
+
+    def from_engine(self, turn: Numbers, spin: Numbers) -> list[float]:
+        """Turn what the engine has into the state of the joint."""
+        own = composed(composed(self._axes, turn), self._back)
+        return [*own, *rotated(self._axes, spin)]
+
+    def torque(self, torque: Numbers) -> Numbers:
+        """Turn a torque in the frame of the body into one about the principal axes."""
+        return rotated(self._back, torque)
 
 
-@lru_cache(maxsize=64)
-def _rotations(model: Model) -> tuple[int, ...]:
-    """List where in the state quaternions begin."""
-    slices = model.layout.slices
-    return tuple(slices[row.name].start for row in model.states if row.kind == "rotation")
+def rotated(turn: Numbers, v: Numbers) -> Numbers:
+    """Rotate a vector by a unit quaternion (x, y, z, w)."""
+    x, y, z, w = turn
+    a, b, c = v
+    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return (
+        a + w * p + (y * r - z * q),
+        b + w * q + (z * p - x * r),
+        c + w * r + (x * q - y * p),
+    )
+
+
+def composed(p: Numbers, q: Numbers) -> Numbers:
+    """Compose two rotations (x, y, z, w): first q, then p."""
+    a, b, c, d = p
+    x, y, z, w = q
+    return (
+        d * x + a * w + b * z - c * y,
+        d * y + b * w + c * x - a * z,
+        d * z + c * w + a * y - b * x,
+        d * w - a * x - b * y - c * z,
+    )
+
+
+def _carried(linear: Numbers, spin: Numbers, arm: Numbers, sign: float) -> Numbers:
+    """Give the velocity of the point at an arm from the one that has the linear velocity."""
+    return (
+        linear[0] + sign * (spin[1] * arm[2] - spin[2] * arm[1]),
+        linear[1] + sign * (spin[2] * arm[0] - spin[0] * arm[2]),
+        linear[2] + sign * (spin[0] * arm[1] - spin[1] * arm[0]),
+    )
 
 
 @final
@@ -113,22 +196,12 @@ class ModelClient(Client):
         return [row.key for row in structure.parameters if known.get(row.key) == "rebuilt"]
 
     @staticmethod
-    def settle(structure: Model, given: State) -> list[float]:
-        """Turn a state into plain numbers, with unit quaternions of either sign."""
-        plain = plain_state(structure, given)
-        normalize(plain, _rotations(structure))
-        return plain
-
-    @staticmethod
     def rotations(structure: Model) -> Sequence[int]:
         """List where in the state the quaternions begin."""
-        return _rotations(structure)
+        slices = structure.layout.slices
+        return [slices[row.name].start for row in structure.states if row.kind == "rotation"]
 
     # --- bodies ----------------------------------------------------------------------------------
-
-    def furnish(self) -> None:
-        """Set how the engine works; nothing stands in every scene."""
-        self.set_solver()
 
     def construct(self, structure: Model, parameters: Values) -> None:
         """Make everything anew, unless only other parameters differ from what is there."""
@@ -157,7 +230,7 @@ class ModelClient(Client):
         self._size = size
         self._frames: list[Frame] = []
         self._ball_joints: dict[int, Ball] = {}
-        scalars: dict[int, Scalars] = {}
+        scalars: dict[int, tuple[list[int], list[tuple[int, float]]]] = {}
         for number, joint in enumerate(bodies.joints):
             multibody, link = built.joints[number]
             if joint.kind == "free":
@@ -168,10 +241,10 @@ class ModelClient(Client):
                 axes = bodies.bodies[joint.body].axes if last else (0.0, 0.0, 0.0, 1.0)
                 self._ball_joints[number] = Ball(multibody, link, joint.start, axes)
             else:
-                found = scalars.setdefault(multibody, Scalars(multibody, [], []))
-                found.links.append(link)
-                found.places.append((joint.start, joint.reference))
-        self._scalars = list(scalars.values())
+                links, places = scalars.setdefault(multibody, ([], []))
+                links.append(link)
+                places.append((joint.start, joint.reference))
+        self._scalars = [(multibody, *both) for multibody, both in scalars.items()]
 
     def pose(self, parameters: Values, state: list[float]) -> None:
         """Put all that moves in its place, and make the engine forget what touched what."""
@@ -285,14 +358,14 @@ class ModelClient(Client):
             for number, ball in self._ball_joints.items()
             if number in forces.driven
         ]
-        drives: dict[int, Drive] = {}
+        drives: dict[int, tuple[list[int], list[int]]] = {}
         for number in forces.driven:
             multibody, link = built.joints[number]
             if number not in self._ball_joints:
-                found = drives.setdefault(multibody, Drive(multibody, [], []))
-                found.links.append(link)
-                found.dofs.append(forces.dofs[number])
-        self._drives = list(drives.values())
+                links, dofs = drives.setdefault(multibody, ([], []))
+                links.append(link)
+                dofs.append(forces.dofs[number])
+        self._drives = [(multibody, *both) for multibody, both in drives.items()]
 
     def parameter(self, key: ParameterKey) -> Floats:
         """Ask the engine for a parameter: mass, inertia, gravity and step; it has no others."""
@@ -303,8 +376,7 @@ class ModelClient(Client):
         _, row, parts = self._bodies.places[key]
         field = parts[0].field
         if field == "gravity":
-            physics = engine.getPhysicsEngineParameters(physicsClientId=handle)
-            return np.array([physics[f"gravityAcceleration{axis}"] for axis in "XYZ"])
+            return self.gravity()
         if field == "timestep":
             physics = engine.getPhysicsEngineParameters(physicsClientId=handle)
             return np.array(physics["fixedTimeStep"])
@@ -313,17 +385,12 @@ class ModelClient(Client):
             return np.array(info[0] if field == "mass" else info[2])
         return value
 
-    def inertia(self, body: str) -> Floats:
-        """Ask for the principal moments of inertia of a body that can move [kg m²].
-
-        Raises:
-            UnknownOption: There is no such body.
-        """
+    def carrier(self, body: str) -> tuple[int, int]:
+        """Give multibody and link that carry the mass of a body that can move."""
         names = {self._bodies.bodies[number].name: number for number in self._built.bodies}
         if body not in names:
             raise UnknownOption("body", body, names)
-        place = self._built.bodies[names[body]]
-        return np.array(self.engine.getDynamicsInfo(*place, physicsClientId=self.handle)[2])
+        return self._built.bodies[names[body]]
 
     # --- steps -----------------------------------------------------------------------------------
 
@@ -350,17 +417,6 @@ class ModelClient(Client):
             step(physicsClientId=handle)
         return []
 
-    def contacts(self) -> tuple[Contact, ...]:
-        """List the points that touch or press."""
-        owners = self._built.owners
-        return tuple(
-            Contact(
-                bodies=(owners[point[1], point[3]], owners[point[2], point[4]]),
-                position=(np.array(point[5]) + np.array(point[6])) / 2,
-                normal=-np.array(point[7]),  # the engine's points to the first body
-                depth=-point[8],
-                force=point[9],
-            )
-            for point in self.engine.getContactPoints(physicsClientId=self.handle)
-            if point[8] <= 0.0 or point[9] > 0.0
-        )
+    def owner(self, multibody: int, link: int) -> str:
+        """Name the body that a shape of the engine belongs to."""
+        return self._built.owners[multibody, link]

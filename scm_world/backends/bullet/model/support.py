@@ -2,14 +2,50 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Literal
 
-from scm_world.backends.bullet.model.friction import worst_pairs
 from scm_world.models.bodies import Bodies, Joint
 from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey
+
+
+def shares(bodies: Bodies, usual: float) -> list[float]:
+    """Give each shape a number, so that a contact has the product of two as its friction.
+
+    A model says the larger of two coefficients. The product is that wherever a moving shape
+    touches fixed ones that are all alike, and wherever one of two moving shapes has the usual
+    coefficient and the other at least that, if the floor has no more than it. The number of a
+    moving shape depends on its own coefficient and on that of the first fixed shape alone, so
+    that shapes which never touch leave one another alone to the last bit.
+
+    Args:
+        bodies: All of them, with the coefficients in force.
+        usual: See ``usual_friction``.
+    """
+    fixed = [not bodies.roots[geom.body] for geom in bodies.geoms]
+    coefficients = [0.0 if geom.slippery else geom.friction for geom in bodies.geoms]
+    measure = next((c for c, still in zip(coefficients, fixed, strict=True) if still), None)
+    if not measure:  # nothing is fixed, or it is smooth: the other shape decides
+        scale = math.sqrt(usual) if measure is None and usual else 1.0
+        return [
+            (c or 1.0) if still else c / scale for c, still in zip(coefficients, fixed, strict=True)
+        ]
+    scale = math.sqrt(max(measure, usual))
+    return [
+        c / measure * scale if still else max(c, measure) / scale
+        for c, still in zip(coefficients, fixed, strict=True)
+    ]
+
+
+def usual_friction(bodies: Bodies) -> float:
+    """Give the coefficient in the middle of those of the moving shapes, as in the model's file."""
+    moving = [geom for geom in bodies.geoms if bodies.roots[geom.body]]
+    return statistics.median_low([0.0 if g.slippery else g.friction for g in moving] or [0.0])
+
 
 MOST_LINKS = 127
 """The engine has room for no more of them in a multibody."""
@@ -92,38 +128,11 @@ def _links(bodies: Bodies, members: list[int]) -> int:
     return links
 
 
-def deviations(model: Model) -> tuple[str, ...]:
-    """List what the engine does in another way than the file says, one sentence each."""
-    bodies = model.bodies
-    found = list(bodies.notes)
-    if any(joint.range is not None for joint in bodies.joints):
-        found.append("Limits of joints are stiff.")
-    if bodies.touching:
-        found.append("Contacts are stiff: solref and solimp have no meaning.")
-    if any(joint.friction for joint in bodies.joints):
-        found.append("Dry friction of joints is a motor that holds still.")
-    off = worst_pairs(bodies)
-    if off:
-        first, second, has, wanted = max(off, key=lambda pair: abs(pair[2] - pair[3]))
-        names = bodies.geoms[first].name, bodies.geoms[second].name
-        found.append(
-            f"The friction of {len(off)} of {len(bodies.touching)} pairs of shapes is not the "
-            f"larger of two coefficients: that of {names[0]!r} and {names[1]!r} is {has:.3g} "
-            f"instead of {wanted:.3g}."
-        )
-    return tuple(found)
-
-
 def supports(model: Model, key: ParameterKey) -> bool:
     """Tell whether a parameter of a model can be set: the engine has it, or only pictures do."""
     return key in changes(model.bodies) or any(
         row.key == key and row.visual for row in model.parameters
     )
-
-
-def parameters_without(model: Model) -> tuple[ParameterKey, ...]:
-    """List the parameters of a model that the engine lacks: they keep their defaults."""
-    return tuple(row.key for row in model.parameters if not supports(model, row.key))
 
 
 @lru_cache(maxsize=64)

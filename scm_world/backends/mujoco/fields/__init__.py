@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import mujoco
 
-from scm_world.backends.mujoco.fields.bodies import bodies, joints
+from scm_world.backends.mujoco.fields.bodies import bodies, joints, shapes
 from scm_world.backends.mujoco.fields.drives import (
     actuators,
     control_unit,
@@ -23,7 +23,6 @@ from scm_world.backends.mujoco.fields.drives import (
     tendon_unit,
     tendons,
 )
-from scm_world.backends.mujoco.fields.names import clean, element_names
 from scm_world.backends.mujoco.fields.rows import (
     FREE,
     HINGE,
@@ -32,10 +31,12 @@ from scm_world.backends.mujoco.fields.rows import (
     Field,
     Scope,
     Slots,
+    clean,
+    element_names,
     least,
 )
-from scm_world.backends.mujoco.fields.shapes import shapes
-from scm_world.backends.mujoco.slots import Option, Place, Slot
+from scm_world.backends.mujoco.slots import Slot, place
+from scm_world.backends.mujoco.slots import option as option_slot
 from scm_world.backends.mujoco.trees import Couplings, Effect
 from scm_world.models.scene import ParameterKey
 
@@ -94,11 +95,11 @@ def options(scope: Scope) -> Iterator[Field]:
         return trees.always(trees.every)
 
     def option(name: str) -> Slots:
-        return lambda mj, _: Option(mj.opt, name)
+        return lambda mj, _: option_slot(mj.opt, name)
 
     yield Field(
         "option", "", "gravity", "m/s^2", "Acceleration that acts on every mass.",
-        lambda mj, _: Place(mj.opt.gravity), everything,
+        lambda mj, _: place(mj.opt.gravity), everything,
         refusal=scope.off(OFF.mjDSBL_GRAVITY, "gravity"),
     )  # fmt: skip
     yield Field(
@@ -107,7 +108,7 @@ def options(scope: Scope) -> Iterator[Field]:
     )  # fmt: skip
     yield Field(
         "option", "", "wind", "m/s", "Velocity of the medium.",
-        lambda mj, _: Place(mj.opt.wind), everything,
+        lambda mj, _: place(mj.opt.wind), everything,
         refusal="" if scope.fluid else "acts on nothing: density and viscosity are zero",
     )  # fmt: skip
     for name, unit in (("density", "kg/m^3"), ("viscosity", "Pa s")):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -20,7 +21,7 @@ from scm_world.backends.mujoco.fields.rows import (
     least,
     solver_rows,
 )
-from scm_world.backends.mujoco.slots import Gain
+from scm_world.backends.mujoco.slots import gain as gain_slot
 
 _TRN, _WRAP = mujoco.mjtTrn, mujoco.mjtWrap
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
@@ -111,17 +112,13 @@ def equalities(scope: Scope) -> Iterator[Field]:
     mj = scope.mj
     curves = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)
     for equality in range(mj.neq):
-        row = scope.rows("equality", equality, _joined(scope, equality))
+        row = scope.rows("equality", equality, partial(scope.trees.equality, equality))
         yield from solver_rows(row, mj, "eq", equality, usual=False)
         if mj.eq_type[equality] in curves:
             yield row(
                 "polycoef", "1", "Coefficients of the polynomial that gives one from the other.",
                 at("eq_data", equality, slice(5), constant=True), usual=False,
             )  # fmt: skip
-
-
-def _joined(scope: Scope, equality: int) -> Callable[[], Any]:
-    return lambda: scope.trees.equality(equality)
 
 
 # --- actuators ---------------------------------------------------------------------------------
@@ -232,18 +229,32 @@ def _law(mj: mujoco.MjModel, actuator: int, row: Callable[..., Field], off: str)
     about = "Force of the servo for each unit of "
     match servo(mj, actuator):
         case "position":
-            slot = _gain([(*gain, 0)], [(*bias, 1)])
+            slot = _gain((*gain, 0), (*bias, 1))
             yield row("kp", stiffness, about + "distance.", slot, low=0.0, refusal=off)
-            slot = _gain([], [(*bias, 2)])
+            slot = _gain((), (*bias, 2))
             yield row("kv", damping, about + "velocity.", slot, low=0.0, refusal=off)
         case "velocity":
-            slot = _gain([(*gain, 0)], [(*bias, 2)])
+            slot = _gain((*gain, 0), (*bias, 2))
             yield row("kv", damping, about + "velocity.", slot, low=0.0, refusal=off)
         case "damper":
-            slot = _gain([], [(*gain, 2)])
+            slot = _gain((), (*gain, 2))
             yield row("kv", "1", about + "velocity and control.", slot, low=0.0, refusal=off)
-        case _:
-            yield from _parameters(mj, actuator, row, off)
+        case _:  # gain and bias as MuJoCo has them
+            fixed = mj.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_FIXED)
+            kind = int(mj.actuator_biastype[actuator])
+            biased = bool(mj.actuator_biasprm[actuator, :3].any())
+            for present, name, usual, doc, at_ in (
+                (fixed, "gain", False, "Force for each unit of control.", at(*gain, 0)),
+                (not fixed, "gainprm", False, "Parameters of its gain, as MuJoCo numbers them.",
+                 at(*gain)),
+                (kind == int(_BIAS.mjBIAS_AFFINE), "bias", biased,
+                 "Force without control: constant, for each unit of length, of velocity.",
+                 at(*bias, slice(3))),
+                (kind not in (int(_BIAS.mjBIAS_AFFINE), int(_BIAS.mjBIAS_NONE)), "biasprm", False,
+                 "Parameters of its bias, as MuJoCo numbers them.", at(*bias)),
+            ):  # fmt: skip
+                if present:
+                    yield row(name, "1", doc, at_, usual=usual, refusal=off)
     times = _TIMES.get(int(mj.actuator_dyntype[actuator]), 0)
     if times:
         used = 0 if times == 1 else slice(times)
@@ -254,36 +265,10 @@ def _law(mj: mujoco.MjModel, actuator: int, row: Callable[..., Field], off: str)
         )  # fmt: skip
 
 
-def _gain(plus: Sequence[tuple[Any, ...]], minus: Sequence[tuple[Any, ...]]) -> Slots:
-    def places(mj: mujoco.MjModel, where: Sequence[tuple[Any, ...]]) -> list[Any]:
-        return [getattr(mj, array)[actuator, i, ...] for array, actuator, i in where]
+def _gain(plus: tuple[Any, ...], minus: tuple[Any, ...] = ()) -> Slots:
+    """Find a gain in two arrays of the model: each is an array, an actuator, and a column."""
 
-    return lambda mj, _: Gain(places(mj, plus), places(mj, minus))
+    def places(mj: mujoco.MjModel, where: tuple[Any, ...]) -> list[Any]:
+        return [getattr(mj, where[0])[where[1], where[2], ...]] if where else []
 
-
-def _parameters(
-    mj: mujoco.MjModel, actuator: int, row: Callable[..., Field], off: str
-) -> Iterator[Field]:
-    """Give gain and bias as MuJoCo has them."""
-    kinds = mj.actuator_gaintype[actuator], mj.actuator_biastype[actuator]
-    biased = bool(mj.actuator_biasprm[actuator, :3].any())
-    if kinds[0] == int(_GAIN.mjGAIN_FIXED):
-        yield row(
-            "gain", "1", "Force for each unit of control.",
-            at("actuator_gainprm", actuator, 0), usual=False, refusal=off,
-        )  # fmt: skip
-    else:
-        yield row(
-            "gainprm", "1", "Parameters of its gain, as MuJoCo numbers them.",
-            at("actuator_gainprm", actuator), usual=False, refusal=off,
-        )  # fmt: skip
-    if kinds[1] == int(_BIAS.mjBIAS_AFFINE):
-        yield row(
-            "bias", "1", "Force without control: constant, for each unit of length, of velocity.",
-            at("actuator_biasprm", actuator, slice(3)), usual=biased, refusal=off,
-        )  # fmt: skip
-    elif kinds[1] != int(_BIAS.mjBIAS_NONE):
-        yield row(
-            "biasprm", "1", "Parameters of its bias, as MuJoCo numbers them.",
-            at("actuator_biasprm", actuator), usual=False, refusal=off,
-        )  # fmt: skip
+    return lambda mj, _: gain_slot(places(mj, plus), places(mj, minus))

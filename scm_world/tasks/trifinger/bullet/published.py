@@ -23,9 +23,8 @@ from scm_world._types import Floats
 from scm_world.models.scene import ParameterKey
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.bullet import arena
-from scm_world.tasks.trifinger.bullet.client import TriFingerClient
-from scm_world.tasks.trifinger.bullet.description import link_index
-from scm_world.tasks.trifinger.bullet.dynamics import Bodies
+from scm_world.tasks.trifinger.bullet.arena import link_index
+from scm_world.tasks.trifinger.bullet.client import Handles, TriFingerClient
 
 ROBOT_DAMPING, BLOCK_DAMPING = 0.5, 0.04
 TABLE_TOP = -0.001  # [m] above it is the collision margin
@@ -72,7 +71,7 @@ class PublishedClient(TriFingerClient):
                 )
                 for name, flags in (("table", 0), ("wall", engine.GEOM_FORCE_CONCAVE_TRIMESH))
             )
-        self.bodies = Bodies(robot, floor, (stage,), spinning=SPINNING, ground=under)
+        self.bodies = Handles(robot, floor, (stage,), spinning=SPINNING, ground=under)
         engine.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=handle)
 
     def _still(self, shape: int, height: float) -> int:

@@ -1,17 +1,20 @@
-"""Boxes on a table, as a hand that comes from above sees them."""
+"""What a policy that grasps sees: boxes on a table, and the hand above them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Floats, Value
+from scm_world.errors import ActionError
+from scm_world.geometry import overlap_volume
 from scm_world.geometry.penetration import box_box_kernel
 from scm_world.geometry.rotations import rotation_kernel
+from scm_world.tasks.trifinger.grasping.hand import Hand
 
 QUARTER = math.pi / 2.0
 SKY = 10.0  # [m] above and below everything
@@ -31,7 +34,7 @@ def smallest(angle: float, period: float = 2.0 * math.pi) -> float:
 
 @final
 @dataclass(frozen=True)
-class Body:
+class Cuboid:
     """A box that stands on one of its faces.
 
     Attributes:
@@ -58,7 +61,7 @@ class Body:
         """Height of its lower face [m]."""
         return float(self.place[2] - self.half[2])
 
-    def at(self, place: Floats, yaw: float) -> Body:
+    def at(self, place: Floats, yaw: float) -> Cuboid:
         """Put it elsewhere."""
         return replace(self, place=place, yaw=yaw)
 
@@ -70,7 +73,7 @@ class Body:
         """Turn points of the world, shape (n, 3), into points of its own frame [m]."""
         return (points - self.place) @ turn_about_z(self.yaw)
 
-    def depth_in(self, other: Body, *, margin: float = 0.0, flat: bool = False) -> float:
+    def depth_in(self, other: Cuboid, *, margin: float = 0.0, flat: bool = False) -> float:
         """Measure how deep it lies in another one [m].
 
         Args:
@@ -87,7 +90,7 @@ class Body:
         return float(box_box_kernel(*first, other.half, other.place, turn_about_z(other.yaw)))
 
 
-def body_of(name: str, values: Mapping[str, Value]) -> Body:
+def body_of(name: str, values: Mapping[str, Value]) -> Cuboid:
     """See a box: which of its faces is below, and how it is turned about the vertical."""
     axes = np.empty((3, 3))
     rotation_kernel(np.asarray(values[f"{name}.orientation"], dtype=np.float64), axes)
@@ -96,10 +99,10 @@ def body_of(name: str, values: Mapping[str, Value]) -> Body:
     half = 0.5 * np.asarray(values[f"{name}.size"], dtype=np.float64)[[x, y, up]]
     place = np.array(values[f"{name}.cartesian_position"], dtype=np.float64)
     lean = axes[:2, up] if axes[2, up] > 0.0 else -axes[:2, up]
-    return Body(name, half, place, math.atan2(axes[1, x], axes[0, x]), lean)
+    return Cuboid(name, half, place, math.atan2(axes[1, x], axes[0, x]), lean)
 
 
-def turns(block: Body, goal: Body) -> tuple[float, ...]:
+def turns(block: Cuboid, goal: Cuboid) -> tuple[float, ...]:
     """List by how much a block may be turned to stand like its goal, the least first [rad].
 
     A box looks the same after half a turn, and after a quarter if it is as wide as it is deep.
@@ -116,7 +119,7 @@ def turns(block: Body, goal: Body) -> tuple[float, ...]:
     return tuple(sorted(fitting, key=abs))
 
 
-def solids(bodies: Iterable[Body], grow: float = 0.0) -> tuple[Floats, Floats, Floats]:
+def solids(bodies: Iterable[Cuboid], grow: float = 0.0) -> tuple[Floats, Floats, Floats]:
     """Gather half edges, centers and axes of boxes: shapes (n, 3), (n, 3) and (n, 3, 3)."""
     listed = list(bodies)
     if not listed:
@@ -126,3 +129,89 @@ def solids(bodies: Iterable[Body], grow: float = 0.0) -> tuple[Floats, Floats, F
         np.array([body.place for body in listed]),
         np.array([turn_about_z(body.yaw) for body in listed]),
     )
+
+
+LEAST_FRICTION = 0.05
+"""Friction that is reckoned with at least, so that no force is infinite."""
+
+FIRM = 0.6  # [N] with which even a block without weight is pressed
+MARGIN = 2.0
+"""How many times the force that just carries a block it is pressed with, besides."""
+
+_POSE = ("size", "cartesian_position", "orientation")
+
+
+@final
+class Sight:
+    """The present of a world, looked at once per control step.
+
+    Args:
+        world: With blocks that have goals.
+
+    Attributes:
+        hand: The robot.
+        joints: Its joint positions, shape (9,) [rad].
+        pairs: Blocks, each with its goal.
+        left: How many control steps the episode still has.
+
+    Raises:
+        ActionError: The task of the world has no blocks with goals.
+    """
+
+    hand: Hand
+    joints: Floats
+    pairs: tuple[tuple[str, str], ...]
+
+    def __init__(self, world: Any) -> None:
+        self._version = -1
+        self.look(world)
+
+    def look(self, world: Any) -> None:
+        """See how things are now."""
+        self._values: Mapping[str, Value] = world.evaluate(())
+        self.joints = np.array(self._values["joint_positions"])
+        self.left = world.max_episode_length - world.index
+        if self._version != world.version:
+            self._version = world.version
+            self._learn(world)
+
+    def _learn(self, world: Any) -> None:
+        """See what moves only when someone intervenes."""
+        self.hand = Hand(self._values, world.control_period)
+        self._solid = (*world.composition.blocks, *world.composition.obstacles)
+        task = world.compiled.task
+        targets = task.targets()
+        self.pairs = tuple(
+            (tool, goal)
+            for goal, tool in targets.items()
+            if tool in self._solid and f"{goal}.size" in self._values
+        )
+        if not self.pairs:
+            problem = f"a grasp needs blocks that have goals; {task.name!r} has none"
+            raise ActionError(problem, None)
+
+    def body(self, name: str) -> Cuboid:
+        """See a block, a goal or an obstacle."""
+        return body_of(name, self._values)
+
+    def solid(self) -> dict[str, Cuboid]:
+        """See everything that fingers could run into, by name."""
+        return {name: self.body(name) for name in self._solid}
+
+    def filled(self, tool: str, goal: str) -> float:
+        """Compute which share of a goal its block fills."""
+        poses = (self._values[f"{name}.{part}"] for name in (tool, goal) for part in _POSE)
+        return float(overlap_volume(*poses)) / float(np.prod(self._values[f"{goal}.size"]))
+
+    def weight(self, tool: str) -> float:
+        """Compute the weight of a block [N]."""
+        return float(self._values[f"{tool}.mass"]) * -float(self._values["gravity"][2])
+
+    def burden(self, tool: str) -> float:
+        """Compute with which force a block must be pressed from both sides to be carried [N]."""
+        friction = float(self._values["finger_friction"]) * float(self._values[f"{tool}.friction"])
+        return abs(self.weight(tool)) / (2.0 * max(friction, LEAST_FRICTION))
+
+    def wanted(self, tool: str) -> float:
+        """Choose with which force a block should be pressed [N]."""
+        return FIRM + MARGIN * self.burden(tool)

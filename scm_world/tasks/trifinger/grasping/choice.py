@@ -10,8 +10,7 @@ from typing import final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.tasks.trifinger.grasping.bodies import Body, turns
-from scm_world.tasks.trifinger.grasping.sight import Sight
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, Sight, turns
 from scm_world.tasks.trifinger.grasping.ways import Move, Planner, Way
 
 ENOUGH = 0.93
@@ -114,7 +113,7 @@ class Choice:
             )
         )
 
-    def _end(self, goal: str) -> Body:
+    def _end(self, goal: str) -> Cuboid:
         """Say where a block should be for its goal: a block that is held does not rub."""
         end = self._goals[goal]
         return end.at(end.place + lifted(self._kept == goal), end.yaw)
@@ -127,14 +126,14 @@ class Choice:
             if other != goal
         )
 
-    def _others(self, tool: str) -> list[Body]:
+    def _others(self, tool: str) -> list[Cuboid]:
         return [body for name, body in self._bodies.items() if name != tool]
 
-    def _best(self, tool: str, start: Body, ways: Iterable[Way], *, release: bool) -> Move | None:
+    def _best(self, tool: str, start: Cuboid, ways: Iterable[Way], *, release: bool) -> Move | None:
         planner = Planner(self._sight.hand, self._sight.joints, self._others(tool))
         return planner.best(start, ways, wanted=self._sight.wanted(tool), release=release)
 
-    def _make_way(self, tool: str, end: Body) -> Job | None:
+    def _make_way(self, tool: str, end: Cuboid) -> Job | None:
         """Move a block that stands where another one should go, or where its fingers would be."""
         start = self._bodies[tool]
         depth = {
@@ -181,7 +180,7 @@ class Choice:
                 if tried == TRIES:
                     return
 
-    def _is_free(self, tool: str, stop: Body) -> bool:
+    def _is_free(self, tool: str, stop: Cuboid) -> bool:
         """Tell whether a block can stand somewhere, with room for fingers and beside all goals."""
         near = ((body, ROOM) for body in self._others(tool))
         wide = ((body, ASIDE) for body in self._goals.values())
@@ -197,12 +196,12 @@ def lifted(held: bool) -> Floats:
     return np.array([0.0, 0.0, HOVER * held])
 
 
-def _length(start: Body, stop: Floats, end: Body) -> float:
+def _length(start: Cuboid, stop: Floats, end: Cuboid) -> float:
     """Measure a way over a stop, seen from above [m]."""
     return math.dist(start.place[:2], stop) + math.dist(stop, end.place[:2])
 
 
-def _differs(start: Body, stop: Body) -> bool:
+def _differs(start: Cuboid, stop: Cuboid) -> bool:
     """Tell whether it is worth the while to move a block."""
     far = math.dist(start.place[:2], stop.place[:2])
     return far > MOVED or abs(stop.yaw - start.yaw) > TURNED

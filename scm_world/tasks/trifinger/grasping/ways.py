@@ -1,21 +1,95 @@
-"""Which way to hold a block, and to bring it somewhere, is best."""
+"""How three fingers may take hold of a block, and which way to bring it somewhere is best."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import permutations, product
 from typing import final
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.grasping.bodies import Body, solids, turn_about_z
-from scm_world.tasks.trifinger.grasping.grips import OPENINGS, Grip, grips
-from scm_world.tasks.trifinger.grasping.hand import Hand
+from scm_world.tasks.trifinger.grasping.bodies import Cuboid, solids, turn_about_z
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
 
-Way = tuple[Body, float]
+LEVELS = (0.15, 0.4, 0.0)
+"""How high the fingertips are above the middle of a block, in halves of its height."""
+
+SPREADS = (0.55, 0.3)
+"""How far from the middle of a face its two fingertips are, in halves of its width."""
+
+OPENINGS = (0.025, 0.014)  # [m] between fingertip and face, open
+NARROWEST = 0.013  # [m] of a spread: fingers have room beside one another
+EDGE = 0.006  # [m] that fingertips keep away from edges
+
+_Point = tuple[float, float, float]
+
+
+@final
+@dataclass(frozen=True)
+class Grip:
+    """Where fingertips touch a block, in its own frame.
+
+    Attributes:
+        touch: Centers of the fingertips as they touch, shape (3, 3) [m].
+        inward: In which direction they press, each force as a share of the grip's, shape (3, 3).
+        used: Which fingers take part.
+        opening: How far from there they are while open [m].
+    """
+
+    touch: Floats
+    inward: Floats
+    used: tuple[bool, bool, bool]
+    opening: float
+
+    @property
+    def firm(self) -> bool:
+        """Whether all fingers take part, so that the block cannot swing."""
+        return all(self.used)
+
+    def points(self, opening: float) -> Floats:
+        """Give the fingertips at a distance from the faces, shape (3, 3) [m]."""
+        points: Floats = self.touch - opening * np.sign(self.inward)
+        return points
+
+
+def grips(block: Cuboid) -> Iterator[Grip]:
+    """List the ways to hold a block: one finger against two, or against one."""
+    for axis, level, opening in product((0, 1), LEVELS, OPENINGS):
+        out, along = block.half[axis] + TIP_RADIUS, block.half[1 - axis]
+        z = min(level * block.half[2], block.half[2] - TIP_RADIUS)
+        for side, spread in product((out, -out), SPREADS):
+            wide = min(max(spread * along, NARROWEST), along - EDGE)
+            three = ((side, 0.0, z), (-side, wide, z), (-side, -wide, z))
+            yield from _orders(axis, three, (1.0, 0.5, 0.5), opening)
+        two = ((out, 0.0, z), (-out, 0.0, z), (0.0, 0.0, z))
+        yield from _orders(axis, two, (1.0, 1.0, 0.0), opening)
+
+
+def _orders(
+    axis: int, places: Sequence[_Point], shares: Sequence[float], opening: float
+) -> Iterator[Grip]:
+    """List in which way three fingers can be at three places.
+
+    Args:
+        axis: Across which the block is pressed.
+        places: Across it, along the face, and upwards [m].
+        shares: Of the force.
+        opening: See ``Grip``.
+    """
+    for order in permutations(range(3)):
+        touch, inward = np.empty((3, 3)), np.zeros((3, 3))
+        for finger, (across, along, up), share in zip(order, places, shares, strict=True):
+            touch[finger] = (across, along, up) if axis == 0 else (along, across, up)
+            inward[finger, axis] = -np.sign(across) * share
+        one, two, three = (bool(row.any()) for row in inward)
+        yield Grip(touch, inward, (one, two, three), opening)
+
+
+Way = tuple[Cuboid, float]
 """Where a block shall be, and by how much it is turned on the way [rad]."""
 
 CROWDED = 0.003  # [m] that blocks may lie in one another at the end, as stacked ones do
@@ -56,8 +130,8 @@ class Move:
     """
 
     grip: Grip
-    start: Body
-    end: Body
+    start: Cuboid
+    end: Cuboid
     turn: float
     height: float
     above: float
@@ -76,14 +150,14 @@ class Planner:
         others: Everything else that stands in the world.
     """
 
-    def __init__(self, hand: Hand, joints: Floats, others: Iterable[Body]) -> None:
+    def __init__(self, hand: Hand, joints: Floats, others: Iterable[Cuboid]) -> None:
         self._hand, self._joints = hand, joints
         self._others = tuple(others)
         self._boxes = solids(self._others, CLEAR)
         self._aside = hand.tips(np.array(hardware.ASIDE)).reshape(3, 3)
 
     def best(
-        self, start: Body, ends: Iterable[Way], *, wanted: float, release: bool
+        self, start: Cuboid, ends: Iterable[Way], *, wanted: float, release: bool
     ) -> Move | None:
         """Find the best way to bring a block to one of some places.
 
@@ -114,7 +188,7 @@ class Planner:
                         best = move
         return best
 
-    def place(self, grip: Grip, body: Body, opening: float, above: float | None = None) -> Floats:
+    def place(self, grip: Grip, body: Cuboid, opening: float, above: float | None = None) -> Floats:
         """Place the fingertips about a block.
 
         Args:
@@ -135,7 +209,7 @@ class Planner:
 
     # --- heights ------------------------------------------------------------------------------
 
-    def _height(self, start: Body, end: Body) -> float:
+    def _height(self, start: Cuboid, end: Cuboid) -> float:
         """Find how high a block must be carried to pass over what stands in its way [m]."""
         height = max(float(start.place[2]) + CLEARANCE, float(end.place[2]))
         if math.dist(start.place[:2], end.place[:2]) < UPRIGHT:
@@ -147,13 +221,13 @@ class Planner:
                     height = max(height, other.top + float(start.half[2]) + CLEARANCE)
         return height
 
-    def _above(self, *blocks: Body) -> float:
+    def _above(self, *blocks: Cuboid) -> float:
         """Find a height at which fingertips pass over everything [m]."""
         return max(LOWEST, *(body.top + OVER for body in (*self._others, *blocks)))
 
     # --- judging ------------------------------------------------------------------------------
 
-    def _beginning(self, grip: Grip, start: Body) -> tuple[float, float]:
+    def _beginning(self, grip: Grip, start: Cuboid) -> tuple[float, float]:
         """Judge how a block is taken hold of: with which force [N], and how easily."""
         above = self._above(start)
         if not self._opens(grip, start, above):
@@ -178,14 +252,14 @@ class Planner:
             grip, start, move.end, move.turn, height, move.above, strength, worth, move.release
         )
 
-    def _strength(self, grip: Grip, body: Body) -> float:
+    def _strength(self, grip: Grip, body: Cuboid) -> float:
         """Find with which force a grip can hold a block somewhere [N]; 0 if it cannot."""
         joints, reached = self._hand.solve(self.place(grip, body, 0.0), self._joints)
         if not reached or self._depth(joints, body, -TOUCH) > 0.0:
             return 0.0
         return self._hand.strength(joints, grip.inward @ turn_about_z(body.yaw).T)
 
-    def _opens(self, grip: Grip, body: Body, above: float) -> bool:
+    def _opens(self, grip: Grip, body: Cuboid, above: float) -> bool:
         """Tell whether open fingers can be about a block, and above it."""
         tips = self.place(grip, body, grip.opening)
         joints, reached = self._hand.solve(tips, self._joints)
@@ -194,7 +268,7 @@ class Planner:
         over, reached = self._hand.solve(self.place(grip, body, grip.opening, above), joints)
         return reached and self._depth(over) <= 0.0
 
-    def _transit(self, grip: Grip, body: Body, above: float) -> float:
+    def _transit(self, grip: Grip, body: Cuboid, above: float) -> float:
         """Judge the way to the block: fingers should not meet; the shorter, the better."""
         first = self._hand.tips(self._joints)
         first[2::3] = np.maximum(first[2::3], above)
@@ -205,7 +279,7 @@ class Planner:
             worth -= MEETING * (self._depth(joints) > 0.0)
         return worth
 
-    def _depth(self, joints: Floats, block: Body | None = None, margin: float = 0.0) -> float:
+    def _depth(self, joints: Floats, block: Cuboid | None = None, margin: float = 0.0) -> float:
         """Measure how deep fingers lie in one another and in things [m]."""
         boxes = self._boxes
         if block is not None:

@@ -1,19 +1,25 @@
-"""From a structure to a compiled model; parameters have their defaults in it."""
+"""From a structure to a compiled model; parameters have their defaults in it.
+
+Stock settings cannot lift a block with three fingers, let it creep on a slope and make a fast one
+hover. A softer friction reference for contacts without fingers, elliptic cones and a high
+``impratio`` mend all three. Fingers keep the hard reference: they have to grip.
+
+Source:
+    Measured; see the parity table in ``docs/design``.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from functools import lru_cache
+from typing import Any
 
 import mujoco
 
-from scm_world.geometry.hulls import Hull
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.controller import ControllerSpec
 from scm_world.tasks.trifinger.hardware import FINGERS, link_name
-from scm_world.tasks.trifinger.mujoco.settings import Settings, settings, write_options
-from scm_world.tasks.trifinger.presets import Preset
 from scm_world.tasks.trifinger.structure import (
     SPINNING_FRICTION,
     WALL_HEIGHT,
@@ -27,10 +33,22 @@ FLOOR = "floor"
 STAGE = "stage"
 SHAPES = ("upper", "middle", "lower", "tip")  # in the order of the links 1, 2, 3 and 3
 
+CONTACT = {"fast": (0.010, 1.0), "precise": (0.004, 1.0)}
+"""Time constant [s] and damping ratio of contacts, by preset."""
+
+SLIDING = {"fast": (0.04, 1.0), "precise": (0.02, 1.0)}
+"""The same for friction between blocks, floor and stage."""
+
+IMPRATIO = 100.0  # stiffness of friction over stiffness of the normal
+MANY = 8
+"""From more blocks than this on, the Jacobian of the constraints is a sparse matrix."""
+
 _BLOCK_HALF = 0.0325  # [m] any positive size and mass do: parameters follow
 _BLOCK_MASS = 0.02  # [kg]
 _TORQUE_LIMIT = ControllerSpec().limit  # [N m] any positive one does
-_OBSTACLE_POSE = (0.1, 0.2, 0.3), (0.9, 0.1, 0.2, 0.3)  # MuJoCo fixes poses of zero for good
+_OBSTACLE_POSE = {"pos": (0.1, 0.2, 0.3), "quat": (0.9, 0.1, 0.2, 0.3)}
+"""MuJoCo fixes poses of zero for good."""
+
 _ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
 
 
@@ -40,14 +58,33 @@ def compiled(structure: Structure) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.modelname = "scm_world"
     spec.compiler.degree = False
-    write_options(spec, structure.preset, len(structure.blocks))
-    _add_arena(spec)
+    _write_options(spec, structure)
+    _add_arena(spec.worldbody)
+    box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": (_BLOCK_HALF,) * 3}
     for name in structure.obstacles:
-        _add_obstacle(spec, name)
-    _add_robot(spec, structure.preset)
+        _add_shape(spec.worldbody, name, **box, **_OBSTACLE_POSE)
+    _add_robot(spec, CONTACT[structure.preset.name])
     for name in structure.blocks:
-        _add_block(spec, name, structure.hull(name))
-    gripping, sliding = _pair_classes(spec, settings(structure.preset))
+        body, hull = spec.worldbody.add_body(name=name), structure.hull(name)
+        body.add_freejoint()
+        body.mass = _BLOCK_MASS
+        body.inertia = (_BLOCK_MASS / 6 * (2 * _BLOCK_HALF) ** 2,) * 3
+        body.explicitinertial = True
+        if hull is None:
+            _add_shape(body, name, **box)
+        else:  # MuJoCo moves a mesh into a frame of its own and the shape back by as much
+            mesh = spec.add_mesh(name=name)
+            mesh.uservert = [number for vertex in hull.vertices for number in vertex]
+            mesh.userface = [index for face in hull.faces for index in face]
+            _add_shape(body, name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+    contact, slide = (table[structure.preset.name] for table in (CONTACT, SLIDING))
+    gripping = spec.default
+    sliding = spec.add_default("sliding", gripping)
+    for kind, friction in ((gripping, contact), (sliding, slide)):
+        pair = kind.pair
+        pair.condim, pair.margin, pair.gap = 4, 0.0, 0.0
+        pair.solref, pair.solreffriction = contact, friction
+        pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
     for first, second, slides in contact_pairs(structure):
         spec.add_pair(sliding if slides else gripping, geomname1=first, geomname2=second)
     return spec.compile()
@@ -103,11 +140,8 @@ def contact_pairs(structure: Structure) -> Iterator[tuple[str, str, bool]]:
             for fixed in (FLOOR, *structure.obstacles)
             for shape in SHAPES[1:]
         )
-        yield from (
-            # Nothing but a tip reaches the ring: the knee stays within 0.232 m of the center.
-            (wall, shape_name(finger, "tip"), False)
-            for wall in walls
-        )
+        # Nothing but a tip reaches the ring: the knee stays within 0.232 m of the center.
+        yield from ((wall, shape_name(finger, "tip"), False) for wall in walls)
     for i, finger in enumerate(FINGERS):
         for other in FINGERS[i + 1 :]:
             yield from (
@@ -117,131 +151,106 @@ def contact_pairs(structure: Structure) -> Iterator[tuple[str, str, bool]]:
             )
 
 
-def _pair_classes(
-    spec: mujoco.MjSpec, chosen: Settings
-) -> tuple[mujoco.MjsDefault, mujoco.MjsDefault]:
-    """Declare what contact pairs have in common: those that grip, and those that slide."""
-    gripping = spec.default
-    sliding = spec.add_default("sliding", gripping)
-    for kind, friction in ((gripping, chosen.contact), (sliding, chosen.sliding)):
-        pair = kind.pair
-        pair.condim = 4
-        pair.solref = chosen.contact
-        pair.solreffriction = friction
-        pair.friction = (1.0, 1.0, SPINNING_FRICTION, _ROLLING_FRICTION, _ROLLING_FRICTION)
-        pair.margin = pair.gap = 0.0
-    return gripping, sliding
+def _write_options(spec: mujoco.MjSpec, structure: Structure) -> None:
+    """Write everything that concerns the whole simulation."""
+    option = spec.option
+    option.timestep = structure.preset.timestep
+    # The only one besides Euler in which bodies that do not touch are solved apart, to the last
+    # digit; ``discrete`` scales by the masses of all of them.
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.impratio = IMPRATIO
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # MuJoCo 4.0.0 factors the Hessian wrongly where the Jacobian is sparse (#3767). The price of a
+    # dense one: its sums are grouped by the numbers of the degrees of freedom, so one block more
+    # changes the last digits of the others. Parameters of what does not touch still do nothing.
+    # With many blocks it is 17 times faster in a built wall; there, in 48 states, accelerations
+    # differed by less than 1e-6 from those of a dense one, as much as either did from the truth.
+    sparse, dense = mujoco.mjtJacobian.mjJAC_SPARSE, mujoco.mjtJacobian.mjJAC_DENSE
+    option.jacobian = sparse if len(structure.blocks) > MANY else dense
+    # A simulation that explodes must say so instead of starting again. A warm start is accepted
+    # or rejected for all islands together, so that bodies that do not touch would act on each
+    # other's last digits; without it, a step is a function of positions, velocities and command
+    # alone, and a parameter of what does not touch does exactly nothing.
+    off = mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    option.disableflags = int(off)
+    option.enableflags = 0  # sleeping islands, in particular, cannot be restored exactly
 
 
-def _add_arena(spec: mujoco.MjSpec) -> None:
-    spec.worldbody.add_geom(
-        name=FLOOR,
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=(1.0, 1.0, 0.1),
-        contype=0,
-        conaffinity=0,
-    )
-    stage = spec.worldbody.add_body(name=STAGE)
+def _add_shape(body: mujoco.MjsBody, name: str, **options: Any) -> None:
+    """Add a shape that touches what pairs say."""
+    body.add_geom(name=name, contype=0, conaffinity=0, **options)
+
+
+def _add_arena(world: mujoco.MjsBody) -> None:
+    _add_shape(world, FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 0.1))
+    stage = world.add_body(name=STAGE)
     outer = WALL_RADIUS + WALL_THICKNESS
     half = (WALL_THICKNESS / 2, outer * math.tan(math.pi / WALL_SEGMENTS), WALL_HEIGHT / 2)
+    center = WALL_RADIUS + WALL_THICKNESS / 2
     for i in range(WALL_SEGMENTS):
         angle = 2 * math.pi * i / WALL_SEGMENTS
-        center = WALL_RADIUS + WALL_THICKNESS / 2
-        stage.add_geom(
-            name=wall_name(i),
+        _add_shape(
+            stage,
+            wall_name(i),
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=(center * math.cos(angle), center * math.sin(angle), WALL_HEIGHT / 2),
             quat=_yaw(angle),
             size=half,
-            contype=0,
-            conaffinity=0,
         )
 
 
-def _add_obstacle(spec: mujoco.MjSpec, name: str) -> None:
-    position, orientation = _OBSTACLE_POSE
-    _add_box(spec.worldbody, name, pos=position, quat=orientation)
-
-
-def _add_block(spec: mujoco.MjSpec, name: str, hull: Hull | None) -> None:
-    body = spec.worldbody.add_body(name=name)
-    body.add_freejoint()
-    body.mass = _BLOCK_MASS
-    body.inertia = (_BLOCK_MASS / 6 * (2 * _BLOCK_HALF) ** 2,) * 3
-    body.explicitinertial = True
-    if hull is None:
-        _add_box(body, name)
-    else:
-        _add_hull(spec, body, name, hull)
-
-
-def _add_box(body: mujoco.MjsBody, name: str, **pose: tuple[float, ...]) -> None:
-    body.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(_BLOCK_HALF,) * 3,
-        contype=0,
-        conaffinity=0,
-        **pose,
-    )
-
-
-def _add_hull(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, hull: Hull) -> None:
-    """Add a mesh. MuJoCo moves it into a frame of its own and the shape back by as much."""
-    mesh = spec.add_mesh(name=name)
-    mesh.uservert = [number for vertex in hull.vertices for number in vertex]
-    mesh.userface = [index for face in hull.faces for index in face]
-    body.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, contype=0, conaffinity=0
-    )
-
-
-def _add_robot(spec: mujoco.MjSpec, preset: Preset) -> None:
-    """Hang each finger from the world.
+def _add_robot(spec: mujoco.MjSpec, contact: tuple[float, float]) -> None:
+    """Hang each finger from the world; then add nine servos with a limit, and nine dampers.
 
     MuJoCo works in the frame of the center of mass of a kinematic tree. With a tree per finger,
     and the links that cannot move outside of them, no mass changes the roundings elsewhere.
     """
-    height = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET
+    height, world = hardware.NOMINAL_HEIGHT - hardware.TABLE_OFFSET, spec.worldbody
+    cos, sin = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
     for finger, (x, y, z), yaw in zip(
         FINGERS, hardware.FINGER_OFFSET, hardware.FINGER_YAW, strict=True
     ):
-        cos, sin = math.cos(hardware.WORLD_YAW), math.sin(hardware.WORLD_YAW)
-        position = (cos * x - sin * y, sin * x + cos * y, z + height)
-        orientation = _yaw(hardware.WORLD_YAW + yaw)
-        fixed = spec.worldbody.add_body(name=link_name(finger, 0), pos=position, quat=orientation)
+        pose: dict[str, Any] = {
+            "pos": (cos * x - sin * y, sin * x + cos * y, z + height),
+            "quat": _yaw(hardware.WORLD_YAW + yaw),
+        }
+        fixed = world.add_body(name=link_name(finger, 0), **pose)
         _set_inertial(fixed, 0)
-        fixed.add_geom(
-            name=shape_name(finger, "base"),
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=(0.01, 0.0, 0.0),
-            contype=0,
-            conaffinity=0,
-        )
-        root = spec.worldbody.add_body(name=base_name(finger), pos=position, quat=orientation)
-        _add_finger(root, finger, preset)
-    _add_controller(spec)
-
-
-def _add_finger(body: mujoco.MjsBody, finger: str, preset: Preset) -> None:
-    for index in (1, 2, 3):
-        body = body.add_body(name=link_name(finger, index), pos=hardware.JOINT_ORIGINS[index - 1])
-        _set_inertial(body, index)
-        reach = hardware.ENGINE_LIMITS[index - 1]
-        body.add_joint(
-            name=link_name(finger, index),
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=hardware.JOINT_AXES[index - 1],
-            limited=True,
-            range=(-reach, reach),
-            solref_limit=settings(preset).contact,
-            actfrclimited=True,
-            actfrcrange=(-_TORQUE_LIMIT, _TORQUE_LIMIT),
-        )
-        _add_capsule(body, finger, SHAPES[index - 1])
-    tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=hardware.TIP_ORIGIN)
-    tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
-    _add_capsule(tip, finger, "tip")
+        sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": (0.01, 0.0, 0.0)}
+        _add_shape(fixed, shape_name(finger, "base"), **sphere)
+        body = world.add_body(name=base_name(finger), **pose)
+        for index in (1, 2, 3):
+            name = link_name(finger, index)
+            body = body.add_body(name=name, pos=hardware.JOINT_ORIGINS[index - 1])
+            _set_inertial(body, index)
+            reach = hardware.ENGINE_LIMITS[index - 1]
+            body.add_joint(
+                name=name,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=hardware.JOINT_AXES[index - 1],
+                limited=True,
+                range=(-reach, reach),
+                solref_limit=contact,
+                actfrclimited=True,  # the joint clips the sum of servo and damper
+                actfrcrange=(-_TORQUE_LIMIT, _TORQUE_LIMIT),
+            )
+            _add_capsule(body, finger, SHAPES[index - 1])
+        tip = body.add_body(name=f"robot_finger_{finger}_tip", pos=hardware.TIP_ORIGIN)
+        tip.mass, tip.inertia, tip.explicitinertial = hardware.TIP_MASS, hardware.TIP_INERTIA, True
+        _add_capsule(tip, finger, "tip")
+    for purpose, limit in (("servo", _TORQUE_LIMIT), ("safety", 0.0)):
+        for joint in (link_name(finger, index) for finger in FINGERS for index in (1, 2, 3)):
+            spec.add_actuator(  # without gains: they are parameters and follow
+                name=f"{joint}/{purpose}",
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                target=joint,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+                gainprm=[0.0] * 10,
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                forcelimited=limit > 0.0,
+                forcerange=(-limit, limit),
+            )
 
 
 def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
@@ -256,38 +265,12 @@ def _set_inertial(body: mujoco.MjsBody, index: int) -> None:
 
 def _add_capsule(body: mujoco.MjsBody, finger: str, shape: str) -> None:
     capsule = hardware.COLLISION[shape]
-    body.add_geom(
-        name=shape_name(finger, shape),
+    _add_shape(
+        body,
+        shape_name(finger, shape),
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         fromto=(*capsule.start, *capsule.end),
         size=(capsule.radius, 0.0, 0.0),
-        contype=0,
-        conaffinity=0,
-    )
-
-
-def _add_controller(spec: mujoco.MjSpec) -> None:
-    """Add nine servos whose force is clipped, then nine dampers; the joint clips the sum."""
-    joints = [link_name(finger, index) for finger in FINGERS for index in (1, 2, 3)]
-    for joint in joints:
-        _add_actuator(spec, joint, "servo", limit=_TORQUE_LIMIT)
-    for joint in joints:
-        _add_actuator(spec, joint, "safety")
-
-
-def _add_actuator(
-    spec: mujoco.MjSpec, joint: str, purpose: str, limit: float | None = None
-) -> None:
-    """Add a source of torque without gains: they are parameters and follow."""
-    spec.add_actuator(
-        name=f"{joint}/{purpose}",
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        target=joint,
-        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-        gainprm=[0.0] * 10,
-        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-        forcelimited=limit is not None,
-        forcerange=(-(limit or 0.0), limit or 0.0),
     )
 
 
