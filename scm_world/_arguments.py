@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Container, Iterable
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from scm_world.errors import MissingExtra, UnknownOption
+from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 
 def whole_number(option: str, value: Any, *, least: int) -> int:
@@ -36,3 +38,44 @@ def load(module: str, library: str, extra: str = "") -> Any:
         return import_module(module)
     except ImportError as error:
         raise MissingExtra(library, extra or library) from error
+
+
+def enter(
+    registry: dict[str, Any],
+    kind: Any,
+    base: type,
+    *,
+    what: str,
+    taken: Container[str],
+    check: Callable[[Any], Iterable[str]],
+) -> None:
+    """Enter a class of a user into a registry, by its ``name``.
+
+    Args:
+        registry: The classes that were entered.
+        kind: The class. One whose module was run again takes its own place.
+        base: What it must be derived from.
+        what: What it is called in errors.
+        taken: Names that it may not have.
+        check: Lists what else is wrong with it.
+
+    Raises:
+        ModelError: It is no such class, it lacks methods or a name, or what ``check`` says.
+        UnknownOption: Another one has this name.
+    """
+    if not (inspect.isclass(kind) and issubclass(kind, base)):
+        public = f"{base.__module__.rpartition('.')[0]}.{base.__name__}"
+        raise ModelError([f"{kind!r} is no class derived from {public}"])
+    missing = sorted(getattr(kind, "__abstractmethods__", ()))
+    problems = [f"{kind.__name__} does not define {method!r}" for method in missing]
+    name = getattr(kind, "name", None)
+    if not isinstance(name, str) or not name:
+        problems.append(f"{kind.__name__} has no name; set name = 'mine' in the class")
+    problems += check(kind)
+    if problems:
+        raise ModelError(problems)
+    other = registry.get(str(name), kind)
+    same = (other.__module__, other.__qualname__) == (kind.__module__, kind.__qualname__)
+    if name in taken or not same:
+        raise UnknownOption(f"name of a {what}", name, ("a name that is not taken",))
+    registry[str(name)] = kind

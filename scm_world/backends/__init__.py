@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import inspect
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
+from scm_world._arguments import enter
 from scm_world.backends.base import Backend, BackendWrapper, Capabilities, Contact, EngineSnapshot
-from scm_world.errors import MissingEngine, ModelError, UnknownOption
+from scm_world.errors import MissingEngine, UnknownOption
 from scm_world.models import Model
 
 BACKENDS = ("mujoco", "bullet", "step", "fake")
@@ -42,26 +43,13 @@ def register(kind: Kind) -> Kind:
         ModelError: It is no class of backends, methods are missing, or it has no name.
         UnknownOption: Another one has this name.
     """
-    if not (inspect.isclass(kind) and issubclass(kind, Backend)):
-        raise ModelError([f"{kind!r} is no class derived from scm_world.backends.Backend"])
-    missing = sorted(getattr(kind, "__abstractmethods__", ()))
-    problems = [f"{kind.__name__} does not define {method!r}" for method in missing]
-    name = getattr(kind, "name", None)
-    if not isinstance(name, str) or not name:
-        problems.append(f"{kind.__name__} has no name; set name = 'mine' in the class")
-    if not isinstance(getattr(kind, "capabilities", None), Capabilities):
-        problems.append(f"{kind.__name__} has no capabilities; set capabilities = Capabilities()")
-    if problems:
-        raise ModelError(problems)
-    if kind.name in BACKENDS or not _same(_REGISTERED.get(kind.name, kind), kind):
-        raise UnknownOption("name of a backend", kind.name, ("a name that is not taken",))
-    _REGISTERED[kind.name] = kind
+
+    def check(kind: type[Backend]) -> Iterable[str]:
+        if not isinstance(getattr(kind, "capabilities", None), Capabilities):
+            yield f"{kind.__name__} has no capabilities; set capabilities = Capabilities()"
+
+    enter(_REGISTERED, kind, Backend, what="backend", taken=BACKENDS, check=check)
     return kind
-
-
-def _same(one: type, other: type) -> bool:
-    """Say whether two classes are one, or one whose module was run again."""
-    return (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
 
 
 def backends() -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from hashlib import blake2b
@@ -50,16 +50,8 @@ class Quantity:
         return np.full(self.shape, self.default, dtype=np.float64)
 
 
-_Pieces = tuple[tuple[Quantity, slice], ...]
-
-
-def _pieces(quantities: Iterable[Quantity]) -> tuple[_Pieces, int]:
-    """Lay quantities out in a row: the place of each, and how many numbers there are."""
-    found, end = [], 0
-    for quantity in quantities:
-        start, end = end, end + int(np.prod(quantity.shape, dtype=int))
-        found.append((quantity, slice(start, end)))
-    return tuple(found), end
+_KINDS = "parameters", "states", "actions", "noise"
+"""What a step function is given, in this order."""
 
 
 @final
@@ -112,12 +104,12 @@ class StepModel:
     @property
     def n_commands(self) -> int:
         """How many numbers a command has: those of the actions and those of the noise."""
-        return self._actions[1] + self._noise[1]
+        return sum(self._pieces[kind][1] for kind in ("actions", "noise"))
 
     @cached_property
     def layout(self) -> StateLayout:
         """Where each state stands in the vector."""
-        pieces, _ = self._states
+        pieces, _ = self._pieces["states"]
         start = [number for quantity, _ in pieces for number in quantity.value.ravel().tolist()]
         sizes = tuple(where.stop - where.start for _, where in pieces)
         return StateLayout(tuple(quantity.name for quantity, _ in pieces), sizes, tuple(start))
@@ -162,50 +154,54 @@ class StepModel:
         return new
 
     def _call(self, parameters: Floats, states: Floats, commands: Floats) -> Any:
-        split = self._actions[1]
+        split = self._pieces["actions"][1]
         arrays = [parameters, states, commands[..., :split], commands[..., split:]]
         given: list[Any] = [np.array(array) for array in arrays]  # it may keep them
         if self.signature == "dicts":
             for array in given:
                 array.flags.writeable = False
-            tables = (self._parameters, self._states, self._actions, self._noise)
-            given = [
-                _named(pieces, array) for (pieces, _), array in zip(tables, given, strict=True)
-            ]
+            given = [self._named(kind, array) for kind, array in zip(_KINDS, given, strict=True)]
         try:
             result = self.function(*given)
         except Exception as error:
-            raise EngineFailure(self._raised(error), StepFunction.name) from error
+            advice = ""
+            if isinstance(error, KeyError):
+                names = {kind: [q.name for q in getattr(self, kind)] for kind in _KINDS}
+                known = (f"{kind} {', '.join(named)}" for kind, named in names.items() if named)
+                advice = f"; it is given {'; '.join(known)}"
+            elif "read-only" in str(error):
+                advice = "; what it is given must not be changed: let it work on a copy"
+            raise self._failure(f"raised {type(error).__name__}: {error}{advice}") from error
         if self.signature == "arrays":
             kinds = ("parameters", "state", "action", "noise")
             for kind, array, copy in zip(kinds, arrays, given, strict=True):
                 if array.tobytes() != copy.tobytes():
-                    raise EngineFailure(
-                        f"the step function of {self.name!r} changed the {kind} it was given; "
-                        "let it work on a copy",
-                        StepFunction.name,
-                    )
+                    changed = f"changed the {kind} it was given; let it work on a copy"
+                    raise self._failure(changed)
         return result
 
-    def _raised(self, error: Exception) -> str:
-        """Say what went wrong in the function, and what may help."""
-        advice = ""
-        if isinstance(error, KeyError):
-            kinds = ("parameters", "states", "actions", "noise")
-            given = (
-                f"{kind} {', '.join(q.name for q in getattr(self, kind))}"
-                for kind in kinds
-                if getattr(self, kind)
-            )
-            advice = f"; it is given {'; '.join(given)}"
-        elif "read-only" in str(error):
-            advice = "; what it is given must not be changed: let it work on a copy"
-        what = f"{type(error).__name__}: {error}"
-        return f"the step function of {self.name!r} raised {what}{advice}"
+    def _failure(self, what: str) -> EngineFailure:
+        """Say what the function did."""
+        return EngineFailure(f"the step function of {self.name!r} {what}", StepFunction.name)
+
+    def _named(self, kind: str, numbers: Floats) -> dict[str, Any]:
+        """Name the parts of flat numbers, shape (..., size); they cannot be written."""
+        lead, found = numbers.shape[:-1], dict[str, Any]()
+        for quantity, where in self._pieces[kind][0]:
+            if not lead and not quantity.shape:
+                number = numbers[where.start]
+                found[quantity.name] = np.int64(number) if quantity.integer else number
+                continue
+            part: Value = numbers[..., where].reshape(*lead, *quantity.shape)
+            if quantity.integer:
+                part = part.astype(np.int64)
+                part.flags.writeable = False
+            found[quantity.name] = part
+        return found
 
     def _checked(self, result: Any, lead: tuple[int, ...]) -> Floats:
         """Put what the function gave into an array, shape (*lead, s), or refuse it."""
-        pieces, size = self._states
+        pieces, size = self._pieces["states"]
         new, problems = np.empty((*lead, size)), []
         if self.signature == "arrays":
             given = np.asarray(result)
@@ -246,20 +242,16 @@ class StepModel:
         return new
 
     @cached_property
-    def _parameters(self) -> tuple[_Pieces, int]:
-        return _pieces(self.parameters)
-
-    @cached_property
-    def _states(self) -> tuple[_Pieces, int]:
-        return _pieces(self.states)
-
-    @cached_property
-    def _actions(self) -> tuple[_Pieces, int]:
-        return _pieces(self.actions)
-
-    @cached_property
-    def _noise(self) -> tuple[_Pieces, int]:
-        return _pieces(self.noise)
+    def _pieces(self) -> dict[str, tuple[tuple[tuple[Quantity, slice], ...], int]]:
+        """Lay each kind of quantities out in a row: the places, and how many numbers there are."""
+        found = {}
+        for kind in _KINDS:
+            pieces, end = [], 0
+            for quantity in getattr(self, kind):
+                start, end = end, end + int(np.prod(quantity.shape, dtype=int))
+                pieces.append((quantity, slice(start, end)))
+            found[kind] = tuple(pieces), end
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}
@@ -316,22 +308,6 @@ def _inside(part: Any) -> tuple[Any, ...]:
     return ()
 
 
-def _named(pieces: _Pieces, numbers: Floats) -> dict[str, Any]:
-    """Name the parts of flat numbers, shape (..., size); they cannot be written."""
-    lead, found = numbers.shape[:-1], dict[str, Any]()
-    for quantity, where in pieces:
-        if not lead and not quantity.shape:
-            number = numbers[where.start]
-            found[quantity.name] = np.int64(number) if quantity.integer else number
-            continue
-        part: Value = numbers[..., where].reshape(*lead, *quantity.shape)
-        if quantity.integer:
-            part = part.astype(np.int64)
-            part.flags.writeable = False
-        found[quantity.name] = part
-    return found
-
-
 @final
 class StepFunction(InMemory):
     """Realises a ``StepModel``.
@@ -379,7 +355,12 @@ class StepFunction(InMemory):
         _require_controls(mode)
         parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
         if self._asked is not self._structure:
-            _refuse_memory(self._structure, parameters, states, commands)
+            asked = (self._structure.advance(parameters, states, commands) for _ in range(2))
+            if len({answer.tobytes() for answer in asked}) > 1:
+                raise self._structure._failure(
+                    "gave two answers to one question; let it keep no memory between calls, and "
+                    "declare what is random in noise="
+                )
             self._asked = self._structure
         for _ in range(substeps):
             states = self._structure.advance(parameters, states, commands)
@@ -468,7 +449,10 @@ class StepBatch(EngineBatch):
         states = np.array([member.vector for member in members])
         parameters = np.array([member.numbers for member in members])
         if (model, len(members)) not in self._compared:
-            if not _is_alone_as_among_others(model, parameters, states, commands):
+            among = model.advance(parameters, states, commands)
+            rows = [slice(row, row + 1) for row in range(len(states))]
+            alone = [model.advance(parameters[one], states[one], commands[one]) for one in rows]
+            if np.concatenate(alone).tobytes() != among.tobytes():
                 return EngineFailure(
                     f"the vectorised step function of {model.name!r} gives a row other numbers "
                     f"among {len(states)} rows than alone; write it without matrix products over "
@@ -486,24 +470,3 @@ class StepBatch(EngineBatch):
 def _require_controls(mode: ControlMode) -> None:
     if mode is not ControlMode.CONTROLS:
         raise UnknownOption("mode of a step function", str(mode), (str(ControlMode.CONTROLS),))
-
-
-def _refuse_memory(model: StepModel, parameters: Floats, states: Floats, commands: Floats) -> None:
-    """Refuse a function that gives two answers to one question."""
-    answers = [model.advance(parameters, states, commands).tobytes() for _ in range(2)]
-    if answers[0] != answers[1]:
-        raise EngineFailure(
-            f"the step function of {model.name!r} gave two answers to one question; let it keep "
-            "no memory between calls, and declare what is random in noise=",
-            StepFunction.name,
-        )
-
-
-def _is_alone_as_among_others(
-    model: StepModel, parameters: Floats, states: Floats, commands: Floats
-) -> bool:
-    """Tell whether a vectorised function gives each row the numbers that it gives it alone."""
-    among = model.advance(parameters, states, commands)
-    rows = [slice(row, row + 1) for row in range(len(states))]
-    alone = [model.advance(parameters[one], states[one], commands[one]) for one in rows]
-    return bool(np.concatenate(alone).tobytes() == among.tobytes())

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
-from scm_world.errors import ModelError, UnknownOption
+from scm_world._arguments import enter
 from scm_world.tasks.base import TIME, Observed, Task, Timing
 from scm_world.tasks.conventions import CONVENTIONS, Conventions, conventions
 from scm_world.tasks.model import ModelTask, model_task
@@ -61,31 +62,16 @@ def register(kind: Kind) -> Kind:
             an argument has no default.
         UnknownOption: Another one has this name.
     """
-    if not (inspect.isclass(kind) and issubclass(kind, Task)):
-        raise ModelError([f"{kind!r} is no class derived from scm_world.tasks.Task"])
-    missing = sorted(getattr(kind, "__abstractmethods__", ()))
-    problems = [f"{kind.__name__} does not define {method!r}" for method in missing]
-    name = getattr(kind, "name", None)
-    if not isinstance(name, str) or not name:
-        problems.append(f"{kind.__name__} has no name; set name = 'mine' in the class")
-    if issubclass(kind, TriFingerTask) and not hasattr(kind, "default_weights"):
-        problems.append(f"{kind.__name__} has no default_weights; set them in the class")
-    problems += [
-        f"{kind.__name__} has no default for {parameter.name!r}"
-        for parameter in inspect.signature(kind.__init__).parameters.values()
-        if parameter.kind is parameter.KEYWORD_ONLY and parameter.default is parameter.empty
-    ]
-    if problems:
-        raise ModelError(problems)
-    if kind.name in TASKS or not _same(_REGISTERED.get(kind.name, kind), kind):
-        raise UnknownOption("name of a task", kind.name, ("a name that is not taken",))
-    _REGISTERED[kind.name] = kind
+
+    def check(kind: type[Task]) -> Iterable[str]:
+        if issubclass(kind, TriFingerTask) and not hasattr(kind, "default_weights"):
+            yield f"{kind.__name__} has no default_weights; set them in the class"
+        for parameter in inspect.signature(kind.__init__).parameters.values():
+            if parameter.kind is parameter.KEYWORD_ONLY and parameter.default is parameter.empty:
+                yield f"{kind.__name__} has no default for {parameter.name!r}"
+
+    enter(_REGISTERED, kind, Task, what="task", taken=TASKS, check=check)
     return kind
-
-
-def _same(one: type, other: type) -> bool:
-    """Say whether two classes are one, or one whose module was run again."""
-    return (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
 
 
 def tasks() -> dict[str, type[Task]]:

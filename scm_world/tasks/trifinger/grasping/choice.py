@@ -74,10 +74,11 @@ class Choice:
         height = {goal: float(body.place[2]) for goal, body in self._goals.items()}
         pairs = sorted(sight.pairs, key=lambda pair: height[pair[1]])
         self._kept = pairs[-1][1] if holds and pairs else None
+        enough = ENOUGH if sight.left > LATE else FAIR  # in the end, better not touch it again
         self._todo = [
             (tool, goal)
             for tool, goal in pairs
-            if sight.filled(tool, goal) < self._enough() or self._hangs(tool, goal)
+            if sight.filled(tool, goal) < enough or self._hangs(tool, goal)
         ]
 
     def job(self) -> Job | None:
@@ -85,7 +86,8 @@ class Choice:
         for tool, goal in self._todo:
             if self._waits(tool, goal):
                 continue
-            hangs, end, start = self._hangs(tool, goal), self._end(goal), self._bodies[tool]
+            hangs, end, start = self._hangs(tool, goal), self._goals[goal], self._bodies[tool]
+            end = end.at(end.place + lifted(self._kept == goal), end.yaw)
             ways = [(start.at(end.place, start.yaw + turn), turn) for turn in turns(start, end)]
             move = self._best(tool, start, ways, release=not hangs)
             if move is not None and (not hangs or move.grip.firm):
@@ -98,10 +100,6 @@ class Choice:
                 return found
         return None
 
-    def _enough(self) -> float:
-        """Say which share of a goal is enough: towards the end, better not touch it again."""
-        return ENOUGH if self._sight.left > LATE else FAIR
-
     def _hangs(self, tool: str, goal: str) -> bool:
         """Tell whether a block is held at its goal: there is nothing below, or it is asked for."""
         end = self._goals[goal]
@@ -112,11 +110,6 @@ class Choice:
                 for body in self._others(tool)
             )
         )
-
-    def _end(self, goal: str) -> Cuboid:
-        """Say where a block should be for its goal: a block that is held does not rub."""
-        end = self._goals[goal]
-        return end.at(end.place + lifted(self._kept == goal), end.yaw)
 
     def _waits(self, tool: str, goal: str) -> bool:
         """Tell whether a block cannot stand before another goal below its own is filled."""
@@ -170,11 +163,13 @@ class Choice:
         """List places where a block may be put down, the shortest detours first."""
         start, tried = self._bodies[tool], 0
         end, full = ways[0] if ways else (start, 0.0)
-        for place in sorted(STOPS, key=lambda stop: _length(start, stop, end)):
+        first, last = start.place[:2], end.place[:2]
+        for place in sorted(STOPS, key=lambda at: math.dist(first, at) + math.dist(at, last)):
             for part in PARTS if ways else PARTS[-1:]:
                 turn = part * full
                 stop = start.at(np.array([*place, start.half[2]]), start.yaw + turn)
-                if self._is_free(tool, stop) and _differs(start, stop):
+                moved, turned = math.dist(first, stop.place[:2]), abs(stop.yaw - start.yaw)
+                if self._is_free(tool, stop) and (moved > MOVED or turned > TURNED):
                     tried += 1
                     yield stop, turn
                 if tried == TRIES:
@@ -194,14 +189,3 @@ class Choice:
 def lifted(held: bool) -> Floats:
     """Say by how much a block is held higher than its goal, so that nothing is in its way [m]."""
     return np.array([0.0, 0.0, HOVER * held])
-
-
-def _length(start: Cuboid, stop: Floats, end: Cuboid) -> float:
-    """Measure a way over a stop, seen from above [m]."""
-    return math.dist(start.place[:2], stop) + math.dist(stop, end.place[:2])
-
-
-def _differs(start: Cuboid, stop: Cuboid) -> bool:
-    """Tell whether it is worth the while to move a block."""
-    far = math.dist(start.place[:2], stop.place[:2])
-    return far > MOVED or abs(stop.yaw - start.yaw) > TURNED

@@ -106,14 +106,14 @@ def deepest_kernel(
 
 
 @njit(cache=True)
-def _carrying_kernel(joints: Floats, weights: Floats, out: Floats) -> None:
-    """Write the torques that carry the fingers into ``out`` (9,) [N m].
+def carrying(joints: Floats, weights: Floats) -> Floats:
+    """Compute the torques that carry the fingers themselves, shape (9,) [N m].
 
     Args:
         joints: Shape (9,) [rad].
         weights: Of the middle link, the lower link and the tip of each finger, shape (3, 3) [N].
-        out: Overwritten.
     """
+    out = np.empty(9)
     for finger in range(N_FINGERS):
         i = 3 * finger
         sine, cosine = math.sin(joints[i]), math.cos(joints[i])
@@ -125,19 +125,22 @@ def _carrying_kernel(joints: Floats, weights: Floats, out: Floats) -> None:
             out[i] += weight * (-aside * cosine - down * sine)
             out[i + 1] += weight * (above * math.sin(first) + below * math.sin(second)) * cosine
             out[i + 2] += weight * below * math.sin(second) * cosine
+    return out
 
 
 @njit(cache=True)
-def _pressing_kernel(joints: Floats, height: float, forces: Floats, out: Floats) -> None:
-    """Write the torques with which fingertips press into ``out`` (9,) [N m].
+def pressing(joints: Floats, height: float, forces: Floats) -> Floats:
+    """Compute the torques with which fingertips press, without what carries the fingers.
 
     Args:
         joints: Shape (9,) [rad].
         height: Of the robot [m].
         forces: Of the fingertips on what they touch, shape (3, 3) [N].
-        out: Overwritten.
+
+    Returns:
+        Shape (9,) [N m].
     """
-    here, there, moved = np.empty(9), np.empty(9), joints.copy()
+    out, here, there, moved = np.empty(9), np.empty(9), np.empty(9), joints.copy()
     forward_kernel(joints, height, here)
     for joint in range(3):
         moved[joint::3] += NUDGE
@@ -148,6 +151,7 @@ def _pressing_kernel(joints: Floats, height: float, forces: Floats, out: Floats)
             for k in range(3):
                 work += (there[i + k] - here[i + k]) * forces[finger, k]
             out[i + joint] = work / NUDGE
+    return out
 
 
 @final
@@ -170,19 +174,13 @@ class Hand:
                 for finger in hardware.FINGERS
             ]
         )
-        self._lead = self._delay(values, period) / period
-        self._last: Floats | None = None
-
-    def _delay(self, values: Mapping[str, Value], period: float) -> Floats:
-        """Find by how much a command must be early so that a joint is there in time [s].
-
-        A damped spring whose target jumps once per control step lags behind a steady motion.
-        """
+        # A damped spring whose target jumps once per control step lags behind a steady motion: a
+        # command must be so much earlier that a joint is there in time.
         damping = float(values["joint_damping"]) + values["velocity_gains"]
         damping = np.maximum(np.tile(damping + values["safety_damping"], N_FINGERS), LEAST_DAMPING)
         left = np.exp(-period * self._gains / damping)
-        delay: Floats = period * left / (1.0 - left)
-        return delay
+        self._lead = period * left / (1.0 - left) / period
+        self._last: Floats | None = None
 
     def solve(self, tips: Floats, near: Floats) -> tuple[Floats, bool]:
         """Find the joints for fingertips, shape (9,) [m]; tell whether all of them are reached."""
@@ -195,30 +193,6 @@ class Hand:
         tips = np.empty(9)
         forward_kernel(joints, self.height, tips)
         return tips
-
-    def depth(self, joints: Floats, boxes: Solids) -> float:
-        """Measure how deep fingers lie in boxes and in one another; see ``deepest_kernel``."""
-        return float(deepest_kernel(joints, self.height, *boxes))
-
-    def pressing(self, joints: Floats, forces: Floats) -> Floats:
-        """Compute the torques with which fingertips press, without what carries the fingers.
-
-        Args:
-            joints: Shape (9,) [rad].
-            forces: Of the fingertips on what they touch, shape (3, 3) [N].
-
-        Returns:
-            Shape (9,) [N m].
-        """
-        torques = np.empty(9)
-        _pressing_kernel(joints, self.height, forces, torques)
-        return torques
-
-    def carrying(self, joints: Floats) -> Floats:
-        """Compute the torques that carry the fingers themselves, shape (9,) [N m]."""
-        torques = np.empty(9)
-        _carrying_kernel(joints, self._weights, torques)
-        return torques
 
     def command(self, tips: Floats, forces: Floats, near: Floats) -> Floats:
         """Find the joint positions to command so that fingertips come somewhere, and press.
@@ -235,7 +209,7 @@ class Hand:
             Shape (9,) [rad], within the bounds of a command.
         """
         joints, _ = self.solve(tips, near)
-        torques = self.carrying(joints) + self.pressing(joints, forces)
+        torques = carrying(joints, self._weights) + pressing(joints, self.height, forces)
         wanted = joints + np.minimum(np.maximum(torques, -self._limit), self._limit) / self._gains
         if self._last is not None:
             stride = np.minimum(np.maximum(joints - self._last, -STRIDE), STRIDE)
@@ -246,7 +220,7 @@ class Hand:
 
     def strength(self, joints: Floats, forces: Floats) -> float:
         """Tell how many times some forces, shape (3, 3), the fingers can exert."""
-        own, unit = self.carrying(joints), self.pressing(joints, forces)
+        own, unit = carrying(joints, self._weights), pressing(joints, self.height, forces)
         room = self._limit - own * np.sign(unit)
         asked = np.abs(unit) > 1e-9
         return max(float((room[asked] / np.abs(unit[asked])).min(initial=np.inf)), 0.0)

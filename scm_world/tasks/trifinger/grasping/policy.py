@@ -16,7 +16,7 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, UnknownOption
 from scm_world.tasks.trifinger.grasping.bodies import QUARTER, Cuboid, Sight, smallest, turn_about_z
 from scm_world.tasks.trifinger.grasping.choice import Choice, Job, lifted
-from scm_world.tasks.trifinger.grasping.ways import Grip, Move, Planner
+from scm_world.tasks.trifinger.grasping.ways import Grip, Planner
 
 Step = tuple[Floats, Floats]
 """Where the fingertips should be, shape (9,) [m], and how they press, shape (3, 3) [N]."""
@@ -292,14 +292,9 @@ class _Grasping:
                 for _ in range(AGAIN):
                     yield self._tips, _FREE
             else:
-                yield from self._approach(job.move)
-                yield from self._close(job.tool, job.move.grip, self._press(job))
+                yield from self._take(job)
                 yield from self._bring(job)
                 yield from self._rise(job.move.above)
-
-    def _press(self, job: Job) -> float:
-        """Choose the force between the fingers [N]."""
-        return min(self._sight.wanted(job.tool), job.move.strength)
 
     # --- fingers without a block ----------------------------------------------------------
 
@@ -316,16 +311,14 @@ class _Grasping:
         tips[2::3] = np.maximum(tips[2::3], above)
         yield from self._glide(tips, self._pace.travel)
 
-    def _approach(self, move: Move) -> Iterator[Step]:
-        """Come to a block from above."""
+    def _take(self, job: Job) -> Iterator[Step]:
+        """Come to a block from above and press on its faces, wherever it moves in the meantime."""
+        move, tool, grip = job.move, job.tool, job.move.grip
         place = Planner(self._sight.hand, self._sight.joints, ()).place
-        grip = move.grip
         yield from self._rise(move.above)
         yield from self._glide(place(grip, move.start, grip.opening, move.above), self._pace.travel)
         yield from self._glide(place(grip, move.start, grip.opening), self._pace.travel)
-
-    def _close(self, tool: str, grip: Grip, press: float) -> Iterator[Step]:
-        """Come to the faces of a block and press, wherever it moves in the meantime."""
+        press = min(self._sight.wanted(tool), move.strength)
         place = Planner(self._sight.hand, self._sight.joints, ()).place
         steps = math.ceil(grip.opening / self._pace.close)
         for step in range(1, steps + PRESS + SETTLE + 1):
@@ -338,20 +331,23 @@ class _Grasping:
 
     def _bring(self, job: Job) -> Iterator[Step]:
         """Bring a block to its end, and let go of it there or when it is lost."""
-        tool, move = job.tool, job.move
-        body, press = self._sight.body(tool), self._press(job)
-        hold = Hold(self._sight, tool, move.grip, press, self._tips)
-        stations = _stations(body, move)
-        rate = self._rate(job, [body, *stations], self._sight.burden(tool) / press)
+        tool, move, sight = job.tool, job.move, self._sight
+        body, press = sight.body(tool), min(sight.wanted(tool), move.strength)
+        hold = Hold(sight, tool, move.grip, press, self._tips)
+        # It comes by above its place, above its end, and at its end.
+        yaw = body.yaw + move.turn + smallest(move.start.yaw - body.yaw, QUARTER)
+        over, there = (np.array([*on.place[:2], move.height]) for on in (body, move.end))
+        stations = body.at(over, body.yaw), body.at(there, yaw), body.at(move.end.place, yaw)
+        rate = self._rate(job, [body, *stations], sight.burden(tool) / press)
         for station in stations:
             yield from hold.carry(station, rate, self._pace.turn)
         if not move.release:
-            goal = next(goal for block, goal in self._sight.pairs if block == tool)
+            goal = next(goal for block, goal in sight.pairs if block == tool)
             yield from hold.stay(goal, self._pace.carry, lifted(self._holds))
         yield from hold.settle()
         for share in LETTING_GO:
             yield hold.step(share)
-        axes = turn_about_z(self._sight.body(tool).yaw)
+        axes = turn_about_z(sight.body(tool).yaw)
         away = (move.grip.points(move.grip.opening) - move.grip.touch) @ axes.T
         yield from self._glide(self._tips + away.ravel(), 2.0 * self._pace.close)
 
@@ -374,10 +370,3 @@ class _Grasping:
 def _unit(world: Any) -> tuple[int, int]:
     """Say which episode this is."""
     return world.noise.seed, world.episode
-
-
-def _stations(body: Cuboid, move: Move) -> tuple[Cuboid, Cuboid, Cuboid]:
-    """Say where a block comes by: above its place, above its end, its end."""
-    yaw = body.yaw + move.turn + smallest(move.start.yaw - body.yaw, QUARTER)
-    over, there = (np.array([*on.place[:2], move.height]) for on in (body, move.end))
-    return body.at(over, body.yaw), body.at(there, yaw), body.at(move.end.place, yaw)

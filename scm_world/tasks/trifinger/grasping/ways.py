@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, solids, turn_about_z
-from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand
+from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS, Hand, deepest_kernel
 
 LEVELS = (0.15, 0.4, 0.0)
 """How high the fingertips are above the middle of a block, in halves of its height."""
@@ -289,4 +289,4 @@ class Planner:
                 np.concatenate([boxes[1], place]),
                 np.concatenate([boxes[2], axes]),
             )
-        return self._hand.depth(joints, boxes)
+        return float(deepest_kernel(joints, self._hand.height, *boxes))
