@@ -201,7 +201,7 @@ class Place(NamedTuple):
 
 @final
 @dataclass(frozen=True, eq=False)
-class Bodies:
+class ModelBodies:
     """All of a model that an engine needs to build and to drive it.
 
     Attributes:
@@ -229,7 +229,7 @@ class Bodies:
     places: Mapping[ParameterKey, Place] = field(default_factory=dict, repr=False)
     missing: tuple[str, ...] = ()
 
-    def with_parameters(self, values: Mapping[ParameterKey, Any]) -> Bodies:
+    def with_parameters(self, values: Mapping[ParameterKey, Any]) -> ModelBodies:
         """Give the same bodies with other values of some parameters, which have a place here.
 
         Args:

@@ -15,7 +15,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from scm_world.errors import ModelError
-from scm_world.models.bodies import Bodies
+from scm_world.models.bodies import ModelBodies
 from scm_world.models.scene import ParameterKey, Scene, State, StateLayout
 
 Numbers = float | tuple[float, ...]
@@ -127,7 +127,7 @@ class Model:
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
         notes: What acts without having a variable (plugins, flex), one sentence each.
-        describe: Gives the ``Bodies`` of the model, for engines that do not read its source. It
+        describe: Gives the ``ModelBodies`` of the model, for engines that do not read its file. It
             can be pickled.
     """
 
@@ -142,7 +142,7 @@ class Model:
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
-    describe: Callable[[Model], Bodies] | None = field(default=None, repr=False)
+    describe: Callable[[Model], ModelBodies] | None = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
@@ -170,7 +170,7 @@ class Model:
         )
 
     @cached_property
-    def bodies(self) -> Bodies:
+    def bodies(self) -> ModelBodies:
         """The bodies in plain words.
 
         Raises:

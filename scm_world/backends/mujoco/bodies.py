@@ -13,11 +13,11 @@ from scm_world.backends.mujoco.fields import Field, element_names, table
 from scm_world.backends.mujoco.trees import Couplings, disabled
 from scm_world.models.bodies import (
     Actuator,
-    Bodies,
     Body,
     Coupling,
     Geom,
     Joint,
+    ModelBodies,
     Place,
     Rotation,
     RowPart,
@@ -93,7 +93,7 @@ _TABLES = {
 
 
 @lru_cache(maxsize=32)
-def describe(mj: mujoco.MjModel) -> Bodies:
+def describe(mj: mujoco.MjModel) -> ModelBodies:
     """Describe the bodies of a compiled model, which must not be changed afterwards."""
     names, couplings = element_names(mj), Couplings(mj)
     joints, start = [], 0
@@ -106,7 +106,7 @@ def describe(mj: mujoco.MjModel) -> Bodies:
     driven = [i for i in range(mj.nactuator) if not _odd_actuator(mj, i) and _works(mj, i)]
     rows = {"geom": row, "actuator": {number: i for i, number in enumerate(driven)}}
     followed = [i for i in range(mj.neq) if _acts(mj, i) and _is_linear(mj, i)]
-    return Bodies(
+    return ModelBodies(
         bodies=tuple(
             Body(
                 name,

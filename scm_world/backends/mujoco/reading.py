@@ -27,7 +27,7 @@ from scm_world.backends.mujoco.realization import callbacks
 from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, nearest
-from scm_world.models.bodies import Bodies
+from scm_world.models.bodies import ModelBodies
 from scm_world.models.model import Input, Model, Numbers, Parameter, StateRow
 
 _DSBL, _JNT, _TRN, _INT = (
@@ -125,7 +125,7 @@ def compiled(model: Model) -> mujoco.MjModel:
     return realized(model.source)[0]
 
 
-def described(model: Model) -> Bodies:
+def described(model: Model) -> ModelBodies:
     """Describe the bodies of a model, for engines that do not read its source."""
     return describe(compiled(model))
 

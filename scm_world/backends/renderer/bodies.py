@@ -27,7 +27,7 @@ NOTHING = -1
 """What a pixel shows where there is no body."""
 
 
-class SolidTable(NamedTuple):
+class Bodies(NamedTuple):
     """Solids: one row each, in the order in which they are drawn.
 
     Capsules and cylinders lie along the third axis of their own frame.
@@ -94,7 +94,7 @@ def _drawn(scene: Scene) -> tuple[VisibleModel, Any]:
     return drawn(scene)
 
 
-def goal_bodies(goals: tuple[Goal, ...], eye: tuple[float, float, float]) -> SolidTable:
+def goal_bodies(goals: tuple[Goal, ...], eye: tuple[float, float, float]) -> Bodies:
     """List silhouettes from the farthest to the nearest: each is drawn over those behind."""
     ordered = sorted(goals, key=lambda goal: -float(np.linalg.norm(goal.position - eye)))
     bodies = empty_bodies(len(goals), [goal.hull for goal in ordered])
@@ -125,9 +125,9 @@ def _hull_parts(hull: Hull) -> tuple[Floats, Floats]:
     return parts.planes, halves
 
 
-def empty_bodies(n: int, hulls: list[Hull | None]) -> SolidTable:
+def empty_bodies(n: int, hulls: list[Hull | None]) -> Bodies:
     """Make room for n bodies; the last ones are boxes, or hulls where one is given."""
-    bodies = SolidTable(
+    bodies = Bodies(
         np.full(n, BOX), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3)),
         np.empty((n, 3)), np.empty(n, dtype=np.int64), np.empty((0, 4)),
         np.zeros(n + 1, dtype=np.int64),

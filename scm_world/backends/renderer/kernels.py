@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.renderer.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, HULL, SolidTable
+from scm_world.backends.renderer.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, HULL, Bodies
 from scm_world.backends.renderer.rays import (
     Hit,
     Triple,
@@ -68,7 +68,7 @@ class Canvas(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _rectangle(
-    bodies: SolidTable, n: int, view: View, width: int, height: int
+    bodies: Bodies, n: int, view: View, width: int, height: int
 ) -> tuple[int, int, int, int]:
     """Bound the pixels a body can cover: first and last column plus one, the same for rows."""
     left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
@@ -216,7 +216,7 @@ def _opacity(shape: int, facets: Floats, point: Triple, n: Triple) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _scale(bodies: SolidTable, n: int) -> tuple[Floats, float]:
+def _scale(bodies: Bodies, n: int) -> tuple[Floats, float]:
     """Give the unit of length in the frame of a body, and half the length of what is round."""
     scale = bodies.halves[n].copy()
     if bodies.shapes[n] == HULL:
@@ -313,7 +313,7 @@ def blend(rgb: Colors, v: int, u: int, color: Triple, light: float, paint: float
 
 @njit(cache=True, error_model="numpy")
 def _draw_body(
-    bodies: SolidTable, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
+    bodies: Bodies, n: int, view: View, light: Floats, alpha: float, canvas: Canvas
 ) -> None:
     """Draw one body where it is nearer than what is there; see ``draw``."""
     depth, owners, rgb = canvas
@@ -349,7 +349,7 @@ def _draw_body(
 
 
 @njit(cache=True, error_model="numpy")
-def draw(bodies: SolidTable, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
+def draw(bodies: Bodies, view: View, light: Floats, alpha: float, canvas: Canvas) -> None:
     """Draw solids over what is there, where they are nearer.
 
     Args:

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.renderer.bodies import NOTHING, SolidTable
+from scm_world.backends.renderer.bodies import NOTHING, Bodies
 from scm_world.backends.renderer.kernels import (
     SHADOW,
     Canvas,
@@ -301,7 +301,7 @@ def lamp(light: Light) -> Floats:
 
 
 def shadow_map(
-    bodies: SolidTable,
+    bodies: Bodies,
     light: Light,
     meshes: Iterable[Triangles] = (),
     *,

@@ -14,7 +14,7 @@ from scm_world.backends.renderer.bodies import (
     CYLINDER,
     ELLIPSOID,
     NOTHING,
-    SolidTable,
+    Bodies,
 )
 from scm_world.backends.renderer.kernels import Canvas, View, camera_view, draw
 from scm_world.backends.renderer.meshes import (
@@ -121,11 +121,11 @@ def _draw_clear(shape: Shape, view: View, towards: Floats, canvas: Canvas) -> No
         draw_mesh(mesh, view, towards, alpha, nearest)
 
 
-def _table(shapes: Sequence[Shape]) -> SolidTable:
+def _table(shapes: Sequence[Shape]) -> Bodies:
     """Collect the shapes that are neither meshes nor planes."""
     round_ = [shape for shape in shapes if shape.kind in SOLIDS]
     n = len(round_)
-    return SolidTable(
+    return Bodies(
         np.array([SOLIDS[shape.kind] for shape in round_], dtype=np.int64),
         np.array([shape.position for shape in round_]).reshape(n, 3),
         np.array([shape.rotation for shape in round_]).reshape(n, 3, 3),

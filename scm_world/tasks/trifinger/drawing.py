@@ -15,7 +15,7 @@ from scm_world.backends.renderer.bodies import (
     CAPSULE,
     ELLIPSOID,
     NOTHING,
-    SolidTable,
+    Bodies,
     empty_bodies,
     goal_bodies,
     turn_kernel,
@@ -68,7 +68,7 @@ class Content(NamedTuple):
         shadow: How dark the floor is; None where shadows are not drawn.
     """
 
-    bodies: SolidTable
+    bodies: Bodies
     shadow: Floats | None
 
 
@@ -237,14 +237,23 @@ def lit_arena(camera: Camera, light: Light, colors: Palette) -> Colors:
     return paint_arena(empty_arena(camera), camera_view(camera, 1), light, colors)
 
 
-def solid_bodies(scene: Scene) -> SolidTable:
+def solid_bodies(scene: Scene) -> Bodies:
     """List the hub, the links, the blocks and the obstacles of a scene."""
     structure, parameters, state = scene.structure, scene.parameters, scene.state
     names = (*structure.blocks, *structure.obstacles)
     hulls = dict(structure.hulls)
     n, n_blocks = N_ROBOT + len(names), N_ROBOT + len(structure.blocks)
     bodies = empty_bodies(n, [hulls.get(name) for name in names])
-    _place_robot(bodies, scene)
+    height = float(parameters["robot", "height"])
+    bodies.shapes[:N_ROBOT] = _ROBOT_SHAPES
+    bodies.halves[:N_ROBOT] = _ROBOT_HALVES
+    bodies.owners[:N_ROBOT] = _ROBOT_OWNERS
+    bodies.centers[0] = (0.0, 0.0, height - hardware.TABLE_OFFSET)
+    bodies.rotations[0] = np.eye(3)
+    bodies.colors[0] = HUB_COLOR
+    colors = np.array([parameters[link, "color"] for link in hardware.LINK_NAMES])
+    bodies.colors[1:N_ROBOT] = colors[_LINKS]
+    _hang(*link_frames(state.joint_positions, height), _CENTERS, _ROTATIONS, bodies)
     bodies.centers[N_ROBOT:n_blocks] = state.positions
     turn_kernel(np.ascontiguousarray(state.orientations), bodies.rotations[N_ROBOT:n_blocks])
     for i, name in enumerate(names, start=N_ROBOT):
@@ -288,7 +297,7 @@ _ROBOT_OWNERS = np.array([ROBOT, *(_LINKS + ROBOT + 1)])
 
 @njit(cache=True)
 def _hang(
-    origins: Floats, orientations: Floats, centers: Floats, turns: Floats, bodies: SolidTable
+    origins: Floats, orientations: Floats, centers: Floats, turns: Floats, bodies: Bodies
 ) -> None:
     """Hang one capsule into each frame of the fingers, behind the hub."""
     frame = np.empty((3, 3))
@@ -302,18 +311,3 @@ def _hang(
                 bodies.rotations[n + 1, i, j] = 0.0
                 for k in range(3):
                     bodies.rotations[n + 1, i, j] += frame[i, k] * turns[kind, k, j]
-
-
-def _place_robot(bodies: SolidTable, scene: Scene) -> None:
-    """Write the first rows: the hub and the fingers."""
-    height = float(scene.parameters["robot", "height"])
-    bodies.shapes[:N_ROBOT] = _ROBOT_SHAPES
-    bodies.halves[:N_ROBOT] = _ROBOT_HALVES
-    bodies.owners[:N_ROBOT] = _ROBOT_OWNERS
-    bodies.centers[0] = (0.0, 0.0, height - hardware.TABLE_OFFSET)
-    bodies.rotations[0] = np.eye(3)
-    bodies.colors[0] = HUB_COLOR
-    colors = np.array([scene.parameters[link, "color"] for link in hardware.LINK_NAMES])
-    bodies.colors[1:N_ROBOT] = colors[_LINKS]
-    frames = link_frames(scene.state.joint_positions, height)
-    _hang(*frames, _CENTERS, _ROTATIONS, bodies)

@@ -13,7 +13,7 @@ from scm_world.geometry.hulls import Convex, box_hull, placed, sides_depth
 from scm_world.geometry.penetration import box_capsule
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.geometry.sweep import FLOOR, OTHERS, WALL, apart_in_rows, sweep
-from scm_world.models.scene import TOLERANCE, Goal, Overlap, Scene
+from scm_world.models.scene import TOLERANCE, Overlap, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, frames_of_rows, link_frames
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
@@ -134,7 +134,8 @@ def thin(
         frames_of_rows(np.ascontiguousarray(joints), np.ascontiguousarray(heights), frames, turns)
         boxes = [*some, *fixed]
         sizes = _together([candidates.parameter((name, "size")) for name in boxes], 3)
-        poses = [candidates.state(_pose(index)) for index in range(len(some))]
+        firsts = [ROBOT_SIZE + BLOCK_SIZE * index for index in range(len(some))]
+        poses = [candidates.state(slice(first, first + 7)) for first in firsts]
         centers, orientations = ([pose[:, at] for pose in poses] for at in (_CENTER, _TURN))
         centers += [candidates.parameter((name, "position")) for name in fixed]
         orientations += [candidates.parameter((name, "orientation")) for name in fixed]
@@ -153,11 +154,6 @@ def thin(
         candidates.keep(apart)
         if not len(candidates.attempts):
             return
-
-
-def _pose(block: int) -> slice:
-    first = ROBOT_SIZE + BLOCK_SIZE * block
-    return slice(first, first + 7)
 
 
 def _together(parts: list[Floats], size: int) -> Floats:
@@ -179,21 +175,19 @@ def buried_goals(scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
     found = []
     for goal in scene.goals:
         for obstacle in scene.structure.obstacles if goal.name in names else ():
-            depth = _depth_of_goal(goal, scene, obstacle)
+            if goal.shape == "sphere":
+                size, place, turn = (
+                    scene.parameters[obstacle, what] for what in ("size", "position", "orientation")
+                )
+                center, radius = goal.position, 0.5 * float(goal.size[0])
+                depth = box_capsule(size, place, turn, center, center, radius)
+            else:
+                hull = goal.hull or box_hull(goal.size)
+                body = placed(hull, goal.position, goal.orientation)
+                depth = sides_depth(body, _solid(scene, obstacle))
             if depth > TOLERANCE:
                 found.append(Overlap((goal.name, obstacle), depth))
     return tuple(found)
-
-
-def _depth_of_goal(goal: Goal, scene: Scene, obstacle: str) -> float:
-    if goal.shape == "sphere":
-        size, position, turn = (
-            scene.parameters[obstacle, what] for what in ("size", "position", "orientation")
-        )
-        center, radius = goal.position, 0.5 * float(goal.size[0])
-        return box_capsule(size, position, turn, center, center, radius)
-    hull = goal.hull or box_hull(goal.size)
-    return sides_depth(placed(hull, goal.position, goal.orientation), _solid(scene, obstacle))
 
 
 def fingers_reach(
@@ -245,7 +239,8 @@ def _sharper(scene: Scene, found: Iterable[Overlap], tolerance: float) -> Iterat
         depth = overlap.depth
         if hulls & {first, second}:
             if second in hardware.LINK_NAMES:
-                links = links or _links(scene)
+                height = float(scene.parameters["robot", "height"])
+                links = links or _placed_links(scene.state.joint_positions, height)
                 deep = max(sides_depth(_solid(scene, first), part) for part in links[second])
             elif second in ("floor", "stage"):
                 corners = _solid(scene, first).corners
@@ -266,11 +261,6 @@ def _solid(scene: Scene, name: str) -> Convex:
         return placed(hull, parameters[name, "position"], parameters[name, "orientation"])
     pose = scene.state.blocks[structure.blocks.index(name)]
     return placed(hull, pose[:3], pose[3:7])
-
-
-def _links(scene: Scene) -> dict[str, list[Convex]]:
-    height = float(scene.parameters["robot", "height"])
-    return _placed_links(scene.state.joint_positions, height)
 
 
 def _placed_links(joints: ArrayLike, height: float) -> dict[str, list[Convex]]:

@@ -88,42 +88,29 @@ def _pile(
 
 @lru_cache(maxsize=512)
 def _dropped(lone: bytes, each: bytes) -> bytes:
-    """Simulate a pile once, and remember it."""
+    """Simulate a pile once, and remember it: poses of the blocks, shape (n, 7)."""
+    from scm_world.backends import make_backend  # it loads an engine
+
     size, mass, floor, *gravity = np.frombuffer(lone).tolist()
     drops = np.frombuffer(each).reshape(-1, 7)
     names = tuple(f"block_{index}" for index in range(len(drops)))
     structure = Structure(names)
-    parameters = default_parameters(structure)
     common = {("world", "gravity"): gravity, ("floor", "friction"): floor}
     common[("robot", "height")] = AWAY
     for name, drop in zip(names, drops, strict=True):
         common |= {(name, "size"): [size] * 3, (name, "mass"): mass, (name, "friction"): drop[6]}
-    parameters |= {key: np.asarray(value, dtype=np.float64) for key, value in common.items()}
-    scene = Scene(structure, parameters, _waiting(len(names)))
-    return _simulated(scene, size, drops[:, :6]).tobytes()
-
-
-def _waiting(count: int) -> PhysicalState:
-    """Give the state in which all blocks are in the sky, far from one another."""
-    state = PhysicalState(count)
-    state.joint_positions[:] = hardware.RAISED
-    state.positions[:, 0] = 10.0 * np.arange(count)
-    state.positions[:, 2] = SKY
-    return state
-
-
-def _simulated(scene: Scene, size: float, drops: Floats) -> Floats:
-    """Drop the blocks of a scene, shape (n, 7)."""
-    from scm_world.backends import make_backend  # it loads an engine
-
-    rest, state = scene.state, scene.state.copy()
-    substeps = round(FALL / scene.structure.preset.timestep)
+    changed = {key: np.asarray(value, dtype=np.float64) for key, value in common.items()}
+    rest = PhysicalState(len(names))  # all blocks are in the sky, far from one another
+    rest.joint_positions[:] = hardware.RAISED
+    rest.positions[:, 0] = 10.0 * np.arange(len(names))
+    rest.positions[:, 2] = SKY
+    state, substeps = rest.copy(), round(FALL / structure.preset.timestep)
     engine = make_backend(ENGINE)
-    engine.build(scene)
+    engine.build(Scene(structure, default_parameters(structure) | changed, rest))
     for index, drop in enumerate(drops):
         state.vector[:27] = rest.vector[:27]
         state.blocks[index:] = rest.blocks[index:]
-        state.orientations[index] = turned = from_rotation_vector(drop[3:])
+        state.orientations[index] = turned = from_rotation_vector(drop[3:6])
         low = lowest_point(np.full(3, size), turned)
         state.positions[index] = _lifted(drop[:3], low, state.positions[:index], size)
         engine.apply(Difference(state=state.copy()))
@@ -131,7 +118,7 @@ def _simulated(scene: Scene, size: float, drops: Floats) -> Floats:
         engine.read(state)
     engine.close()
     inside = np.clip(state.positions, *numbers.POSITION_BOUNDS.bounds((3,), {}))
-    return np.concatenate([inside, state.orientations], axis=1)
+    return np.concatenate([inside, state.orientations], axis=1).tobytes()
 
 
 def _lifted(place: Floats, low: float, there: Floats, size: float) -> Floats:

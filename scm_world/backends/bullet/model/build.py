@@ -21,7 +21,7 @@ from scm_world.geometry.rotations import (
     quaternion_product,
     rotation_matrix,
 )
-from scm_world.models.bodies import Bodies, Geom, Joint
+from scm_world.models.bodies import Geom, Joint, ModelBodies
 
 Handle = tuple[int, int]
 """A multibody and a link of it; -1 is its base."""
@@ -125,7 +125,7 @@ class _Links:
         return self._columns
 
 
-def build(engine: Any, client: int, bodies: Bodies) -> Built:
+def build(engine: Any, client: int, bodies: ModelBodies) -> Built:
     """Make everything, in an empty client; without motors, damping and sleep."""
     built = Built(joints=[(-1, -1)] * len(bodies.joints), geoms=[(-1, -1)] * len(bodies.geoms))
     roots = bodies.roots
@@ -172,7 +172,7 @@ def _composed(
     return moved, quaternion_product(turn, np.array(orientation))
 
 
-def places_of_fixed(bodies: Bodies) -> dict[int, tuple[Floats, Floats]]:
+def places_of_fixed(bodies: ModelBodies) -> dict[int, tuple[Floats, Floats]]:
     """Give position and orientation in the world of the bodies that cannot move."""
     places = {0: (np.zeros(3), _UNTURNED)}
     for number, body in enumerate(bodies.bodies):
@@ -203,7 +203,7 @@ def _shape(engine: Any, client: int, geom: Geom) -> int:
 def _add_tree(
     engine: Any,
     client: int,
-    bodies: Bodies,
+    bodies: ModelBodies,
     members: list[int],
     places: dict[int, tuple[Floats, Floats]],
     built: Built,
@@ -304,7 +304,7 @@ def _settle(engine: Any, client: int, made: int, joints: list[tuple[Joint, int]]
             )
 
 
-def _couple(engine: Any, client: int, bodies: Bodies, built: Built) -> None:
+def _couple(engine: Any, client: int, bodies: ModelBodies, built: Built) -> None:
     """Let joints follow others."""
     for coupling in bodies.couplings:
         multibody, link = built.joints[coupling.joint]
@@ -329,7 +329,7 @@ def _couple(engine: Any, client: int, bodies: Bodies, built: Built) -> None:
 
 
 def _choose_pairs(
-    engine: Any, client: int, bodies: Bodies, roots: tuple[int, ...], built: Built
+    engine: Any, client: int, bodies: ModelBodies, roots: tuple[int, ...], built: Built
 ) -> None:
     """Say which shapes may touch: by groups what most pairs do, and one by one the others."""
     moving = [bool(roots[geom.body]) for geom in bodies.geoms]
@@ -356,7 +356,7 @@ def _choose_pairs(
             )
 
 
-def solid(bodies: Bodies, body: int) -> tuple[Floats, Floats]:
+def solid(bodies: ModelBodies, body: int) -> tuple[Floats, Floats]:
     """Give the principal moments [kg m²] and axes of a body, with the armature of its hinge.
 
     The motor of the only hinge of a body that hangs on the world turns as fast as the body: it is

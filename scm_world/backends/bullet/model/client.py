@@ -15,7 +15,7 @@ from scm_world.backends.bullet.model.forces import Forces
 from scm_world.backends.bullet.model.support import changes, shares, unsupported, usual_friction
 from scm_world.backends.bullet.values import Values
 from scm_world.errors import ModelError, NotIntervenable, UnknownOption
-from scm_world.models.bodies import Bodies
+from scm_world.models.bodies import ModelBodies
 from scm_world.models.model import Model
 from scm_world.models.scene import ControlMode, ParameterKey
 
@@ -225,7 +225,7 @@ class ModelClient(Client):
         self._set_world()
         self._follow()
 
-    def _find(self, bodies: Bodies, built: Built, size: int) -> None:
+    def _find(self, bodies: ModelBodies, built: Built, size: int) -> None:
         """Remember how states are written and read."""
         self._size = size
         self._frames: list[Frame] = []

@@ -28,7 +28,7 @@ from scm_world.backends.bullet.vectors import (
     vector,
 )
 from scm_world.geometry.rotations import rotation_kernel
-from scm_world.models.bodies import Bodies
+from scm_world.models.bodies import ModelBodies
 
 HINGE, SLIDE, BALL, FREE = range(4)
 KINDS = {"hinge": HINGE, "slide": SLIDE, "ball": BALL, "free": FREE}
@@ -37,8 +37,8 @@ WIDTH = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
 """How many numbers of the state say where a joint is; its velocities follow."""
 
 
-class JointArrays(NamedTuple):
-    """JointArrays as arrays, n of them.
+class Joints(NamedTuple):
+    """Joints as arrays, n of them.
 
     Attributes:
         kinds: Shape (n,).
@@ -123,7 +123,7 @@ class Forces:
         dofs: First degree of freedom of each joint.
     """
 
-    def __init__(self, bodies: Bodies) -> None:
+    def __init__(self, bodies: ModelBodies) -> None:
         joints, actuators = bodies.joints, bodies.actuators
         sizes = [DOFS[joint.kind] for joint in joints]
         self.dofs: list[int] = np.cumsum([0, *sizes])[:-1].tolist()
@@ -140,7 +140,7 @@ class Forces:
         brakes = any(joint.damping for joint in joints)
         brakes = brakes or any(servo[1] or servo[3] for servo in servos)
         infinite = (-math.inf, math.inf)
-        self._joints = JointArrays(
+        self._joints = Joints(
             np.array([KINDS[joint.kind] for joint in joints], dtype=np.int64),
             np.array([joint.start for joint in joints], dtype=np.int64),
             np.array(self.dofs, dtype=np.int64),
@@ -191,7 +191,7 @@ def _rows(rows: list[tuple[float, ...]], width: int) -> Floats:
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
-def _links(bodies: Bodies, joints: JointArrays, needed: bool) -> Links:
+def _links(bodies: ModelBodies, joints: Joints, needed: bool) -> Links:
     """Describe what moves by arrays; none if that is not needed."""
     moving = [number for number, root in enumerate(bodies.roots) if root and needed]
     row = {number: i for i, number in enumerate(moving)}
@@ -238,7 +238,7 @@ def _links(bodies: Bodies, joints: JointArrays, needed: bool) -> Links:
 def _forces(
     state: Floats,
     command: Floats,
-    joints: JointArrays,
+    joints: Joints,
     actuators: Actuators,
     links: Links,
     gravity: Floats,
@@ -267,7 +267,7 @@ def _forces(
 def _act(
     state: Floats,
     command: Floats,
-    joints: JointArrays,
+    joints: Joints,
     actuators: Actuators,
     forces: Floats,
     slopes: Floats,
@@ -296,7 +296,7 @@ def _act(
 
 
 @njit(cache=True)
-def _resist(state: Floats, joints: JointArrays, forces: Floats, slopes: Floats) -> None:
+def _resist(state: Floats, joints: Joints, forces: Floats, slopes: Floats) -> None:
     """Cut the forces of actuators, and add those of springs and dampers.
 
     Source:
@@ -320,7 +320,7 @@ def _resist(state: Floats, joints: JointArrays, forces: Floats, slopes: Floats) 
 
 @njit(cache=True)
 def _dynamics(
-    state: Floats, joints: JointArrays, links: Links, gravity: Floats
+    state: Floats, joints: Joints, links: Links, gravity: Floats
 ) -> tuple[Floats, Floats]:
     """Compute the mass matrix, shape (n_dofs, n_dofs), and the bias, shape (n_dofs,).
 
@@ -370,7 +370,7 @@ def _move(
     i: int,
     joint: int,
     state: Floats,
-    joints: JointArrays,
+    joints: Joints,
     turns: Floats,
     places: Floats,
     points: Floats,

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Literal
 
-from scm_world.models.bodies import Bodies, Joint
+from scm_world.models.bodies import Joint, ModelBodies
 from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey
 
 
-def shares(bodies: Bodies, usual: float) -> list[float]:
+def shares(bodies: ModelBodies, usual: float) -> list[float]:
     """Give each shape a number, so that a contact has the product of two as its friction.
 
     A model says the larger of two coefficients. The product is that wherever a moving shape
@@ -41,7 +41,7 @@ def shares(bodies: Bodies, usual: float) -> list[float]:
     ]
 
 
-def usual_friction(bodies: Bodies) -> float:
+def usual_friction(bodies: ModelBodies) -> float:
     """Give the coefficient in the middle of those of the moving shapes, as in the model's file."""
     moving = [geom for geom in bodies.geoms if bodies.roots[geom.body]]
     return statistics.median_low([0.0 if g.slippery else g.friction for g in moving] or [0.0])
@@ -55,7 +55,7 @@ REBUILT = {
     "joints": ("position", "axis", "reference", "armature"),
     "geoms": ("position", "orientation", "size"),
 }
-"""What only new bodies can take on, by table of ``Bodies``."""
+"""What only new bodies can take on, by table of ``ModelBodies``."""
 
 LIVE = {
     "bodies": ("mass", "inertia"),
@@ -73,7 +73,7 @@ def unsupported(model: Model) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=64)
-def _unsupported(bodies: Bodies) -> tuple[str, ...]:
+def _unsupported(bodies: ModelBodies) -> tuple[str, ...]:
     roots = bodies.roots
     found = [*bodies.missing, *_of_joints(bodies)]
     for coupling in bodies.couplings:
@@ -93,7 +93,7 @@ def _unsupported(bodies: Bodies) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _of_joints(bodies: Bodies) -> Iterator[str]:
+def _of_joints(bodies: ModelBodies) -> Iterator[str]:
     """List what joints ask for in vain."""
     for joint in bodies.joints:
         scalar = joint.kind in ("hinge", "slide")
@@ -112,14 +112,14 @@ def _of_joints(bodies: Bodies) -> Iterator[str]:
             yield f"damping of the free joint {joint.name!r}"
 
 
-def takes_armature(bodies: Bodies, body: int) -> bool:
+def takes_armature(bodies: ModelBodies, body: int) -> bool:
     """Tell whether the armature of the joint of a body is as if the body had more inertia."""
     joints = [bodies.joints[joint] for joint in bodies.joints_of(body)]
     fixed = not bodies.roots[bodies.bodies[body].parent]
     return fixed and len(joints) == 1 and joints[0].kind == "hinge"
 
 
-def _links(bodies: Bodies, members: list[int]) -> int:
+def _links(bodies: ModelBodies, members: list[int]) -> int:
     """Count the links of a multibody."""
     links = sum(geom.body in members for geom in bodies.geoms)
     for member in members:
@@ -136,7 +136,7 @@ def supports(model: Model, key: ParameterKey) -> bool:
 
 
 @lru_cache(maxsize=64)
-def changes(bodies: Bodies) -> Mapping[ParameterKey, Literal["live", "rebuilt"]]:
+def changes(bodies: ModelBodies) -> Mapping[ParameterKey, Literal["live", "rebuilt"]]:
     """Map the parameters that the engine has to what a change of them takes."""
     found: dict[ParameterKey, Literal["live", "rebuilt"]] = {}
     for key, place in bodies.places.items():
@@ -152,7 +152,7 @@ def changes(bodies: Bodies) -> Mapping[ParameterKey, Literal["live", "rebuilt"]]
     return found
 
 
-def _is_of(bodies: Bodies, joint: Joint, fields: set[str]) -> bool:
+def _is_of(bodies: ModelBodies, joint: Joint, fields: set[str]) -> bool:
     """Tell whether a joint can have something."""
     if "armature" in fields:
         return takes_armature(bodies, joint.body)
