@@ -19,7 +19,6 @@ from scm_world.backends.renderer.pixels import (
     depth_and_segmentation,
     goal_pixels,
     now_pixels,
-    pixels,
     resized,
 )
 
@@ -39,7 +38,6 @@ __all__ = [
     "goal_pixels",
     "now_pixels",
     "picture",
-    "pixels",
     "render",
     "resized",
     "scene_camera",

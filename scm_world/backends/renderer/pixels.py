@@ -105,47 +105,6 @@ def goal_pixels(
     _draw_all(scene, content, cameras, out, convention)
 
 
-def pixels(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    *,
-    goals: Scene | None = None,
-    size: tuple[int, int] | None = None,
-    convention: Convention = PLAIN,
-) -> Colors:
-    """Draw the pixel observation: what cameras see now, and then what they should see.
-
-    Args:
-        scene: What to show.
-        cameras: Where from; all with pictures of one size.
-        goals: The scene whose goals to show; if not given, ``scene``.
-        size: Height and width of the pictures; if not given, those of the cameras [pixels].
-        convention: How pixels are laid out.
-
-    Returns:
-        uint8 of shape (2 n, 3, h, w), or (2 n, h, w, 3) with channels last: ``now_pixels`` and
-        then ``goal_pixels``.
-
-    Raises:
-        ValueError: There are no cameras, or their sizes differ.
-
-    Example:
-        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
-        >>> from scm_world.tasks.trifinger.cameras import CAMERAS
-        >>> pixels(default_scene(Structure()), CAMERAS, size=(64, 96)).shape
-        (6, 3, 64, 96)
-    """
-    if size is not None:
-        cameras = resized(cameras, *size)
-    if not cameras:
-        raise ValueError("cameras: there must be at least one")
-    n = len(cameras)
-    out = np.empty((2 * n, *convention.shape(cameras[0])), dtype=np.uint8)
-    now_pixels(scene, cameras, out[:n], convention=convention)
-    goal_pixels(scene if goals is None else goals, cameras, out[n:], convention=convention)
-    return out
-
-
 def depth_and_segmentation(
     scene: Scene, cameras: Sequence[Camera], *, convention: Convention = PLAIN
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -57,34 +57,35 @@ class Built:
     owners: dict[Handle, str] = field(default_factory=dict)
 
 
+COLUMNS = (
+    "linkMasses",
+    "linkCollisionShapeIndices",
+    "linkVisualShapeIndices",
+    "linkPositions",
+    "linkOrientations",
+    "linkInertialFramePositions",
+    "linkInertialFrameOrientations",
+    "linkParentIndices",
+    "linkJointTypes",
+    "linkJointAxis",
+)
+"""What ``createMultiBody`` is told of every link."""
+
+
 @final
 class _Links:
     """The links of a multibody that is not made yet.
 
     Args:
         engine: The module ``pybullet``.
+
+    Attributes:
+        rows: What the engine is told of each: see ``COLUMNS``.
     """
 
     def __init__(self, engine: Any) -> None:
         self._fixed = engine.JOINT_FIXED
-        self._columns: dict[str, list[Any]] = {
-            name: []
-            for name in (
-                "linkMasses",
-                "linkCollisionShapeIndices",
-                "linkVisualShapeIndices",
-                "linkPositions",
-                "linkOrientations",
-                "linkInertialFramePositions",
-                "linkInertialFrameOrientations",
-                "linkParentIndices",
-                "linkJointTypes",
-                "linkJointAxis",
-            )
-        }
-
-    def __len__(self) -> int:
-        return len(self._columns["linkMasses"])
+        self.rows: list[list[Any]] = []
 
     def add(
         self,
@@ -97,32 +98,16 @@ class _Links:
         axis: tuple[float, ...] = (0.0, 0.0, 1.0),
     ) -> int:
         """Add a link without mass whose frame is given in that of its parent."""
-        row = (
-            0.0,
-            shape,
-            -1,
-            position.tolist(),
-            orientation.tolist(),
-            [0.0, 0.0, 0.0],
-            _UNTURNED.tolist(),
-            parent + 1,  # the engine counts from the base
-            self._fixed if kind is None else kind,
-            list(axis),
-        )
-        for column, value in zip(self._columns.values(), row, strict=True):
-            column.append(value)
-        return len(self) - 1
+        frame = [position.tolist(), orientation.tolist(), [0.0, 0.0, 0.0], _UNTURNED.tolist()]
+        joint = [self._fixed if kind is None else kind, list(axis)]
+        # The engine counts parents from the base.
+        self.rows.append([0.0, shape, -1, *frame, parent + 1, *joint])
+        return len(self.rows) - 1
 
     def load(self, link: int, mass: float, center: Floats, axes: Floats) -> None:
         """Give a link a mass, whose center and principal axes are in the frame of the link."""
-        self._columns["linkMasses"][link] = mass
-        self._columns["linkInertialFramePositions"][link] = center.tolist()
-        self._columns["linkInertialFrameOrientations"][link] = axes.tolist()
-
-    @property
-    def arguments(self) -> dict[str, list[Any]]:
-        """The arguments of ``createMultiBody`` that say which links there are."""
-        return self._columns
+        row = self.rows[link]
+        row[0], row[5], row[6] = mass, center.tolist(), axes.tolist()
 
 
 def build(engine: Any, client: int, bodies: ModelBodies) -> Built:
@@ -256,7 +241,10 @@ def _add_tree(
     # What touches what is said by pairs alone, also within the multibody.
     flags = engine.URDF_USE_SELF_COLLISION | engine.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
     made = engine.createMultiBody(
-        flags=flags, physicsClientId=client, **base, **(links.arguments if len(links) else {})
+        flags=flags,
+        physicsClientId=client,
+        **base,
+        **dict(zip(COLUMNS, map(list, zip(*links.rows, strict=True)), strict=bool(links.rows))),
     )
     built.bodies.update((number, (made, link)) for number, link in carrier.items())
     for joint, link in joint_links.items():
