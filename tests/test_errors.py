@@ -46,7 +46,9 @@ from scm_world.errors import (
 )
 
 CLASSES = [
-    c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, ScmWorldError)
+    c
+    for name, c in inspect.getmembers(errors, inspect.isclass)
+    if issubclass(c, ScmWorldError) and not name.startswith("_")
 ]
 
 EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [

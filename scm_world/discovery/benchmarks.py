@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from itertools import product
 from threading import Event, Lock
@@ -22,7 +21,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import load, whole_number
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
@@ -165,9 +164,7 @@ class BenchmarkResult:
         Raises:
             MissingExtra: pandas is not installed.
         """
-        if find_spec("pandas") is None:
-            raise MissingExtra("pandas", "data")
-        return import_module("pandas").DataFrame(self.records)
+        return load("pandas", "pandas", "data").DataFrame(self.records)
 
     def write(self, folder: Location | str) -> None:
         """Write ``benchmark.json``, ``results.csv``, ``results.md``, a picture and a report."""
@@ -578,7 +575,12 @@ class _Runner:
 
     def run(self, job: _Job) -> BenchmarkRun:
         """Do a prepared job; a failure of the learner is recorded in the run."""
-        table = None if job.run.data == "paired" else self._rows(job.run)
+        table = None
+        if job.run.data != "paired":
+            whole = self._data[job.run.data]
+            each = len(whole) / len(np.unique(whole.episode))
+            part = whole.first(math.ceil(job.run.budget / each))
+            table = part.standardised() if job.run.standardised else part
         started = time.perf_counter()
         try:
             run = self._learned(job.run, table)
@@ -589,12 +591,6 @@ class _Runner:
             seconds, said = time.perf_counter() - started, in_one_line(error)
             return replace(job.run, status="failed", message=said, seconds=seconds)
         return run
-
-    def _rows(self, run: BenchmarkRun) -> Dataset:
-        whole = self._data[run.data]
-        each = len(whole) / len(np.unique(whole.episode))
-        part = whole.first(math.ceil(run.budget / each))
-        return part.standardised() if run.standardised else part
 
     def _learned(self, run: BenchmarkRun, table: Dataset | None) -> BenchmarkRun:
         made: Any = self._problem

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
-from importlib import import_module
 from itertools import islice
 from typing import Literal
 
 import numpy as np
 
-from scm_world.errors import MissingExtra
+from scm_world._arguments import load
 from scm_world.graph.equivalence import (
     Bools,
     cpdag,
@@ -76,12 +75,10 @@ def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:
         Peters and Bühlmann, *Structural intervention distance for evaluating causal graphs*,
         Neural Computation 2015; computed by ``gadjid``.
     """
-    if not has_gadjid():
-        raise MissingExtra("gadjid", "discovery")
+    distance = load("gadjid", "gadjid", "discovery").sid
     members = list(islice(extensions(found), MEMBERS + 1))
     if not 0 < len(members) <= MEMBERS:
         return None
-    distance = import_module("gadjid").sid
     wrong = [
         distance(true.astype(np.int8), member.astype(np.int8), edge_direction=ROWS)[1]
         for member in members
@@ -113,15 +110,13 @@ def aid(found: Bools, true: Bools, kind: Adjustment) -> int | None:
         Henckel, Würtzen and Weichwald, *Adjustment identification distance: a gadjid for causal
         structure learning*, UAI 2024.
     """
-    if not has_gadjid():
-        raise MissingExtra("gadjid", "discovery")
+    distance = getattr(load("gadjid", "gadjid", "discovery"), f"{kind}_aid")
     member = extension(found)
     if member is None or not is_acyclic(true):
         return None
     closed = meek(found)
     if not is_chain_graph(closed):
         return None
-    distance = getattr(import_module("gadjid"), f"{kind}_aid")
     # 1 for an edge with a direction, 2 for one without
     coded = [graph.astype(np.int8) + (graph & graph.T).astype(np.int8) for graph in (true, closed)]
     _, wrong = distance(*coded, edge_direction=ROWS)

@@ -335,7 +335,11 @@ class WorldProblem:
             self._world.close()
             raise
         backend = self._world.backend
-        self.version = f"{backend.name} {backend.version} {_source_version(name)}".strip()
+        file = None if name in TASKS else name
+        if ":" in name:
+            file = inspect.getsourcefile(load_factory(name))
+        mark = "" if file is None else hashlib.sha256(read_bytes(file)).hexdigest()[:16]
+        self.version = f"{backend.name} {backend.version} {mark}".strip()
 
     def _chosen(self) -> tuple[str, ...]:
         """Choose what varies: with what is computed from it, since that can be set, too."""
@@ -533,7 +537,11 @@ def problem(name: str, *, seed: int = 0, view: TaskView | None = None) -> Proble
     if name.partition(":")[0] in FAMILIES:
         return SCMProblem(name, random_model(name, seed))
     if name.endswith(".json"):
-        return SCMProblem(Path(name).stem, _read(Path(name)))
+        try:
+            return SCMProblem(Path(name).stem, from_json(read_text(Path(name))))
+        except (OSError, ValueError) as error:
+            advice = "give a file that scm_world.graph.to_json wrote"
+            raise UnreadableFile(name, " ".join(str(error).split()), advice) from None
     if ":" in name:
         made = load_factory(name)(**view.arguments)
         if isinstance(made, SCM | Problem):
@@ -554,19 +562,3 @@ def problem_label(name: str, view: TaskView) -> str:
     short = f"{Path(home).stem if home.endswith('.py') else home}:{function}" if colon else name
     short = Path(name).stem if name.endswith(FILES) else short
     return f"{short}/step" if view.view == "step" else short
-
-
-def _read(path: Path) -> SCM:
-    try:
-        return from_json(read_text(path))
-    except (OSError, ValueError) as error:
-        advice = "give a file that scm_world.graph.to_json wrote"
-        raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from None
-
-
-def _source_version(name: str) -> str:
-    """Return a hash of the file that a world comes from; empty for tasks of this package."""
-    if name in TASKS:
-        return ""
-    file = inspect.getsourcefile(load_factory(name)) if ":" in name else name
-    return "" if file is None else hashlib.sha256(read_bytes(file)).hexdigest()[:16]

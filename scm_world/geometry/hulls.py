@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise, permutations, product
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
@@ -212,7 +212,13 @@ def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:
     middle = cloud.mean(axis=0) if len(cloud) else np.zeros(3)
     if len(cloud) < 4 or extent == 0.0:
         raise ModelError([f"{len(cloud)} points have no volume; give four or more"])
-    wrapped = _wrap((cloud - middle) / extent)
+    thickness = np.linalg.svd((cloud - middle) / extent, compute_uv=False)
+    if thickness[2] <= THINNEST * thickness[0]:
+        raise ModelError(["the points lie in one plane and have no volume"])
+    try:
+        wrapped = ConvexHull((cloud - middle) / extent, qhull_options=f"Qt C-{ROUGHNESS}")
+    except QhullError as error:
+        raise ModelError([f"the points have no convex hull: {error}"]) from error
     if len(wrapped.vertices) > MOST_VERTICES:
         raise ModelError(
             [
@@ -221,22 +227,20 @@ def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:
             ]
         )
     sides = _sides(wrapped.points, wrapped.simplices, wrapped.equations)
-    return _assemble(sides, wrapped.points, middle, extent)
-
-
-def _wrap(cloud: Floats) -> Any:
-    """Let Qhull find the hull of points whose extent is one."""
-    try:
-        from scipy.spatial import ConvexHull, QhullError
-    except ImportError as error:
-        raise MissingExtra("scipy", "mesh") from error
-    thickness = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
-    if thickness[2] <= THINNEST * thickness[0]:
-        raise ModelError(["the points lie in one plane and have no volume"])
-    try:
-        return ConvexHull(cloud, qhull_options=f"Qt C-{ROUGHNESS}")
-    except QhullError as error:
-        raise ModelError([f"the points have no convex hull: {error}"]) from error
+    used = sorted({corner for _, corners in sides for corner in corners})
+    number = {corner: n for n, corner in enumerate(used)}
+    vertices = middle + extent * wrapped.points[used]
+    faces, planes = [], []
+    for normal, corners in sides:
+        first, *fan = (number[corner] for corner in corners)
+        faces += [(first, q, r) for q, r in pairwise(fan)]
+        planes.append([*normal, float(np.max(vertices @ normal))])
+    edges = {(f[k], f[(k + 1) % 3]) for f in faces for k in range(3)}
+    if len(edges) != 3 * len(faces) or any((q, p) not in edges for p, q in edges):
+        raise ModelError(  # some sides were too thin to be told apart
+            ["corners of the mesh nearly coincide, so that it has no clean surface; merge them"]
+        )
+    return vertices, np.array(faces, dtype=np.int64), np.array(planes)
 
 
 def _sides(points: Floats, triangles: Integers, planes: Floats) -> list[tuple[Floats, list[int]]]:
@@ -257,44 +261,13 @@ def _sides(points: Floats, triangles: Integers, planes: Floats) -> list[tuple[Fl
     for group, corners in zip(groups, members, strict=True):
         normal = planes[group[0], :3]
         kept = corners[count[corners] >= 3]  # others lie inside an edge or a side
-        sides.append((normal, _counterclockwise(points, kept, normal)))
+        spokes = points[kept] - points[kept].mean(axis=0)
+        right = spokes[np.argmax(np.linalg.norm(spokes, axis=1))]
+        angles = np.arctan2(spokes @ np.cross(normal, right), spokes @ right)
+        order: list[int] = kept[np.argsort(angles, kind="stable")].tolist()
+        start = order.index(min(order))
+        sides.append((normal, order[start:] + order[:start]))
     return sides
-
-
-def _counterclockwise(points: Floats, corners: Integers, normal: Floats) -> list[int]:
-    """Order the corners of a flat side as they are seen from outside."""
-    spokes = points[corners] - points[corners].mean(axis=0)
-    right = spokes[np.argmax(np.linalg.norm(spokes, axis=1))]
-    angles = np.arctan2(spokes @ np.cross(normal, right), spokes @ right)
-    order: list[int] = corners[np.argsort(angles, kind="stable")].tolist()
-    start = order.index(min(order))
-    return order[start:] + order[:start]
-
-
-def _assemble(
-    sides: Iterable[tuple[Floats, list[int]]], points: Floats, middle: Floats, extent: float
-) -> tuple[Floats, Integers, Floats]:
-    """Number the corners anew, cut sides into triangles, and give them back their size."""
-    sides = list(sides)
-    used = sorted({corner for _, corners in sides for corner in corners})
-    number = {corner: n for n, corner in enumerate(used)}
-    vertices = middle + extent * points[used]
-    faces, planes = [], []
-    for normal, corners in sides:
-        first, *fan = (number[corner] for corner in corners)
-        faces += [(first, q, r) for q, r in pairwise(fan)]
-        planes.append([*normal, float(np.max(vertices @ normal))])
-    _check_closed(faces)
-    return vertices, np.array(faces, dtype=np.int64), np.array(planes)
-
-
-def _check_closed(faces: list[tuple[int, int, int]]) -> None:
-    """Refuse a surface with a hole: some sides were too thin to be told apart."""
-    edges = {(f[k], f[(k + 1) % 3]) for f in faces for k in range(3)}
-    if len(edges) != 3 * len(faces) or any((q, p) not in edges for p, q in edges):
-        raise ModelError(
-            ["corners of the mesh nearly coincide, so that it has no clean surface; merge them"]
-        )
 
 
 def _second_moments(vertices: Floats, faces: Integers) -> tuple[Floats, Floats, float]:

@@ -23,7 +23,7 @@ from scm_world.errors import (
 from scm_world.output.durable import write_durably
 from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
-from scm_world.queries.episodes import Episode, episode_of
+from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.queries.rollouts import Trace, Unit
@@ -181,7 +181,7 @@ def load_episode(
     if _digest(trace) != about["parameters"]:
         raise SnapshotMismatch(f"{file} happens with other parameters than it did")
     _compare(trace, np.split(states, np.cumsum(lengths)[:-1]), file, about["versions"])
-    return episode_of(twins, unit, trace)
+    return Episode(twins, unit, trace)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, final
 
 import numpy as np
@@ -34,29 +33,23 @@ class Episode:
 
     Everything is exact: an episode can be gone through again, and branched off, bit for bit.
 
-    Attributes:
+    Args:
         twins: Twins of the world that it happened in.
+        unit: What was to happen.
+        trace: What it left behind.
+
+    Attributes:
         seed: Of the noise.
         number: Of the episode within that noise.
         layers: Plans, each with the control step from which it counts.
         steps: How many control steps it has.
-        trace: What it left behind.
     """
 
-    def __init__(
-        self,
-        twins: AnyTwins,
-        *,
-        seed: int,
-        number: int,
-        layers: Sequence[Layer],
-        steps: int,
-        trace: Trace,
-    ) -> None:
+    def __init__(self, twins: AnyTwins, unit: Unit, trace: Trace) -> None:
         self.twins: Any = twins
-        self.seed, self.number = seed, number
-        self.layers: tuple[Layer, ...] = tuple(layers)
-        self.steps = steps
+        self.seed, self.number = unit.seed, unit.number
+        self.layers: tuple[Layer, ...] = unit.layers
+        self.steps = unit.steps
         self.trace = trace
         self._all: Trace | None = None
 
@@ -166,7 +159,7 @@ class Episode:
         unit = self._unit(do, self._instant(at), actions, as_names(record))
         with self.twins.twin() as world:
             trace = unit.run(world, lambda twin: self._arrive(twin, unit.first))
-        return episode_of(self.twins, unit, trace)
+        return Episode(self.twins, unit, trace)
 
     def _instant(self, at: Any) -> int:
         last = max(self.steps - 1, 0)
@@ -178,14 +171,15 @@ class Episode:
         self, do: Mapping[str, Any] | None, at: int, actions: Any, names: tuple[str, ...]
     ) -> Unit:
         """Say what is to happen from an instant on."""
-        whole = tuple(name for name in names if self._is_whole(name, at))
+        before = [d.model for step, d in self.trace.declarations if step < max(at, 1)]
+        whole = tuple(name for name in names if all(name in model for model in before))
         past = self.trace.until(at)
         past.values = {name: list(self[name][:at]) for name in whole}
-        again = self._again()
+        again, is_replay = self._again(), isinstance(actions, str) and actions == "replay"
         return replace(
             again,
             layers=(*self.layers, (at, Plan(do))),
-            policy=again.policy if _is_replay(actions) else actions,
+            policy=again.policy if is_replay else actions,
             names=whole,
             first=at,
             past=past,
@@ -226,11 +220,6 @@ class Episode:
         run(running, first, last)
         return running.trace
 
-    def _is_whole(self, name: str, at: int) -> bool:
-        """Tell whether a variable is there at every instant before one."""
-        there = (d for step, d in self.trace.declarations if step < max(at, 1))
-        return all(name in declaration.model for declaration in there)
-
     def worlds(
         self,
         dos: Iterable[Mapping[str, Any]],
@@ -257,28 +246,13 @@ class Episode:
                 self._arrive(world, at)
                 start = world.snapshot()
         units = [replace(self._unit(do, at, actions, names), start=start) for do in given]
-        return tuple(run_units(self.twins, units, partial(self._result, units), workers))
 
-    def _result(self, units: Sequence[Unit], place: int, result: Result) -> Episode:
-        if isinstance(result, Exception):
-            raise result
-        return episode_of(self.twins, units[place], result)
+        def finish(place: int, result: Result) -> Episode:
+            if isinstance(result, Exception):
+                raise result
+            return Episode(self.twins, units[place], result)
 
-
-def episode_of(twins: AnyTwins, unit: Unit, trace: Trace) -> Episode:
-    """Give the episode that a unit has become."""
-    return Episode(
-        twins,
-        seed=unit.seed,
-        number=unit.number,
-        layers=unit.layers,
-        steps=unit.steps,
-        trace=trace,
-    )
-
-
-def _is_replay(actions: Any) -> bool:
-    return isinstance(actions, str) and actions == "replay"
+        return tuple(run_units(self.twins, units, finish, workers))
 
 
 def _same(one: Trace, other: Trace) -> bool:

@@ -73,25 +73,21 @@ def run_units(
     if isinstance(twins, EquationTwins):
         return [finish(place, result) for place, result in enumerate(_solved(twins, units))]
     given = None if workers is None else whole_number("workers", workers, least=1)
-    results = _in_parallel(twins, units, given)
-    if results is None:
+    is_child = multiprocessing.parent_process() is not None  # one of many that share the cores
+    threads = given or (1 if is_child else cores())
+    n = _batch_size(twins, units, threads)
+    executor = None if n or twins.batches else executor_for(twins, units, given or 1)
+    if n:
+        results = _in_batches(twins, units, n, threads)
+    elif executor is not None:
+        results = run_in_processes(executor, twins, units)
+    else:
         return _separately(twins, units, finish, given or 1)
     with closing(results):
         return [finish(place, result) for place, result in enumerate(results)]
 
 
 Results = Generator[Result, None, None]
-
-
-def _in_parallel(twins: Twins, units: Sequence[Unit], workers: int | None) -> Results | None:
-    """Run units in batches or in processes; None where neither pays."""
-    is_child = multiprocessing.parent_process() is not None  # one of many that share the cores
-    threads = workers or (1 if is_child else cores())
-    n = _batch_size(twins, units, threads)
-    if n:
-        return _in_batches(twins, units, n, threads)
-    executor = None if twins.batches else executor_for(twins, units, workers or 1)
-    return None if executor is None else run_in_processes(executor, twins, units)
 
 
 def _batch_size(twins: Twins, units: Sequence[Unit], threads: int) -> int:

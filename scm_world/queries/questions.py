@@ -12,7 +12,7 @@ from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries import samples
-from scm_world.queries.episodes import Episode, episode_of
+from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect, effect_of
 from scm_world.queries.outcomes import usual_outcomes
@@ -77,7 +77,7 @@ class Questions(ABC):
                 steps=length(world, steps),
                 names=as_names(record),
             )
-            return episode_of(twins, unit, unit.run(world))
+            return Episode(twins, unit, unit.run(world))
 
     def counterfactual(
         self,

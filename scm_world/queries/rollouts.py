@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import numpy as np
 
@@ -151,24 +151,12 @@ class Unit:
             return error
 
 
-class Runs(Protocol):
-    """Episodes under way: one in a world or in equations, or those in the rows of a batch."""
-
-    def intervene(self, step: int) -> None:
-        """Do what is due at an instant."""
-
-    def record(self, step: int) -> None:
-        """Record an instant, after its interventions."""
-
-    def act(self, step: int) -> None:
-        """Take a control step."""
-
-
-def run(running: Runs, first: int, steps: int) -> None:
+def run(running: Running | RunningTogether, first: int, steps: int) -> None:
     """Run episodes from one instant to another: the only rollout loop of queries.
 
     Args:
-        running: At the instant ``first``, after its interventions; recorded up to that instant.
+        running: Episodes under way, at the instant ``first``, after its interventions; recorded
+            up to that instant.
         first: Number of the first instant.
         steps: Number of the last one.
     """

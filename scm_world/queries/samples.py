@@ -14,7 +14,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import Episode, episode_of
+from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import System
 from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read, watched
 from scm_world.queries.parallel import Result, paths, run_units
@@ -101,7 +101,7 @@ class Setting:
         """
         unit = self.unit(world, self.plan(world, do), number, names)
         with twins.twin() as twin:
-            return episode_of(twins, unit, unit.run(twin))
+            return Episode(twins, unit, unit.run(twin))
 
 
 @final
@@ -200,7 +200,7 @@ def sample(
         nonlocal done
         if isinstance(result, Exception):
             raise result
-        episode = episode_of(twins, units[place], result)
+        episode = Episode(twins, units[place], result)
         found = [read(outcome, episode) for outcome in wanted]
         done += 1
         if progress is not None:

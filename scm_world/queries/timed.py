@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import Field
 
+from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.models import Model
 from scm_world.queries.equations import System
@@ -35,12 +36,6 @@ def as_act(value: Any) -> Any:
     return Hard(given)
 
 
-def _step(option: str, value: Any, *, least: int = 0) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise UnknownOption(option, value, (f"any whole number from {least} on",))
-    return int(value)
-
-
 @final
 class At(Frozen):
     """Intervene at the beginning of one control step.
@@ -59,7 +54,7 @@ class At(Frozen):
     act: Intervention
 
     def __init__(self, step: Any, act: Any, **fields: Any) -> None:
-        super().__init__(step=_step("At(step)", step), act=as_act(act), **fields)  # type: ignore[call-arg]
+        super().__init__(step=whole_number("At(step)", step, least=0), act=as_act(act), **fields)  # type: ignore[call-arg]
 
 
 @final
@@ -85,8 +80,8 @@ class Clamp(Frozen):
     stop: int | None = None
 
     def __init__(self, act: Any, start: Any = 0, stop: Any = None, **fields: Any) -> None:
-        first = _step("Clamp(start)", start)
-        last = None if stop is None else _step("Clamp(stop)", stop, least=first + 1)
+        first = whole_number("Clamp(start)", start, least=0)
+        last = None if stop is None else whole_number("Clamp(stop)", stop, least=first + 1)
         if isinstance(act, Null):
             allowed = ("a value or an intervention on a variable", "At(step, Null())")
             raise UnknownOption("Clamp(act)", act, allowed)
@@ -162,7 +157,7 @@ class Reaches(Frozen):
             raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
         if isinstance(number, str) or np.ndim(number) or not np.isfinite(number):
             raise UnknownOption("threshold of Reaches", number, ("a finite number",))
-        _step("component of Reaches", fields.get("component", 0))
+        whole_number("component of Reaches", fields.get("component", 0), least=0)
         super().__init__(name=name, **fields)  # type: ignore[call-arg]
 
     def happens(self, world: System) -> bool:

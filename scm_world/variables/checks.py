@@ -168,49 +168,23 @@ def check_space(
     Raises:
         OutOfSpace: With the nearest value of the space.
     """
-    if isinstance(space, Subset):
-        _check_subset(variable, value, space, values)
-    else:
-        _check_named(variable, value, space, values)
-
-
-def _check_subset(variable: Variable, value: Value, subset: Subset, values: Values) -> None:
-    region = subset.region(variable.name)
+    region = space.region(variable.name) if isinstance(space, Subset) else space
+    found = variable.space(region) if isinstance(region, str) else region
+    without, near, inside = "", None, False
     if isinstance(region, str):
-        _check_named(variable, value, region, values)
-    elif region is None or not region.contains(value, values):
-        allowed = "∅ (it is not to be set)"
-        if region is not None:
-            allowed = region.describe(variable.shape, values)
-        raise OutOfSpace(
-            variable.name,
-            _plain(value),
-            space=str(subset),
-            allowed=allowed,
-            nearest=None if region is None else _plain(region.nearest(value, values)),
-            unit=variable.unit,
-        )
-
-
-def _check_named(variable: Variable, value: Value, space: SpaceName, values: Values) -> None:
-    declared = variable.space(space)
-    if declared is None:
-        raise OutOfSpace(
-            variable.name,
-            _plain(value),
-            space=space,
-            allowed="∅ (none is declared)",
-            nearest=None,
-            unit=variable.unit,
-        )
-    if not variable.in_space(value, space, values):
-        near = variable.nearest_in_space(value, space, values)
-        raise OutOfSpace(
-            variable.name,
-            _plain(value),
-            space=space,
-            allowed=declared.describe(variable.shape, values)
-            + (" without A" if space == "B" and variable.a not in (None, variable.b) else ""),
-            nearest=None if near is None else _plain(near),
-            unit=variable.unit,
-        )
+        inside = variable.in_space(value, region, values)
+        without = " without A" * (region == "B" and variable.a not in (None, variable.b))
+        near = variable.nearest_in_space(value, region, values)
+    elif region is not None:
+        inside, near = region.contains(value, values), region.nearest(value, values)
+    if inside:
+        return
+    none = "∅ (none is declared)" if isinstance(region, str) else "∅ (it is not to be set)"
+    raise OutOfSpace(
+        variable.name,
+        _plain(value),
+        space=region if isinstance(region, str) else str(space),
+        allowed=none if found is None else found.describe(variable.shape, values) + without,
+        nearest=None if near is None else _plain(near),
+        unit=variable.unit,
+    )

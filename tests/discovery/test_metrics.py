@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -92,7 +93,7 @@ def test_adjustment_distances_are_those_of_gadjid(monkeypatch: pytest.MonkeyPatc
     ring = np.roll(np.eye(3, dtype=bool), 1, axis=1)
     assert aid(ring, np.zeros((3, 3), bool), "parent") is None
 
-    monkeypatch.setattr(distances, "has_gadjid", lambda: False)
+    monkeypatch.setitem(sys.modules, "gadjid", None)
     with pytest.raises(MissingExtra, match=r"scm-world\[discovery\]"):
         aid(two, two, "parent")
 

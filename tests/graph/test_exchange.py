@@ -155,32 +155,34 @@ def test_a_summary_loses_lags(form: str) -> None:
 def test_tigramite_keeps_names_and_lags(graph: CausalGraph) -> None:
     """The array marks the cause with an arrow, and lag 0 in both directions."""
     made = ex.to_tigramite(graph)
-    assert ex.from_tigramite(made.graph, made.var_names) == plain(graph, sliced=False)
+    at = np.argwhere(made.graph == "-->").tolist()
+    found = {(made.var_names[i], made.var_names[j], lag) for i, j, lag in at}
+    assert found == {edge.key for edge in graph.edges}
     instant = sum(edge.lag == 0 for edge in graph.edges)
-    assert (made.graph == "-->").sum() == len(graph.edges)
     assert (made.graph == "<--").sum() == instant
 
 
 def test_dowhy_gets_an_acyclic_networkx_graph(graph: CausalGraph) -> None:
-    """Names and edges only, and the way back."""
+    """Names and edges only."""
     made = ex.to_dowhy(graph)
     assert nx.is_directed_acyclic_graph(made)
-    assert ex.from_dowhy(made) == plain(graph, sliced=True)
+    assert ex.read_as(ex.from_digraph(made), "two_slice") == plain(graph, sliced=True)
 
 
-def test_causal_learn_there_and_back(graph: CausalGraph) -> None:
+def test_causal_learn_has_the_same_edges(graph: CausalGraph) -> None:
     """causal-learn's graph has the same edges."""
     pytest.importorskip("causallearn")
     made = ex.to_causal_learn(graph)
-    assert ex.from_causal_learn(made) == plain(graph, sliced=True)
+    edges = {(e.get_node1().get_name(), e.get_node2().get_name()) for e in made.get_graph_edges()}
+    assert edges == {edge.key[:2] for edge in ex.seen_as(graph, "two_slice").edges}
 
 
-def test_pgmpy_there_and_back(graph: CausalGraph) -> None:
+def test_pgmpy_has_the_same_edges(graph: CausalGraph) -> None:
     """The DAG of pgmpy has the same edges."""
     base = pytest.importorskip("pgmpy.base")
     made = ex.to_pgmpy(graph)
     assert isinstance(made, base.DAG)
-    assert ex.from_pgmpy(made) == plain(graph, sliced=True)
+    assert set(made.edges) == {edge.key[:2] for edge in ex.seen_as(graph, "two_slice").edges}
 
 
 def test_the_file_is_the_text(tmp_path: Path) -> None:
@@ -197,8 +199,9 @@ def test_networkx_reads_node_link_json() -> None:
     assert ex.from_digraph(nx.node_link_graph(data, edges="edges")) == awkward()
 
 
-NAMES = st.text(min_size=1, max_size=6).filter(str.isprintable)
-TEXTS = st.text(max_size=6).filter(str.isprintable)
+EMPTY = ("[]", "()")  # as networkx writes an empty list and tuple in GML
+NAMES = st.text(min_size=1, max_size=6).filter(lambda t: t.isprintable() and t not in EMPTY)
+TEXTS = st.text(max_size=6).filter(lambda t: t.isprintable() and t not in EMPTY)
 
 
 @st.composite
@@ -231,8 +234,6 @@ def test_any_graph_comes_back(first: CausalGraph) -> None:
             read_graph(write_graph(first, format=form, view=view), format=form, view=view) == first
         )
     assert read_graph(write_graph(first, format="csv"), format="csv") == plain(first, sliced=True)
-    made = ex.to_tigramite(first)
-    assert ex.from_tigramite(made.graph, made.var_names) == plain(first, sliced=False)
 
 
 @given(st.text(alphabet="a@=-1", min_size=1), st.integers(0, 3), st.booleans())
@@ -304,26 +305,6 @@ def test_what_cannot_be_read_says_why(form: str, text: str, reason: str) -> None
     with pytest.raises(UnreadableFile, match=f"it is no {form} graph") as error:
         read_graph(text, format=form)
     assert reason in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("array", "names", "reason"),
-    [
-        (np.zeros((2, 1, 1), dtype="<U3"), "xy", "expected shape (2, 2, lags)"),
-        (np.full((1, 1, 2), "o-o"), "x", "'o-o' from 'x' to 'x', lag 0, is no directed edge"),
-        (np.array([[[""], ["-->"]], [[""], [""]]]), "xy", "does not fit ''"),
-    ],
-)
-def test_undirected_graphs_of_tigramite_are_refused(array: Any, names: str, reason: str) -> None:
-    """With the edge and its lag."""
-    with pytest.raises(UnreadableFile, match=re.escape(reason)):
-        ex.from_tigramite(array, names)
-
-
-def test_undirected_graphs_of_networkx_are_refused() -> None:
-    """Also where DoWhy or pgmpy would take them."""
-    with pytest.raises(UnreadableFile, match="not directed"):
-        ex.from_dowhy(nx.Graph([("a", "b")]))
 
 
 def test_what_a_format_cannot_hold_is_refused() -> None:

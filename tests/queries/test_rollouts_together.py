@@ -16,7 +16,7 @@ from scm_world.discovery.data import Design
 from scm_world.discovery.data.collect import source_of
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
 from scm_world.queries import At, Clamp, Contact, On, Outcome, Reaches, World, parallel
-from scm_world.queries.episodes import episode_of
+from scm_world.queries.episodes import Episode
 from scm_world.queries.parallel import is_known, run_together
 from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.samples import Setting
@@ -152,7 +152,7 @@ def test_branches_together_are_those_alone(at: int) -> None:
     (unit,) = units_of(world, [event], steps=24, policy="across")
     (ending,) = together(twins, [unit])
     assert isinstance(ending, Trace)
-    episode = episode_of(twins, unit, ending)
+    episode = Episode(twins, unit, ending)
     lived = world.rollout("across", seed=0, do=event, steps=24)
     assert episode == lived
     assert not episode.trace.snapshots

@@ -29,7 +29,7 @@ from scm_world.env.observer import published
 from scm_world.errors import BudgetExhausted, InterventionError, UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.policies.scripted import Sequence as Given
-from scm_world.queries.episodes import Episode, episode_of
+from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.outcomes import Outcome, as_outcome
@@ -148,7 +148,7 @@ class WorldSource:
                 raise result
             found: Floats | str = str(result)
             if not isinstance(result, Exception):
-                found = self._row(episode_of(self._twins, units[place], result))
+                found = self._row(Episode(self._twins, units[place], result))
             with lock:
                 tell(1)
             return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, count
 from typing import Literal, TypeVar, final
@@ -217,7 +217,7 @@ def coloring(parents: Bools) -> ExperimentPlan:
     """Plan experiments in which no effect has two of its declared causes moved at once.
 
     All causes of one color are moved together. An effect that answers to a color without one of
-    its causes has a cause that is not declared; ``bisect`` finds it.
+    its causes has a cause that is not declared; ``culprit`` finds it.
 
     Args:
         parents: Declared causes by effects, shape (p, q).
@@ -245,46 +245,34 @@ def coloring(parents: Bools) -> ExperimentPlan:
 # --- finding who did it -----------------------------------------------------------------------
 
 
-def bisect(candidates: Sequence[Cause]) -> Generator[tuple[Cause, ...], bool, Cause]:
-    """Find which of some candidates moves an effect, by halves.
+def culprit(candidates: Sequence[Cause], moves: Callable[[tuple[Cause, ...]], bool]) -> Cause:
+    """Find a candidate that moves an effect, by halves; at least one has to.
 
-    Yields the candidates to move together; send whether the effect moved. At most
-    ``ceil(log2(len(candidates)))`` questions. If several move it, one of them is returned.
+    Args:
+        candidates: One or more.
+        moves: Moves some of them together, and tells whether the effect moved. It is asked at
+            most ``ceil(log2(len(candidates)))`` times.
 
     Raises:
         ModelError: There is no candidate.
 
     Example:
-        >>> questions = bisect(["a", "b", "c"])
-        >>> next(questions), questions.send(False)
-        (('a',), ('b',))
+        >>> culprit(["a", "b", "c"], lambda asked: "b" in asked)
+        'b'
     """
     if not candidates:
         raise ModelError(["there is no candidate to choose from"])
     left = tuple(candidates)
     while len(left) > 1:
         half = left[: len(left) // 2]
-        left = half if (yield half) else left[len(half) :]
+        left = half if moves(half) else left[len(half) :]
     return left[0]
-
-
-def culprit(candidates: Sequence[Cause], moves: Callable[[tuple[Cause, ...]], bool]) -> Cause:
-    """Find one candidate that moves the effect; at least one has to. See ``bisect``."""
-    questions = bisect(candidates)
-    answer: bool | None = None
-    while True:
-        try:
-            asked = next(questions) if answer is None else questions.send(answer)
-        except StopIteration as ended:
-            found: Cause = ended.value
-            return found
-        answer = moves(asked)
 
 
 def culprits(
     candidates: Iterable[Cause], moves: Callable[[tuple[Cause, ...]], bool]
 ) -> tuple[Cause, ...]:
-    """Find all candidates that move the effect: for each one more question than ``bisect``.
+    """Find all candidates that move the effect: for each one more question than ``culprit``.
 
     Source:
         Hwang, *A method for detecting all defective members in a population by group testing*,

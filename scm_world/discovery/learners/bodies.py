@@ -296,15 +296,8 @@ def without(episode: Episode, body: str) -> Episode:
             else:  # actions are drawn at every step, with noise of their own
                 kept[name] = plan[name]
         layers.append((start, Plan(kept)))
-    stripped = Episode(
-        episode.twins,
-        seed=episode.seed,
-        number=episode.number,
-        layers=layers,
-        steps=episode.steps,
-        trace=episode.trace,
-    )
-    return stripped.counterfactual({body: Null()})
+    unit = Unit(episode.seed, episode.number, tuple(layers), None, episode.steps)
+    return Episode(episode.twins, unit, episode.trace).counterfactual({body: Null()})
 
 
 def null_effects(episode: Episode, *, threshold: float = THRESHOLD) -> NullReport:

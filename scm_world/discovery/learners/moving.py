@@ -12,7 +12,7 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.discovery.design import coloring, culprits, pooled
 from scm_world.discovery.learners.found import EstimatedGraph
-from scm_world.discovery.learners.simulators import SMALL, MultiTargetSimulator, PairedSimulator
+from scm_world.discovery.learners.simulators import SMALL, PairedSimulator, SCMSimulator
 from scm_world.errors import ModelError
 from scm_world.queries.experiments.effects import EdgeKey
 
@@ -56,7 +56,7 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
 
 
 def sparse_pooled(
-    simulator: MultiTargetSimulator, *, seed: int = 0, budget: int = 200, unit: int = 0
+    simulator: SCMSimulator, *, seed: int = 0, budget: int = 200, unit: int = 0
 ) -> EstimatedGraph:
     """Find a graph with few causes each by moving all variables at once, at random.
 
@@ -144,7 +144,7 @@ def _pursued(signs: Floats, answer: Floats) -> Floats | None:
 
 
 def verified(
-    simulator: MultiTargetSimulator,
+    simulator: SCMSimulator,
     *,
     declared: Iterable[EdgeKey],
     seed: int = 0,
@@ -217,7 +217,7 @@ class _Account:
         looked: Shape (causes, effects): declared, or the cause was moved without a known one.
     """
 
-    def __init__(self, simulator: MultiTargetSimulator, wanted: set[tuple[str, str]]) -> None:
+    def __init__(self, simulator: SCMSimulator, wanted: set[tuple[str, str]]) -> None:
         self._simulator, self._wanted = simulator, wanted
         self.seen: set[tuple[str, str]] = set()
         self.intruders: set[tuple[str, str]] = set()

@@ -56,7 +56,10 @@ class Learner:
     @property
     def version(self) -> str | None:
         """Version of its package; None if that is not installed, or if it needs none."""
-        return _version(self.package) if self.package else None
+        try:
+            return importlib.metadata.version(self.package) if self.package else None
+        except importlib.metadata.PackageNotFoundError:
+            return None
 
     @property
     def is_installed(self) -> bool:
@@ -218,10 +221,3 @@ def _folded(found: EstimatedGraph, table: Dataset, level: Level) -> EstimatedGra
     np.fill_diagonal(edges[0], False)
     np.fill_diagonal(edge_scores[0], 0.0)
     return replace(found, names=names, edges=edges, edge_scores=edge_scores)
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

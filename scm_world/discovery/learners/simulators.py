@@ -48,42 +48,19 @@ class PairedSimulator(Protocol):
         """
 
 
-class MultiTargetSimulator(PairedSimulator, Protocol):
-    """A paired simulator that can move several variables at once.
-
-    Attributes:
-        lag: How many control steps later the answers are read.
-        causes: What can be moved; each is one number.
-        watched: What answers; each is one number.
-        notes: What it does not show.
-        used: How many experiments there were.
-    """
-
-    lag: int
-    causes: tuple[str, ...]
-    watched: tuple[str, ...]
-    notes: tuple[str, ...]
-    used: int
-
-    def prepare(self, unit: int) -> None:
-        """Run a unit as it is: one experiment."""
-
-    def answers(self, moves: Mapping[str, float]) -> Floats:
-        """Run it again with some causes moved: one experiment.
-
-        Args:
-            moves: How far each is moved, in its own size (1 for a variable without bounds).
-
-        Returns:
-            By how much what is watched differs, shape (len(watched),).
-        """
-
-
 @final
 class SCMSimulator:
     """Paired experiments in a causal model without physics, whose variables are numbers.
 
-    All others are held while some are moved: answers are those of direct effects.
+    It can move several at once. All others are held while some are moved: answers are those of
+    direct effects.
+
+    Attributes:
+        lag: How many control steps later the answers are read.
+        causes: What can be moved.
+        watched: What answers.
+        notes: What it does not show.
+        used: How many experiments there were.
 
     Args:
         model: All its variables can be set.
@@ -101,7 +78,9 @@ class SCMSimulator:
         lags = {edge.lag for edge in model.edges}
         self.lag = max(lags, default=0) if lag is None else lag
         others = lags - {self.lag}
-        self.notes = (f"edges of lag {self.lag} only, and there are others",) if others else ()
+        self.notes: tuple[str, ...] = ()
+        if others:
+            self.notes = (f"edges of lag {self.lag} only, and there are others",)
         self.names = tuple(model)
         self.causes = self.watched = self.names
         self.used = 0
@@ -114,7 +93,7 @@ class SCMSimulator:
         return series.effects
 
     def prepare(self, unit: int) -> None:
-        """Draw a unit: two instants of it.
+        """Draw a unit, two instants of it, and run it as it is: one experiment.
 
         Raises:
             ModelError: A variable is a vector or not real, so that it cannot be moved a little.
@@ -129,7 +108,14 @@ class SCMSimulator:
         self.used += 1
 
     def answers(self, moves: Mapping[str, float]) -> Floats:
-        """Return the changes of all mechanisms; see ``MultiTargetSimulator``."""
+        """Run the unit again with some causes moved: one experiment.
+
+        Args:
+            moves: How far each is moved, in its own size (1 for a variable without bounds).
+
+        Returns:
+            By how much each mechanism gives something else, shape (len(watched),).
+        """
         source = self._before if self.lag else self._now
         moved = {
             **source,

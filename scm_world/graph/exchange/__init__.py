@@ -18,10 +18,6 @@ from scm_world.graph.exchange.formats import (
 from scm_world.graph.exchange.html import to_html
 from scm_world.graph.exchange.libraries import (
     TigramiteGraph,
-    from_causal_learn,
-    from_dowhy,
-    from_pgmpy,
-    from_tigramite,
     to_causal_learn,
     to_dowhy,
     to_pgmpy,
@@ -48,11 +44,7 @@ __all__ = [
     "TigramiteGraph",
     "View",
     "causal_graph",
-    "from_causal_learn",
     "from_digraph",
-    "from_dowhy",
-    "from_pgmpy",
-    "from_tigramite",
     "read_as",
     "read_graph",
     "seen_as",

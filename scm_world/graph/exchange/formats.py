@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -212,19 +211,6 @@ def _known(name: str, view: View | None, *, to_read: bool = False) -> tuple[Text
     return known, view or known.view
 
 
-@contextmanager
-def reading(source: str, what: str) -> Iterator[None]:
-    """Turn whatever goes wrong while something is read into ``UnreadableFile``."""
-    try:
-        yield
-    except UnknownOption:
-        raise
-    except _WRONG as error:
-        said = f"there is no {error}" if isinstance(error, KeyError) else str(error)
-        reason = f"it is no {what}: {said}".rstrip(": ")
-        raise UnreadableFile(source, reason, "docs/graphs.md says what is read") from error
-
-
 def write_graph(
     source: CausalGraph | SCM,
     path: Path | str | None = None,
@@ -279,8 +265,14 @@ def read_graph(
         (Edge(cause='mass', effect='weight', lag=0, when=None),)
     """
     known, chosen = _known(format, view, to_read=True)
-    with reading(str(source) if isinstance(source, Path) else "the text", f"{format} graph"):
+    reader: Any = known.read
+    name = str(source) if isinstance(source, Path) else "the text"
+    try:
         text = read_text(source) if isinstance(source, Path) else source
-        if known.read is None:
-            raise TypeError
-        return read_as(known.read(text), chosen)
+        return read_as(reader(text), chosen)
+    except UnknownOption:
+        raise
+    except _WRONG as error:
+        said = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+        reason = f"it is no {format} graph: {said}".rstrip(": ")
+        raise UnreadableFile(name, reason, "docs/graphs.md says what is read") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -12,10 +11,8 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import load
 from scm_world.errors import UnknownOption
-from scm_world.graph.exchange.formats import from_digraph, reading
-from scm_world.graph.exchange.model import CausalGraph, Node, View, causal_graph, read_as, seen_as
+from scm_world.graph.exchange.model import CausalGraph, View, causal_graph, seen_as
 from scm_world.graph.scm import SCM
-from scm_world.graph.structure import Edge
 
 RIGHT, LEFT, NONE = "-->", "<--", ""
 
@@ -26,11 +23,6 @@ def _acyclic(source: CausalGraph | SCM, view: View, library: str) -> CausalGraph
     graph = seen_as(causal_graph(source), view)
     graph.check_acyclic(library)
     return graph
-
-
-def _read(make: Callable[[], CausalGraph], view: View, what: str) -> CausalGraph:
-    with reading("the graph", what):
-        return read_as(make(), view)
 
 
 # --- tigramite -----------------------------------------------------------------------------------
@@ -58,6 +50,8 @@ def to_tigramite(source: CausalGraph | SCM) -> TigramiteGraph:
         ModelError: Edges of lag 0 form a cycle, as in a summary graph.
 
     Example:
+        >>> from scm_world.graph import Edge
+        >>> from scm_world.graph.exchange import Node
         >>> found = to_tigramite(CausalGraph((Node("x"), Node("y")), (Edge("x", "y", 1),)))
         >>> found.graph.shape, str(found.graph[0, 1, 1])
         ((2, 2, 2), '-->')
@@ -72,31 +66,6 @@ def to_tigramite(source: CausalGraph | SCM) -> TigramiteGraph:
         if edge.lag == 0:
             array[effect, cause, 0] = LEFT
     return TigramiteGraph(array, graph.names)
-
-
-def from_tigramite(graph: NDArray[np.str_], var_names: Sequence[str]) -> CausalGraph:
-    """Read a graph of tigramite: strings, shape (n, n, max lag + 1), and n names.
-
-    Raises:
-        UnreadableFile: The shape is another one, or an edge is not directed.
-    """
-    return _read(lambda: _from_array(np.asarray(graph), tuple(var_names)), "lagged", "graph")
-
-
-def _from_array(array: NDArray[np.str_], names: tuple[str, ...]) -> CausalGraph:
-    if array.ndim != 3 or array.shape[:2] != (len(names), len(names)):
-        raise ValueError(f"expected shape ({len(names)}, {len(names)}, lags), got {array.shape}")
-    edges = []
-    for i, j, lag in np.argwhere(array != NONE).tolist():
-        mark, back = str(array[i, j, lag]), str(array[j, i, 0])
-        where = f"{mark!r} from {names[i]!r} to {names[j]!r}, lag {lag}"
-        if mark not in ((RIGHT, LEFT) if lag == 0 else (RIGHT,)):
-            raise ValueError(f"{where}, is no directed edge")
-        if lag == 0 and {mark, back} != {RIGHT, LEFT}:
-            raise ValueError(f"{where}, does not fit {back!r} in the other direction")
-        if mark == RIGHT:
-            edges.append(Edge(names[i], names[j], lag))
-    return CausalGraph(tuple(map(Node, names)), tuple(edges))
 
 
 # --- causal-learn --------------------------------------------------------------------------------
@@ -120,28 +89,6 @@ def to_causal_learn(source: CausalGraph | SCM, *, view: View = "two_slice") -> A
     return made
 
 
-def from_causal_learn(graph: Any, *, view: View = "two_slice") -> CausalGraph:
-    """Read a graph of causal-learn.
-
-    Raises:
-        UnreadableFile: An edge is not directed, or the slices do not fit together.
-    """
-    return _read(lambda: _from_general(graph), view, "graph")
-
-
-def _from_general(graph: Any) -> CausalGraph:
-    nodes = tuple(Node(node.get_name()) for node in graph.get_nodes())
-    edges = []
-    for edge in graph.get_graph_edges():
-        ends = {str(edge.get_endpoint1()), str(edge.get_endpoint2())}
-        if ends != {"TAIL", "ARROW"}:
-            raise ValueError(f"{str(edge)!r} is no directed edge")
-        names = (edge.get_node1().get_name(), edge.get_node2().get_name())
-        forward = str(edge.get_endpoint2()) == "ARROW"
-        edges.append(Edge(*(names if forward else names[::-1])))
-    return CausalGraph(nodes, tuple(edges))
-
-
 # --- pgmpy and DoWhy -----------------------------------------------------------------------------
 
 
@@ -163,15 +110,6 @@ def _bare(graph: CausalGraph, made: nx.DiGraph) -> nx.DiGraph:
     return made
 
 
-def from_pgmpy(graph: nx.DiGraph, *, view: View = "two_slice") -> CausalGraph:
-    """Read a DAG or a Bayesian network of pgmpy.
-
-    Raises:
-        UnreadableFile: It is none, or the slices do not fit together.
-    """
-    return _read(lambda: from_digraph(graph), view, "directed graph")
-
-
 def to_dowhy(source: CausalGraph | SCM, *, view: View = "two_slice") -> nx.DiGraph:
     """Return the graph that ``dowhy.CausalModel(graph=…)`` and ``dowhy.gcm`` take.
 
@@ -180,7 +118,3 @@ def to_dowhy(source: CausalGraph | SCM, *, view: View = "two_slice") -> nx.DiGra
         UnknownOption: There is no such view.
     """
     return _bare(_acyclic(source, view, "DoWhy"), nx.DiGraph())
-
-
-from_dowhy = from_pgmpy
-"""Read a networkx graph; see ``from_pgmpy``."""

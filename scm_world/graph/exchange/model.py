@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, final, get_args
@@ -13,7 +13,7 @@ import networkx as nx
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.scm import SCM
 from scm_world.graph.structure import Edge
-from scm_world.variables import Affine, Box, Either, Space, Switch, Variable
+from scm_world.variables import Affine, Box, Either, Space, Switch
 from scm_world.variables.spaces import Bound, Bounds
 
 
@@ -211,26 +211,17 @@ def causal_graph(source: SCM | CausalGraph) -> CausalGraph:
     """
     if isinstance(source, CausalGraph):
         return source
-    return CausalGraph(tuple(_node(source[name]) for name in source), source.edges)
-
-
-def _node(variable: Variable) -> Node:
-    given: Any = variable
-    bounds, a, b = (
-        ", ".join(space_lines(space, digits=DIGITS))
-        for space in (variable.bounds, variable.a, variable.b)
-    )
-    return Node(
-        name=variable.name,
-        kind=given.kind,
-        role=variable.role,
-        unit=variable.unit,
-        value_shape="x".join(map(str, variable.shape)),
-        bounds=bounds,
-        a=a,
-        b=b,
-        doc=" ".join(variable.doc.split()),
-    )
+    nodes = []
+    for variable in (source[name] for name in source):
+        given: Any = variable
+        bounds, a, b = (
+            ", ".join(space_lines(space, digits=DIGITS))
+            for space in (variable.bounds, variable.a, variable.b)
+        )
+        shape, doc = "x".join(map(str, variable.shape)), " ".join(variable.doc.split())
+        about = given.kind, variable.role, variable.unit, shape, bounds, a, b, doc
+        nodes.append(Node(variable.name, *about))
+    return CausalGraph(tuple(nodes), source.edges)
 
 
 def edge_attributes(edge: Edge) -> dict[str, Any]:
@@ -317,8 +308,9 @@ def seen_as(graph: CausalGraph, view: View) -> CausalGraph:
     """
     if view not in VIEWS:
         raise UnknownOption("view", view, VIEWS)
-    views = {"summary": _summary, "two_slice": _sliced}
-    return views[view](graph) if view in views else graph
+    if view == "summary":
+        return _summary(graph)
+    return _sliced(graph) if view == "two_slice" else graph
 
 
 def _summary(graph: CausalGraph) -> CausalGraph:
@@ -369,25 +361,17 @@ def _folded(graph: CausalGraph) -> CausalGraph:
         known = nodes.setdefault(where.name, replace(node, name=where.name))
         if where.held and not known.role:
             nodes[where.name] = replace(known, role="parameter")
-    found = [(slices[e.effect].ago, _shifted(e, slices)) for e in _causes(graph, slices)]
+    found = []
+    for edge in graph.edges:
+        cause, effect = slices[edge.cause], slices[edge.effect]
+        if cause.held and cause.name == effect.name:
+            continue  # parameters keep their values
+        if cause.ago < effect.ago:
+            raise ValueError(f"{edge.cause!r} → {edge.effect!r} leads into the past")
+        lagged = Edge(cause.name, effect.name, cause.ago - effect.ago, edge.when)
+        found.append((effect.ago, lagged))
     edges = {edge for ago, edge in found if ago == 0}
     for ago, edge in found:
         if edge not in edges:
             raise ValueError(f"{edge.cause!r} → {edge.effect!r} is there {ago} steps ago, not now")
     return CausalGraph(tuple(nodes.values()), tuple(edges))
-
-
-def _causes(graph: CausalGraph, slices: dict[str, Slice]) -> Iterator[Edge]:
-    """Leave out that parameters keep their values."""
-    for edge in graph.edges:
-        cause = slices[edge.cause]
-        if not (cause.held and cause.name == slices[edge.effect].name):
-            yield edge
-
-
-def _shifted(edge: Edge, slices: dict[str, Slice]) -> Edge:
-    cause, effect = slices[edge.cause], slices[edge.effect]
-    lag = cause.ago - effect.ago
-    if lag < 0:
-        raise ValueError(f"{edge.cause!r} → {edge.effect!r} leads into the past")
-    return Edge(cause.name, effect.name, lag, edge.when)

@@ -208,19 +208,14 @@ class Paired:
             value = self._other(target, step, attempt)
             if value is None:
                 return
-            if self._changed(target, value):
-                return
+            self._doing(np.ravel(value) - np.ravel(self._at_once[target]))
+            try:
+                self._see_target(target, value)
+                self._undo(target, value)
+            except (InterventionError, EngineFailure):
+                continue
+            return
         self.effects.refused[target] = self.effects.refused.get(target, 0) + 1
-
-    def _changed(self, target: str, value: Value) -> bool:
-        """Do the experiments with one value of a target; tell whether all could be done."""
-        self._doing(np.ravel(value) - np.ravel(self._at_once[target]))
-        try:
-            self._see_target(target, value)
-            self._undo(target, value)
-        except (InterventionError, EngineFailure):
-            return False
-        return True
 
     def _see_target(self, target: str, value: Value) -> None:
         """Find the effects of one value.
@@ -244,10 +239,7 @@ class Paired:
             nearby = [r[target] for r in self._world.task.nearby(self._at_once) if target in r]
             if nearby:
                 return nearby[attempt % len(nearby)]
-        return self._another(self._world.model.declared(target), step, attempt)
-
-    def _another(self, variable: Variable, step: float, attempt: int) -> Value | None:
-        """Choose another value than the present one."""
+        variable = self._world.model.declared(target)
         present = self._at_once[variable.name]
         n = int(np.prod(variable.shape))
         uniforms = self._noise.uniforms(variable.name, n=n, episode=self._number, step=attempt)[0]
