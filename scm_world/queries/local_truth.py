@@ -31,39 +31,17 @@ SHARE = 1e-3  # of a parameter, by which it is changed
 DIRECTIONS = 2  # each with both signs
 
 
-def has_local_graphs(world: World) -> bool:
-    """Tell whether a world has bodies between which local graphs are."""
-    return bool(world.composition.movers())
-
-
 def movers(world: World) -> tuple[str, ...]:
     """Name the bodies that can move: of the robot's tasks the fingers, then the blocks.
 
     Raises:
         UnknownOption: It is a world of something else.
     """
-    if not has_local_graphs(world):
+    found = tuple(mover.name for mover in world.composition.movers())
+    if not found:
         allowed = ("a world of the block-building robot",)
         raise UnknownOption("world of local graphs", world.task.name, allowed)
-    return tuple(mover.name for mover in world.composition.movers())
-
-
-@final
-@dataclass(frozen=True)
-class Rehearsal:
-    """What a control step would be like.
-
-    Attributes:
-        mode: How the engine is commanded.
-        command: Shape (9,) [rad] or [N m].
-        contacts: Of each physics step.
-        after: The state that the step leads to.
-    """
-
-    mode: ControlMode
-    command: Floats
-    contacts: tuple[tuple[Contact, ...], ...]
-    after: State
+    return found
 
 
 @final
@@ -72,6 +50,11 @@ class Listener:
 
     Args:
         backend: The engine.
+
+    Attributes:
+        mode: How the engine was commanded last.
+        command: The last one, shape (9,) [rad] or [N m].
+        contacts: Of each physics step since then.
     """
 
     def __init__(self, backend: Any) -> None:
@@ -106,16 +89,15 @@ def listening(world: World) -> Iterator[Listener]:
         world.backend = engine
 
 
-def rehearse(world: World, action: ArrayLike) -> Rehearsal:
+def rehearse(world: World, action: ArrayLike) -> Listener:
     """Take a control step and take it back; the world is bit for bit as it was."""
     before = world.snapshot()
     try:
         with listening(world) as heard:
             world.step(action)
-        after = world.backend.state()
     finally:
         world.restore(before)
-    return Rehearsal(heard.mode, heard.command, tuple(heard.contacts), after)
+    return heard
 
 
 @final

@@ -18,7 +18,6 @@ from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import local_report
-from scm_world.queries.local_truth import has_local_graphs
 from scm_world.queries.progress import Progress
 from scm_world.queries.verification import (
     Fired,
@@ -273,7 +272,7 @@ def _verified(
 
 def _local(world: World, seed: int) -> LocalShare | None:
     """Hold local graphs against paired experiments while the robot moves at random."""
-    if not has_local_graphs(world) or not world.backend.capabilities.physics:
+    if not world.composition.movers() or not world.backend.capabilities.physics:
         return None
     with contextlib.suppress(KeyboardInterrupt):
         world.reset(seed=seed)
