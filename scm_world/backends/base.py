@@ -167,6 +167,23 @@ class Backend(ABC):
         self.read(state)
         return state
 
+    @final
+    def sealed(self, payload: Any) -> EngineSnapshot:
+        """Give a snapshot of this engine, in this version."""
+        return EngineSnapshot(f"{self.name} {self.version}", payload)
+
+    @final
+    def opened(self, snapshot: EngineSnapshot) -> Any:
+        """Give what a snapshot holds.
+
+        Raises:
+            SnapshotMismatch: It was taken by another engine, or another version of this one.
+        """
+        here = f"{self.name} {self.version}"
+        if snapshot.engine != here:
+            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
+        return snapshot.payload
+
     @classmethod
     def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
         """Give what steps several scenes of this engine in one call.
@@ -302,7 +319,7 @@ class BackendWrapper(Backend, ABC):
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
-        return EngineSnapshot(f"{self.name} {self.version}", self.engine.snapshot())
+        return self.sealed(self.engine.snapshot())
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -310,10 +327,7 @@ class BackendWrapper(Backend, ABC):
         Raises:
             SnapshotMismatch: It was taken by another engine, or by the one inside alone.
         """
-        here = f"{self.name} {self.version}"
-        if snapshot.engine != here:
-            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
-        self.engine.restore(snapshot.payload)
+        self.engine.restore(self.opened(snapshot))
 
     def close(self) -> None:
         """Free what the engine holds."""
@@ -388,7 +402,7 @@ class InMemory(Backend, ABC):
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
         scene = Scene(self._structure, dict(self._parameters), self._state.copy())
-        return EngineSnapshot(f"{self.name} {self.version}", scene)
+        return self.sealed(scene)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -396,10 +410,7 @@ class InMemory(Backend, ABC):
         Raises:
             SnapshotMismatch: It was taken by another engine.
         """
-        here = f"{self.name} {self.version}"
-        if snapshot.engine != here:
-            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
-        scene: Scene = snapshot.payload
+        scene: Scene = self.opened(snapshot)
         self._structure, self._state = scene.structure, scene.state.copy()
         self._parameters = {}
         self._keep(scene.parameters)

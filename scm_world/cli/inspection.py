@@ -299,8 +299,8 @@ def list_(
     from scm_world.evaluation import protocols_of
     from scm_world.policies import zoo as policies
     from scm_world.tasks import CONVENTIONS, TASKS
-    from scm_world.tasks.trifinger.controller import PRESETS
     from scm_world.tasks.trifinger.entities.robot import ACTIONS
+    from scm_world.tasks.trifinger.hardware import PRESETS
 
     if zoo:
         made = console.table("name", "task", "seed", "scores", "command", title="trained policies")

@@ -105,7 +105,6 @@ class Geom:
         vertices: Corners of the convex hull of a mesh [m].
         friction: Sliding coefficient.
         slippery: Whether it asks for contacts without friction.
-        priority: The shape with the higher one decides about the friction of a contact.
     """
 
     name: str
@@ -117,7 +116,6 @@ class Geom:
     vertices: tuple[Vector, ...] = ()
     friction: float = 1.0
     slippery: bool = False
-    priority: int = 0
 
 
 @final

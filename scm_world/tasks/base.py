@@ -392,8 +392,12 @@ class Task(ABC):
         declared = {variable.name: variable for variable in self.shared()}
         for name in self.decided_by:
             bounds = declared[name].bounds
-            if isinstance(bounds, Integers):
-                yield from ({name: other} for other in _counts(values[name], bounds))
+            for step in (1, -1) if isinstance(bounds, Integers) else ():
+                for index in reversed(range(np.size(values[name]))):
+                    other = np.array(values[name])
+                    other.reshape(-1)[index] += step
+                    if bounds.contains(other):  # type: ignore[union-attr] # whole numbers
+                        yield {name: other}
 
     def sample_goal(self, space: SpaceName = "A") -> dict[str, Any]:
         """Give the intervention that draws a new goal, for ``reset(do=…)`` or ``do``.
@@ -402,13 +406,3 @@ class Task(ABC):
             space: Where from: ``"A"``, ``"B"`` or ``"A|B"``.
         """
         return {name: Draw(space) for name in self.goal_causes}
-
-
-def _counts(present: Value, bounds: Integers) -> Iterable[Value]:
-    """Change one whole number by one, upward first, the last component first."""
-    for step in (1, -1):
-        for index in reversed(range(np.size(present))):
-            other = np.array(present)
-            other.reshape(-1)[index] += step
-            if bounds.contains(other):
-                yield other

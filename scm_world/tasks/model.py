@@ -198,7 +198,14 @@ class ModelTask(DeclaredTask):
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
-        self.system = self._read(source)
+        readouts = tuple(name for name in self.outcomes if isinstance(name, str))
+        self.system = (
+            source
+            if isinstance(source, Model)
+            else read_model(
+                source, expose=self.expose, readouts=readouts, fixed_base=self.fixed_base
+            )
+        )
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
         self.frame_skip = self._steps()
@@ -219,12 +226,6 @@ class ModelTask(DeclaredTask):
         for option in ("spaces", "start"):
             if not isinstance(getattr(self, option), Mapping):
                 raise UnknownOption(option, getattr(self, option), ("a dictionary by name",))
-
-    def _read(self, source: Any) -> Model:
-        if isinstance(source, Model):
-            return source
-        readouts = tuple(name for name in self.outcomes if isinstance(name, str))
-        return read_model(source, expose=self.expose, readouts=readouts, fixed_base=self.fixed_base)
 
     def _steps(self) -> int:
         """Give the length of a control step in physics steps."""
@@ -426,8 +427,14 @@ def _listed(value: Any) -> list[Any]:
     return list(value) if isinstance(value, Iterable) else [value, None]
 
 
-def _numbers(option: str, value: Any, shape: tuple[int, ...]) -> Any:
+def _numbers(option: str, value: Any, shape: tuple[int, ...], wanted: str = "") -> Any:
     """Give a number, or the numbers of all components.
+
+    Args:
+        option: What it was given for.
+        value: What was given.
+        shape: Of the variable.
+        wanted: What is allowed, where numbers may be infinite.
 
     Raises:
         UnknownOption: It is neither, or not finite.
@@ -435,10 +442,10 @@ def _numbers(option: str, value: Any, shape: tuple[int, ...]) -> Any:
     try:
         numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
     except (TypeError, ValueError):
-        numbers = np.full(shape, np.nan)
-    if not np.isfinite(numbers).all():
-        wanted = f"{int(np.prod(shape))} finite numbers" if shape else "a finite number"
-        raise UnknownOption(option, value, (wanted,))
+        numbers = None
+    if numbers is None or not (wanted or np.isfinite(numbers).all()):
+        many = f"{int(np.prod(shape))} finite numbers" if shape else "a finite number"
+        raise UnknownOption(option, value, (wanted or many,)) from None
     return tuple(numbers.ravel().tolist()) if shape else float(numbers)
 
 
@@ -462,7 +469,7 @@ def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) 
     if isinstance(given, tuple | list):
         if len(given) != 2:
             raise UnknownOption(option, given, (wanted,))
-        given = Box(*(_ends(option, end, shape, wanted) for end in given))
+        given = Box(*(_numbers(option, end, shape, wanted) for end in given))
     if isinstance(within, Rotations) and not isinstance(given, Rotations):
         raise UnknownOption(option, given, ("sw.Rotations()",))
     if not isinstance(given, Box) or given.parents():
@@ -478,15 +485,6 @@ def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) 
         if (low < corners[0]).any() or (high > corners[1]).any():
             raise UnknownOption(option, given, (f"a space within {within.describe(shape, {})}",))
     return given
-
-
-def _ends(option: str, end: Any, shape: tuple[int, ...], wanted: str) -> Any:
-    """Read one end of a box; it may be infinite."""
-    try:
-        numbers = np.broadcast_to(np.asarray(end, dtype=np.float64), shape)
-    except (TypeError, ValueError):
-        raise UnknownOption(option, end, (wanted,)) from None
-    return tuple(numbers.ravel().tolist()) if shape else float(numbers)
 
 
 @Stacked

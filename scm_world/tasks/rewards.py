@@ -84,7 +84,12 @@ def resolve(
     sparse = asked == "sparse" or options.get("activate_sparse_reward", False)
     if sparse or asked == "none":
         weights = dict.fromkeys(weights, 0.0)
-    own_weights = _in_order([n for n in default if n != FRACTION], options)
+    own_weights: dict[str, float] = {}
+    if (given := options.get("dense_reward_weights")) is not None:
+        dense = [name for name in default if name != FRACTION]
+        if np.shape(given) != (len(dense),):
+            raise UnknownOption("dense_reward_weights", given, (f"{len(dense)} numbers", *dense))
+        own_weights = {n: checked_weight(n, w) for n, w in zip(dense, given, strict=True)}
     if (fraction := options.get("fractional_reward_weight")) is not None:
         own_weights[FRACTION] = checked_weight("fractional_reward_weight", fraction)
     if sparse and any(own_weights.values()):
@@ -92,15 +97,6 @@ def resolve(
         raise UnknownOption("weights of a sparse reward", named, ("none: it is 1 for success",))
     weights.update(own_weights)
     return {**weights, SUCCESS: 1.0} if sparse else weights
-
-
-def _in_order(dense: Sequence[str], options: Common) -> dict[str, float]:
-    given = options.get("dense_reward_weights")
-    if given is None:
-        return {}
-    if np.shape(given) != (len(dense),):
-        raise UnknownOption("dense_reward_weights", given, (f"{len(dense)} numbers", *dense))
-    return {name: checked_weight(name, weight) for name, weight in zip(dense, given, strict=True)}
 
 
 def further_terms(

@@ -19,7 +19,7 @@ from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, quaternion_product
 from scm_world.models.scene import ControlMode, Difference, ParameterKey, Parameters, Scene
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.controller import FAST, PRECISE, Preset
+from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.structure import CONTROLLER, Structure, default_scene
 

@@ -20,7 +20,7 @@ from scm_world.tasks.trifinger.bullet import arena
 from scm_world.tasks.trifinger.bullet.arena import PARTS, link_index
 from scm_world.tasks.trifinger.bullet.client import compile_law
 from scm_world.tasks.trifinger.bullet.passive import MASSES, inverse_dynamics, mass_matrix
-from scm_world.tasks.trifinger.controller import ControllerSpec
+from scm_world.tasks.trifinger.hardware import ControllerSpec
 from scm_world.tasks.trifinger.kinematics import link_frames
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.structure import SPINNING_FRICTION, Structure, default_scene

@@ -6,7 +6,7 @@ from typing import ClassVar
 import pytest
 
 from scm_world.backends import Backend, make_backend
-from scm_world.tasks.trifinger.controller import PRECISE, Preset
+from scm_world.tasks.trifinger.hardware import PRECISE, Preset
 from scm_world.testing.backend import BackendConformance
 
 

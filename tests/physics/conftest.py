@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scm_world.backends import Backend, make_backend
 from scm_world.models import ControlMode, Difference
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.controller import FAST, PRECISE, Preset
+from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
 from scm_world.tasks.trifinger.structure import Structure, default_scene
 

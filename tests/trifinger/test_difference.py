@@ -9,7 +9,7 @@ import numpy as np
 from scm_world.geometry.hulls import box_hull
 from scm_world.models import Difference, Scene, diff
 from scm_world.models.scene import complete
-from scm_world.tasks.trifinger.controller import PRECISE, ControllerSpec
+from scm_world.tasks.trifinger.hardware import PRECISE, ControllerSpec
 from scm_world.tasks.trifinger.structure import (
     Structure,
     controller_spec,

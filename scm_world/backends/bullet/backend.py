@@ -14,12 +14,19 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
-from scm_world.backends.bullet import values
-from scm_world.backends.bullet.client import Client, load, version
+from scm_world.backends.bullet.client import (
+    Client,
+    Instant,
+    Values,
+    arrays,
+    known,
+    load,
+    plain,
+    version,
+)
 from scm_world.backends.bullet.model.client import ModelClient
 from scm_world.backends.bullet.model.support import supports
-from scm_world.backends.bullet.values import Instant, Values
-from scm_world.errors import EngineFailure, ModelError, SnapshotMismatch, UnknownOption
+from scm_world.errors import EngineFailure, ModelError, UnknownOption
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
@@ -208,7 +215,7 @@ class BulletBackend(Backend):
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; with the bodies that are there already, where possible."""
         structure, kind = scene.structure, self._kind(scene.structure)
-        parameters = values.complete(scene.parameters, kind.keys(structure))
+        parameters = plain(scene.parameters, known(scene.parameters, kind.keys(structure)))
         kind.check(structure, parameters)
         origin = Instant(structure, parameters, kind.settle(structure, scene.state))
         with self._all_or_nothing():
@@ -256,12 +263,18 @@ class BulletBackend(Backend):
         structure, parameters, state = present.structure, present.parameters, present.state
         kind = self._kind(difference.structure or structure)
         if difference.structure is not None:
-            now = Scene(structure, values.arrays(parameters), values.state_of(structure, state))
+            now = Scene(
+                structure,
+                arrays(parameters),
+                structure.empty_state().with_vector(np.array(state)),
+            )
             structure = difference.structure
             difference = complete(now, structure, difference)
-            parameters = values.complete(difference.parameters, kind.keys(structure))
+            given = difference.parameters
+            parameters = plain(given, known(given, kind.keys(structure)))
         elif difference.parameters:
-            parameters = {**parameters, **values.some(parameters, difference.parameters)}
+            given = difference.parameters
+            parameters = {**parameters, **plain(given, known(parameters, given))}
         if difference.structure is not None or difference.parameters:
             kind.check(structure, parameters)
         if difference.state is not None:
@@ -310,9 +323,7 @@ class BulletBackend(Backend):
             UnknownOption: The scene has no such parameter.
         """
         client = self._now()
-        return {
-            key: client.parameter(key) for key in values.known(self._described().parameters, keys)
-        }
+        return {key: client.parameter(key) for key in known(self._described().parameters, keys)}
 
     def inertia(self, body: str) -> Floats:
         """Read the principal moments of inertia of a body, shape (3,) [kg m²].
@@ -396,7 +407,7 @@ class BulletBackend(Backend):
             resting,
             self._saved,
         )
-        return EngineSnapshot(f"{self.name} {self._version}", record)
+        return self.sealed(record)
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -404,9 +415,7 @@ class BulletBackend(Backend):
         Raises:
             SnapshotMismatch: It was taken by another engine, or another version of it.
         """
-        mine, record = f"{self.name} {self._version}", snapshot.payload
-        if snapshot.engine != mine or not isinstance(record, Record):
-            raise SnapshotMismatch(f"this is a snapshot of {snapshot.engine!r}, not of {mine!r}")
+        record: Record = self.opened(snapshot)
         rows, row = record.rows[: record.length], AHEAD + record.origin.structure.n_commands
         self._history = History(record.origin, rows, list(record.edits), int(sum(rows[1::row])))
         self._before = dict(record.origin.parameters)

@@ -9,22 +9,75 @@ import os
 import sys
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from importlib import metadata
-from typing import Any, ClassVar
+from typing import Any, ClassVar, final
 
 import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import Contact
-from scm_world.backends.bullet.values import Instant, Values
-from scm_world.errors import EngineFailure, MissingEngine
-from scm_world.models.scene import ControlMode, ParameterKey, State
+from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
+from scm_world.models.scene import ControlMode, ParameterKey, Parameters, State, Structure
+
+Values = dict[ParameterKey, Any]
+"""All parameters, or some: plain numbers, or lists of them, which is what the engine speaks.
+Neither they nor their values are ever changed in place."""
 
 SOLVER_ITERATIONS = 50  # with 20, towers spike at 40 mm/s
 TOLERANCE = 1e-6  # how far a state that was set may read back from what was asked
 UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
+
+
+@final
+@dataclass(frozen=True)
+class Instant:
+    """A canonical state: the engine's world is a function of these values.
+
+    Attributes:
+        structure: The bodies.
+        parameters: All of them.
+        state: The numbers of a ``State``, with unit quaternions.
+    """
+
+    structure: Structure
+    parameters: Values
+    state: list[float]
+
+
+def known(there: Mapping[ParameterKey, object], keys: Iterable[ParameterKey]) -> list[ParameterKey]:
+    """Pass keys on that the scene has.
+
+    Raises:
+        UnknownOption: It does not have one of them.
+    """
+    keys = list(keys)
+    for key in keys:
+        if key not in there:
+            raise UnknownOption("parameter", ".".join(key), map(".".join, there))
+    return keys
+
+
+def plain(parameters: Parameters, keys: Iterable[ParameterKey]) -> Values:
+    """Turn some of the parameters of a scene into plain numbers.
+
+    Raises:
+        EngineFailure: One is not finite.
+    """
+    found: Values = {}
+    for key in keys:
+        value = np.asarray(parameters[key], dtype=np.float64).tolist()
+        if not math.isfinite(value if isinstance(value, float) else sum(value)):
+            raise EngineFailure(f"{'.'.join(key)} must be finite, got {value}", "bullet")
+        found[key] = value
+    return found
+
+
+def arrays(parameters: Values) -> Parameters:
+    """Turn plain numbers into parameters of a scene."""
+    return {key: np.array(value) for key, value in parameters.items()}
 
 
 class Client(ABC):
@@ -94,23 +147,23 @@ class Client(ABC):
             ValueError: It is a state of another structure.
             EngineFailure: A number is not finite.
         """
-        plain: list[float] = given.vector.tolist()
-        if len(plain) != structure.layout.size:
+        numbers: list[float] = given.vector.tolist()
+        if len(numbers) != structure.layout.size:
             raise ValueError(f"expected a state of {structure.layout.size} numbers, got {given!r}")
-        if not math.isfinite(sum(plain)):
+        if not math.isfinite(sum(numbers)):
             raise EngineFailure(f"a state must be finite, got {given!r}", "bullet")
         for name in structure.layout.reported:
             where = structure.layout.slices[name]
-            plain[where] = [0.0] * (where.stop - where.start)
+            numbers[where] = [0.0] * (where.stop - where.start)
         for start in cls.rotations(structure):
-            turn = plain[start : start + 4]
+            turn = numbers[start : start + 4]
             square = sum(part * part for part in turn)
             if abs(square - 1.0) >= UNIT and square != 0.0:
                 scale = math.sqrt(square)
-                turn = plain[start : start + 4] = [part / scale for part in turn]
+                turn = numbers[start : start + 4] = [part / scale for part in turn]
             if cls.signed and turn[3] < 0.0:
-                plain[start : start + 4] = [-part for part in turn]
-        return plain
+                numbers[start : start + 4] = [-part for part in turn]
+        return numbers
 
     # --- what is done in the engine -------------------------------------------------------------
 

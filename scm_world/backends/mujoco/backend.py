@@ -29,7 +29,7 @@ from scm_world.backends.mujoco.realization import (
     refuse_callbacks,
     write_vector,
 )
-from scm_world.errors import EngineFailure, ModelError, SnapshotMismatch
+from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Model
 from scm_world.models.scene import (
     ControlMode,
@@ -235,10 +235,8 @@ class MujocoBackend(Backend):
         now = self._now
         touches = self._touches if now.replay is not None else self._last_touches()
         again = (now.replay, now.began) if touches is None else (None, None)
-        payload = Payload(
-            now.structure, dict(now.kept), now.numbers(), now.memory(), touches, again
-        )
-        return EngineSnapshot(f"{self.name} {self.version}", payload)
+        state = now.numbers(), now.memory()
+        return self.sealed(Payload(now.structure, dict(now.kept), *state, touches, again))
 
     def restore(self, snapshot: EngineSnapshot) -> None:
         """Go back to a snapshot.
@@ -246,10 +244,7 @@ class MujocoBackend(Backend):
         Raises:
             SnapshotMismatch: It was taken by another engine, or another version of this one.
         """
-        here = f"{self.name} {self.version}"
-        if snapshot.engine != here:
-            raise SnapshotMismatch(f"a snapshot of {snapshot.engine} cannot be restored by {here}")
-        payload: Payload = snapshot.payload
+        payload: Payload = self.opened(snapshot)
         now: Realization | None = vars(self).get("_now")
         if now is None or now.applied is not payload.parameters:
             now = self._realized(payload.structure, payload.parameters)

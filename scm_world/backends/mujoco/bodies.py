@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from scm_world.backends.mujoco.fields import Field, element_names, table
-from scm_world.backends.mujoco.trees import Couplings, disabled
+from scm_world.backends.mujoco.trees import Couplings, disabled, works
 from scm_world.models.bodies import (
     Actuator,
     Body,
@@ -103,7 +103,7 @@ def describe(mj: mujoco.MjModel) -> ModelBodies:
     touching = np.flatnonzero(couplings.touches.any(axis=1)).tolist()
     shapes = [shape for shape in touching if int(mj.geom_type[shape]) in _SHAPES]
     row = {shape: number for number, shape in enumerate(shapes)}
-    driven = [i for i in range(mj.nactuator) if not _odd_actuator(mj, i) and _works(mj, i)]
+    driven = [i for i in range(mj.nactuator) if not _odd_actuator(mj, i) and works(mj, i)]
     rows = {"geom": row, "actuator": {number: i for i, number in enumerate(driven)}}
     followed = [i for i in range(mj.neq) if _acts(mj, i) and _is_linear(mj, i)]
     return ModelBodies(
@@ -192,7 +192,6 @@ def _geom(mj: mujoco.MjModel, geom: int, name: str) -> Geom:
         corners,
         float(mj.geom_friction[geom, 0]),
         bool(mj.geom_condim[geom] == 1),
-        int(mj.geom_priority[geom]),
     )
 
 
@@ -216,13 +215,6 @@ def _actuator(mj: mujoco.MjModel, actuator: int, name: str) -> Actuator:
         _pair(mj.actuator_ctrlrange[control]) if clipped else None,
         _pair(mj.actuator_forcerange[actuator]) if mj.actuator_forcelimited[actuator] else None,
     )
-
-
-def _works(mj: mujoco.MjModel, actuator: int) -> bool:
-    """Tell whether an actuator is not switched off."""
-    group = int(mj.actuator_group[actuator])
-    off = 0 <= group < 31 and bool(mj.opt.disableactuator & (1 << group))
-    return not (off or disabled(mj, _OFF.mjDSBL_ACTUATION))
 
 
 def _acts(mj: mujoco.MjModel, equality: int) -> bool:
@@ -285,7 +277,7 @@ def _missing(
     if mj.opt.density > 0.0 or mj.opt.viscosity > 0.0:
         yield f"a fluid (density {mj.opt.density:g}, viscosity {mj.opt.viscosity:g})"
     for i in range(mj.nactuator):
-        if _works(mj, i) and _odd_actuator(mj, i):
+        if works(mj, i) and _odd_actuator(mj, i):
             yield f"the actuator {names['actuator'][i]!r}, which {_odd_actuator(mj, i)}"
     yield from _missing_of_bodies(mj, names, touching)
 

@@ -25,76 +25,56 @@ class Touches:
     Attributes:
         owners: Name of the body of each shape: the geoms, then the flexes.
         shapes: Shape (k, 2).
-        positions: Shape (k, 3) [m].
-        normals: From the first shape to the second, shape (k, 3).
-        distances: Shape (k,) [m], negative where they intersect.
-        forces: Normal forces, shape (k,) [N].
+        numbers: Of each: position [m], normal from the first shape to the second, distance [m],
+            negative where they intersect, and normal force [N], shape (k, 8).
     """
 
     owners: tuple[str, ...]
     shapes: Integers
-    positions: Floats
-    normals: Floats
-    distances: Floats
-    forces: Floats
+    numbers: Floats
 
     def contacts(self) -> tuple[Contact, ...]:
         """Name the bodies."""
         return tuple(
             Contact(
                 (self.owners[first], self.owners[second]),
-                self.positions[i],
-                self.normals[i],
-                -float(self.distances[i]),
-                float(self.forces[i]),
+                row[:3],
+                row[3:6],
+                -float(row[6]),
+                float(row[7]),
             )
-            for i, (first, second) in enumerate(self.shapes)
+            for (first, second), row in zip(self.shapes, self.numbers, strict=True)
         )
 
     def extended(self, other: Touches) -> Touches:
         """Add the contacts of such pairs of shapes as touch in the other alone."""
         pairs = {(first, second) for first, second in self.shapes.tolist()}
         new = [i for i, pair in enumerate(other.shapes.tolist()) if tuple(pair) not in pairs]
-        if not new:
-            return self
-        return Touches(
-            self.owners,
-            np.concatenate([self.shapes, other.shapes[new]]),
-            np.concatenate([self.positions, other.positions[new]]),
-            np.concatenate([self.normals, other.normals[new]]),
-            np.concatenate([self.distances, other.distances[new]]),
-            np.concatenate([self.forces, other.forces[new]]),
-        )
+        shapes = np.concatenate([self.shapes, other.shapes[new]])
+        numbers = np.concatenate([self.numbers, other.numbers[new]])
+        return Touches(self.owners, shapes, numbers) if new else self
 
 
 def touches(model: mujoco.MjModel, data: mujoco.MjData, owners: tuple[str, ...]) -> Touches:
-    """Copy the contacts of the last physics step."""
-    contact, forces = data.contact, _normal_forces(model, data)
+    """Copy the contacts of the last physics step.
+
+    Their force is the sum of those on the edges of a pyramid, or the first one of an elliptic cone;
+    contacts within a gap have none.
+    """
+    contact = data.contact
     shapes = contact.geom.astype(np.int64)
     if model.nflex:
         shapes = np.where(shapes < 0, model.ngeom + contact.flex, shapes)
-    return Touches(
-        owners,
-        shapes,
-        contact.pos.copy(),
-        contact.frame[:, :3].copy(),
-        contact.dist.copy(),
-        forces,
-    )
-
-
-def _normal_forces(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
-    """Add the forces on the edges of a pyramid; of an elliptic cone, the first is the normal one.
-
-    Contacts within a gap have no force.
-    """
-    address, size = data.contact.efc_address, data.contact.dim
-    forces, listed = np.zeros(len(address)), address >= 0
+    numbers = np.zeros((len(shapes), 8))
+    numbers[:, :3], numbers[:, 3:6] = contact.pos, contact.frame[:, :3]
+    numbers[:, 6], forces = contact.dist, numbers[:, 7]
+    address, size = contact.efc_address, contact.dim
+    listed = address >= 0
     forces[listed] = data.efc_force[address[listed]]
     if model.opt.cone == _PYRAMID:
         for i in np.flatnonzero(listed & (size > 1)).tolist():
             forces[i] = data.efc_force[address[i] : address[i] + 2 * (size[i] - 1)].sum()
-    return forces
+    return Touches(owners, shapes, numbers)
 
 
 def has_stages(model: mujoco.MjModel) -> bool:

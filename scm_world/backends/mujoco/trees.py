@@ -37,6 +37,13 @@ def disabled(mj: mujoco.MjModel, flag: mujoco.mjtDisableBit) -> bool:
     return bool(mj.opt.disableflags & int(flag))
 
 
+def works(mj: mujoco.MjModel, actuator: int) -> bool:
+    """Tell whether an actuator is not switched off."""
+    group = int(mj.actuator_group[actuator])
+    off = 0 <= group < 31 and bool(mj.opt.disableactuator & (1 << group))
+    return not (off or disabled(mj, _OFF.mjDSBL_ACTUATION))
+
+
 @final
 class Couplings:
     """The trees of a compiled model, and what reaches them.
@@ -135,9 +142,8 @@ class Couplings:
 
     def actuator(self, actuator: int) -> Effect:
         """Give the effect of an actuator: on what its transmission reaches."""
-        mj, group = self._mj, int(self._mj.actuator_group[actuator])
-        off = 0 <= group < 31 and bool(mj.opt.disableactuator & (1 << group))
-        if off or disabled(mj, _OFF.mjDSBL_ACTUATION):
+        mj = self._mj
+        if not works(mj, actuator):
             return NOTHING
         if mj.actuator_trntype[actuator] == int(_TRN.mjTRN_BODY):
             body = int(mj.actuator_trnid[actuator, 0])
@@ -325,14 +331,20 @@ class Couplings:
     @cached_property
     def _attached(self) -> dict[int, Trees]:
         """Map sites to the trees of the tendons, actuators and constraints that use them."""
-        mj = self._mj
-        found: dict[int, Trees] = {}
-        for site, trees in (*self._sites_of_tendons(), *self._sites_of_actuators()):
-            found[site] = found.get(site, NONE) | trees
+        mj, found = self._mj, dict[int, Trees]()
+        uses = [*self._sites_of_tendons()]
+        for i in range(mj.nactuator):  # the sites that actuators act on or refer to
+            ends = [int(end) for end in mj.actuator_trnid[i] if end >= 0]
+            kind = mujoco.mjtTrn(int(mj.actuator_trntype[i]))
+            joint = kind == _TRN.mjTRN_SO3 and len(ends) == 1
+            if kind in (_TRN.mjTRN_SITE, _TRN.mjTRN_SLIDERCRANK, _TRN.mjTRN_SO3) and not joint:
+                uses += [(end, self._of_actuator(i)) for end in ends]
         for i in range(mj.neq):
             if mj.eq_objtype[i] == int(_OBJ.mjOBJ_SITE):
-                for site in (int(mj.eq_obj1id[i]), int(mj.eq_obj2id[i])):
-                    found[site] = found.get(site, NONE) | self._of_equality(i)
+                ends = [int(mj.eq_obj1id[i]), int(mj.eq_obj2id[i])]
+                uses += [(site, self._of_equality(i)) for site in ends]
+        for site, trees in uses:
+            found[site] = found.get(site, NONE) | trees
         return found
 
     def _sites_of_tendons(self) -> Iterator[tuple[int, Trees]]:
@@ -345,16 +357,6 @@ class Couplings:
                     yield int(mj.wrap_objid[i]), trees
                 elif mj.wrap_type[i] in _AROUND and mj.wrap_prm[i] >= 0:
                     yield int(mj.wrap_prm[i]), trees
-
-    def _sites_of_actuators(self) -> Iterator[tuple[int, Trees]]:
-        """List the sites that actuators act on or refer to."""
-        mj = self._mj
-        for actuator in range(mj.nactuator):
-            ends = [int(end) for end in mj.actuator_trnid[actuator] if end >= 0]
-            kind = mujoco.mjtTrn(int(mj.actuator_trntype[actuator]))
-            joint = kind == _TRN.mjTRN_SO3 and len(ends) == 1
-            if kind in (_TRN.mjTRN_SITE, _TRN.mjTRN_SLIDERCRANK, _TRN.mjTRN_SO3) and not joint:
-                yield from ((end, self._of_actuator(actuator)) for end in ends)
 
     @cached_property
     def _wrapped(self) -> dict[int, Trees]:

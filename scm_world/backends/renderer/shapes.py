@@ -16,7 +16,7 @@ from scm_world.backends.renderer.bodies import (
     NOTHING,
     Bodies,
 )
-from scm_world.backends.renderer.kernels import Canvas, View, camera_view, draw
+from scm_world.backends.renderer.kernels import Canvas, camera_view, draw
 from scm_world.backends.renderer.meshes import (
     LOWEST,
     NO_COLORS,
@@ -84,8 +84,19 @@ def draw_shapes(
             draw_mesh(_triangles(shape, shape.mesh), view, towards, 1.0, canvas)
         elif shape.kind == "plane":
             draw_ground(_ground(shape, solid, light, shadows), view, towards, 1.0, canvas)
-    for shape in sorted(clear, key=lambda shape: -_distance(shape, camera)):
-        _draw_clear(shape, view, towards, canvas)
+    away = {id(s): float(np.linalg.norm(s.position - camera.eye)) for s in clear}
+    away |= {id(s): np.inf for s in clear if s.kind == "plane"}  # behind all else
+    for shape in sorted(clear, key=lambda shape: -away[id(shape)]):
+        alpha = float(shape.color[3])
+        if shape.kind == "plane":
+            ground = _ground(shape, (), Light(), shadows=False)
+            draw_ground(ground, view, towards, alpha, canvas)
+        elif shape.mesh is None:
+            draw(_table([shape]), view, towards, alpha, canvas)
+        else:
+            mesh, nearest = _triangles(shape, shape.mesh), canvas.depth.copy()
+            draw_mesh(mesh, view, towards, 1.0, Canvas(nearest, NO_OWNERS, NO_COLORS))
+            draw_mesh(mesh, view, towards, alpha, canvas._replace(depth=nearest))
     return canvas
 
 
@@ -101,24 +112,6 @@ def goal_shapes(goals: Iterable[Goal]) -> list[Shape]:
         color = np.array([*goal.color, GOAL_OPACITY])
         shapes.append(Shape(kind, halves, position, rotation, color, mesh=hull))
     return shapes
-
-
-def _distance(shape: Shape, camera: Camera) -> float:
-    """Give how far away a shape is; planes lie behind all else."""
-    return np.inf if shape.kind == "plane" else float(np.linalg.norm(shape.position - camera.eye))
-
-
-def _draw_clear(shape: Shape, view: View, towards: Floats, canvas: Canvas) -> None:
-    """Blend a shape with what is behind it."""
-    alpha = float(shape.color[3])
-    if shape.kind == "plane":
-        draw_ground(_ground(shape, (), Light(), shadows=False), view, towards, alpha, canvas)
-    elif shape.mesh is None:
-        draw(_table([shape]), view, towards, alpha, canvas)
-    else:
-        mesh, nearest = _triangles(shape, shape.mesh), canvas._replace(depth=canvas.depth.copy())
-        draw_mesh(mesh, view, towards, 1.0, Canvas(nearest.depth, NO_OWNERS, NO_COLORS))
-        draw_mesh(mesh, view, towards, alpha, nearest)
 
 
 def _table(shapes: Sequence[Shape]) -> Bodies:

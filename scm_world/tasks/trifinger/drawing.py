@@ -20,7 +20,6 @@ from scm_world.backends.renderer.bodies import (
     goal_bodies,
     turn_kernel,
 )
-from scm_world.backends.renderer.drawing import Drawing
 from scm_world.backends.renderer.kernels import (
     SHADOW,
     Canvas,
@@ -35,6 +34,7 @@ from scm_world.backends.renderer.kernels import (
     shade_at,
 )
 from scm_world.backends.renderer.meshes import NO_COLORS, NO_SHADOW, lamp, shadow_map
+from scm_world.backends.renderer.picture import Drawing
 from scm_world.backends.renderer.shapes import GOAL_OPACITY
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.models.camera import Camera

@@ -19,17 +19,6 @@ MOST = 10
 _ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # the golden angle: places never line up
 
 
-def _default_places() -> tuple[float, ...]:
-    """Spread places over the arena, between the fingers and above the blocks [m]."""
-    index = np.arange(MOST)
-    radius = 0.05 + 0.008 * index
-    points = np.stack(
-        [radius * np.cos(_ANGLE * index), radius * np.sin(_ANGLE * index), 0.16 + 0.004 * index],
-        axis=-1,
-    )
-    return tuple(points.ravel().tolist())
-
-
 def obstacle_names(count: int) -> tuple[str, ...]:
     """Name the first obstacles."""
     return tuple(f"obstacle_{index}" for index in range(count))
@@ -60,6 +49,10 @@ def scattering(default: int) -> Iterable[Variable]:
         default=default,
         doc="How many small boxes are in the way.",
     )
+    index = np.arange(MOST)  # between the fingers and above the blocks
+    radius, height = 0.05 + 0.008 * index, 0.16 + 0.004 * index
+    x, y = radius * np.cos(_ANGLE * index), radius * np.sin(_ANGLE * index)
+    places = np.stack([x, y, height], axis=-1)
     arena = (ARENA_HALF_WIDTH - 0.005, ARENA_HALF_WIDTH - 0.005)
     low, high = (-arena[0], -arena[1], 0.005), (*arena, ARENA_HEIGHT - 0.005)
     space = Box(low * MOST, high * MOST)
@@ -70,7 +63,7 @@ def scattering(default: int) -> Iterable[Variable]:
         bounds=Box((-0.24, -0.24, 0.0) * MOST, (0.24, 0.24, 0.5) * MOST),
         a=space,
         b=space,
-        default=_default_places(),
+        default=tuple(places.ravel().tolist()),
         doc="Where the centers of the obstacles are.",
     )
 

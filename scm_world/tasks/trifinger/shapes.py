@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from functools import lru_cache
-from typing import final
 
 import numpy as np
 
@@ -19,9 +16,7 @@ from scm_world.geometry import (
     rotation_matrix,
 )
 from scm_world.geometry.hulls import Hull, hull_of, hull_overlap
-from scm_world.models import ParameterKey
 from scm_world.tasks.base import numbers_of
-from scm_world.tasks.composition import Entity, State
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock, block_mass
@@ -31,7 +26,7 @@ from scm_world.tasks.trifinger.entities.goals import (
     goal_position,
     on_the_floor,
 )
-from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Variable
+from scm_world.variables import Box, Derived, Exogenous, Fixed, Function
 from scm_world.variables.spaces import Bound
 
 Place = tuple[float, float] | tuple[float, float, float]
@@ -289,59 +284,6 @@ def _checked(option: str, place: Place) -> tuple[float, ...]:
     if point is None or point.shape not in ((2,), (3,)):
         raise UnknownOption(option, place, ("x, y", "x, y, z [m]"))
     return tuple(point.tolist())
-
-
-@final
-class Standing(Entity):
-    """A block that begins turned, and that keeps its lowest point where it is no box, too.
-
-    Args:
-        block: The block; a hull has its corners as the first further cause of its place.
-        orientation: How it begins: quaternion (x, y, z, w).
-    """
-
-    def __init__(self, block: ToolBlock, *, orientation: Quaternion) -> None:
-        self.name = block.name
-        self._block = block
-        self._first = {f"{self.name}.orientation": orientation}
-        self._carry: dict[str, Function] = {}
-        if block.hull is not None:
-            self._carry[f"{self.name}.cartesian_position"] = Function(keep_lowest_corner)
-
-    @property
-    def is_block(self) -> bool:
-        """A block it is."""
-        return True
-
-    @property
-    def hull(self) -> Hull | None:
-        """The shape of a block that is no box."""
-        return self._block.hull
-
-    def variables(self) -> Iterable[Variable]:
-        """Declare what the block does."""
-        return self._block.variables()
-
-    def states(self) -> Iterable[State]:
-        """Declare its states, with where it begins and how it is carried along."""
-        for state in self._block.states():
-            yield replace(
-                state,
-                default=self._first.get(state.name, state.default),
-                carry=self._carry.get(state.name, state.carry),
-            )
-
-    def inputs(self) -> Iterable[str]:
-        """Name what physics depends on."""
-        return self._block.inputs()
-
-    def parameters(self) -> Mapping[str, ParameterKey]:
-        """Say which variable sets which physical parameter."""
-        return self._block.parameters()
-
-    def slices(self, block: int) -> Mapping[str, slice]:
-        """Say where its states stand in the state vector."""
-        return self._block.slices(block)
 
 
 MASS = "blocks_mass"

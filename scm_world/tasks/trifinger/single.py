@@ -146,7 +146,7 @@ class OneBlock(Building):
             causes: The further ones.
         """
         corners = () if self.shape is None else (f"{TOOL}.vertices",)
-        block = ToolBlock(
+        return ToolBlock(
             TOOL,
             size=self.size_of(TOOL),
             mass=block_mass(f"{TOOL}.mass", default=self._mass),
@@ -155,8 +155,9 @@ class OneBlock(Building):
             a=spaces[0],
             b=spaces[1],
             hull=self.shape,
+            orientation=self._turns[TOOL],
+            carry=None if self.shape is None else Function(shapes.keep_lowest_corner),
         )
-        return shapes.Standing(block, orientation=self._turns[TOOL])
 
     def goal(
         self,

@@ -224,15 +224,15 @@ class Stacking2(Building):
     def _tool(self, index: int, start: Function) -> Entity:
         name, size = TOOLS[index], f"{TOOLS[index]}.size"
         a, b = shapes.block_spaces(size, airborne=self.conventions.published_spaces)
-        block = ToolBlock(
+        return ToolBlock(
             name,
             size=block_size(size, SIZE, spaces=False),
             mass=block_mass(f"{name}.mass", default=self._mass),
             spawn=start,
             a=a,
             b=b,
+            orientation=self._turns[index],
         )
-        return shapes.Standing(block, orientation=self._turns[index])
 
     def dense(self) -> Iterable[Variable]:
         """Declare how blocks and fingers come nearer, and how steady they are."""

@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.geometry.hulls import Hull
 from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.controller import FAST, ControllerSpec, Preset
+from scm_world.tasks.trifinger.hardware import FAST, ControllerSpec, Preset
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState, state_layout
 
 ARENA_HALF_WIDTH = 0.15  # [m]

@@ -9,11 +9,10 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.bullet.client import Client
+from scm_world.backends.bullet.client import Client, Values
 from scm_world.backends.bullet.model.build import Built, build, solid
 from scm_world.backends.bullet.model.forces import Forces
 from scm_world.backends.bullet.model.support import changes, shares, unsupported, usual_friction
-from scm_world.backends.bullet.values import Values
 from scm_world.errors import ModelError, NotIntervenable, UnknownOption
 from scm_world.models.bodies import ModelBodies
 from scm_world.models.model import Model

@@ -67,14 +67,10 @@ LIVE = {
 """What live bodies can take on."""
 
 
+@lru_cache(maxsize=64)
 def unsupported(model: Model) -> tuple[str, ...]:
     """List everything in a model that the engine cannot honour."""
-    return _unsupported(model.bodies)
-
-
-@lru_cache(maxsize=64)
-def _unsupported(bodies: ModelBodies) -> tuple[str, ...]:
-    roots = bodies.roots
+    bodies, roots = model.bodies, model.bodies.roots
     found = [*bodies.missing, *_of_joints(bodies)]
     for coupling in bodies.couplings:
         one, other = bodies.joints[coupling.joint], bodies.joints[coupling.leader]

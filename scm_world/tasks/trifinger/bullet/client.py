@@ -10,8 +10,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.bullet.client import Client
-from scm_world.backends.bullet.values import Values, arrays, known
+from scm_world.backends.bullet.client import Client, Values, arrays, known
 from scm_world.errors import EngineFailure
 from scm_world.geometry.hulls import Hull
 from scm_world.models.scene import ControlMode, ParameterKey
@@ -27,7 +26,7 @@ from scm_world.tasks.trifinger.bullet.arena import (
     link_index,
 )
 from scm_world.tasks.trifinger.bullet.passive import MASSES, resistance
-from scm_world.tasks.trifinger.controller import ControllerSpec
+from scm_world.tasks.trifinger.hardware import ControllerSpec
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.tasks.trifinger.structure import Structure, controller_spec, parameter_keys
 

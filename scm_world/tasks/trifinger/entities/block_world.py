@@ -13,14 +13,15 @@ from scm_world.models import ControlMode, Goal, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity, Mover
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
-from scm_world.tasks.trifinger.controller import PRESET_NAMES, preset
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     LINK_NAMES,
     N_JOINTS,
     NOMINAL_HEIGHT,
+    PRESET_NAMES,
     link_name,
+    preset,
 )
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState

@@ -122,6 +122,9 @@ class ToolBlock(Entity):
         a: Space A of the cylindrical position.
         b: Space B of it.
         hull: Its shape, if it is no box. The size is then a constant.
+        orientation: How it begins turned: quaternion (x, y, z, w).
+        carry: Instead of keeping the lowest point of a box: where its center goes as it is turned
+            or changes its size.
     """
 
     def __init__(
@@ -137,6 +140,8 @@ class ToolBlock(Entity):
         a: Box | None = None,
         b: Box | None = None,
         hull: Hull | None = None,
+        orientation: tuple[float, float, float, float] = numbers.IDENTITY,
+        carry: Function | None = None,
     ) -> None:
         self.name = name
         self._size, self._mass = size, mass
@@ -145,7 +150,7 @@ class ToolBlock(Entity):
         self._restart = (*spawn_from, self._v("size")) if spawn_again else spawn_from
         self._again = self._restart if spawn_again else ()
         self._a, self._b = a, b
-        self._hull = hull
+        self._hull, self._orientation, self._carry = hull, orientation, carry or _KEEP
 
     @property
     def is_block(self) -> bool:
@@ -191,7 +196,7 @@ class ToolBlock(Entity):
             always=(position, linear, *always),
             on_set=(self._v("size"), orientation, *self._spawn_from),
             start=self._spawn,
-            carry=_KEEP,
+            carry=self._carry,
             restart=self._restart,
         )
         yield State(
@@ -199,7 +204,7 @@ class ToolBlock(Entity):
             "1",
             (4,),
             numbers.QUATERNION_BOUNDS,
-            numbers.IDENTITY,
+            self._orientation,
             "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
             always=(orientation, angular, PRESET),
             **self._respawn(numbers.IDENTITY),

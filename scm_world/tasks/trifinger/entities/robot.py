@@ -16,9 +16,8 @@ from scm_world.models import ParameterKey
 from scm_world.tasks.composition import Commands, Entity, State
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.controller import ControllerSpec
 from scm_world.tasks.trifinger.entities.blocks import color
-from scm_world.tasks.trifinger.hardware import FINGERS, N_JOINTS
+from scm_world.tasks.trifinger.hardware import FINGERS, N_JOINTS, ControllerSpec
 from scm_world.tasks.trifinger.kinematics import forward_kernel, inverse_kernel, tip_kernel
 from scm_world.variables import (
     Action,

@@ -8,8 +8,8 @@ from typing import final
 from scm_world.models import ParameterKey
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.controller import PRESET_NAMES
 from scm_world.tasks.trifinger.entities.blocks import color
+from scm_world.tasks.trifinger.hardware import PRESET_NAMES
 from scm_world.variables import Categories, Exogenous, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 

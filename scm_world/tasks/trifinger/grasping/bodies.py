@@ -171,19 +171,14 @@ class Sight:
         self._values: Mapping[str, Value] = world.evaluate(())
         self.joints = np.array(self._values["joint_positions"])
         self.left = world.max_episode_length - world.index
-        if self._version != world.version:
-            self._version = world.version
-            self._learn(world)
-
-    def _learn(self, world: Any) -> None:
-        """See what moves only when someone intervenes."""
+        if self._version == world.version:
+            return  # all else moves only when someone intervenes
+        self._version, task = world.version, world.compiled.task
         self.hand = Hand(self._values, world.control_period)
         self._solid = (*world.composition.blocks, *world.composition.obstacles)
-        task = world.compiled.task
-        targets = task.targets()
         self.pairs = tuple(
             (tool, goal)
-            for goal, tool in targets.items()
+            for goal, tool in task.targets().items()
             if tool in self._solid and f"{goal}.size" in self._values
         )
         if not self.pairs:

@@ -14,8 +14,7 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.realization import Realization, Rows
 from scm_world.models.scene import ControlMode, ParameterKey
 from scm_world.tasks.trifinger.hardware import N_JOINTS
-from scm_world.tasks.trifinger.mujoco.model import compiled, shape_owners
-from scm_world.tasks.trifinger.mujoco.parameters import couple, slots, steer
+from scm_world.tasks.trifinger.mujoco.model import compiled, couple, shape_owners, slots, steer
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
 from scm_world.tasks.trifinger.structure import Structure
 
