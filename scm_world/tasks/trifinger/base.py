@@ -18,9 +18,8 @@ from scm_world.tasks.composition import Clock, Composition, Entity
 from scm_world.tasks.rewards import FRACTION, Common, further_terms, resolve
 from scm_world.tasks.trifinger import hardware, shaping
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
-from scm_world.tasks.trifinger.entities.pictures import LightAndCameras
 from scm_world.tasks.trifinger.entities.robot import ACTIONS, RESOLUTIONS, Robot
-from scm_world.tasks.trifinger.entities.stage import Stage
+from scm_world.tasks.trifinger.entities.stage import LightAndCameras, Stage
 from scm_world.tasks.trifinger.hardware import PRESETS, TIMESTEP
 from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.variables import Linear, Measured, Variable
