@@ -59,7 +59,13 @@ class VisibleModel:
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = model
         self.names = body_names(model)
-        _hide_what_collides(model)
+        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        shown = model.geom_group < SHOWN_GROUPS
+        for body in range(1, model.nbody):
+            mine = shown & (model.geom_bodyid == body)
+            looks, touches = (set(model.geom_group[mine & kind]) for kind in (~collides, collides))
+            if looks - touches:
+                model.geom_group[mine & collides] = HIDDEN_GROUP
         self._scene = mujoco.MjvScene(model, MOST_SHAPES)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._meshes: dict[tuple[int, int], Mesh] = {}
@@ -144,7 +150,13 @@ class VisibleModel:
         color = np.array(geom.rgba, dtype=np.float64)
         texture = self._textures[geom.matid] if geom.matid >= 0 else None
         if texture is not None and kind == "plane":
-            tiles = Tiles(self._tile(geom), tuple((color[:3] * texture[1]).tolist()))
+            # A texture holds two by two tiles.
+            repeat = np.maximum(self.model.mat_texrepeat[geom.matid], 1e-6)
+            whole = np.array(geom.size[:2], dtype=np.float64)
+            if self.model.mat_texuniform[geom.matid]:
+                whole[:] = 1.0
+            first, second = (np.where(whole > 0.0, whole, 1.0) / repeat).tolist()
+            tiles = Tiles((first, second), tuple((color[:3] * texture[1]).tolist()))
             color[:3] *= texture[0]
         elif texture is not None:
             color[:3] *= texture.mean(axis=0)
@@ -166,16 +178,6 @@ class VisibleModel:
             color = np.array(geom.rgba, dtype=np.float64)
             middle = (start + end) / 2.0
             yield Shape("capsule", halves, middle, rotation.reshape(3, 3), color, moves=True)
-
-    def _tile(self, geom: mujoco.MjvGeom) -> tuple[float, float]:
-        """Give the edges of the tiles of a plane: a texture holds two by two of them."""
-        material = geom.matid
-        repeat = np.maximum(self.model.mat_texrepeat[material], 1e-6)
-        whole = np.array(geom.size[:2], dtype=np.float64)
-        if self.model.mat_texuniform[material]:
-            whole[:] = 1.0
-        first, second = (np.where(whole > 0.0, whole, 1.0) / repeat).tolist()
-        return first, second
 
     def _body(self, geom: mujoco.MjvGeom) -> tuple[int, bool]:
         """Find the body that something belongs to, and whether it moves."""
@@ -258,17 +260,6 @@ def draw_goals(scene: mujoco.MjvScene, goals: Iterable[Goal]) -> None:
             np.array([*goal.color, GOAL_OPACITY], dtype=np.float32),
         )
         scene.ngeom += 1
-
-
-def _hide_what_collides(model: mujoco.MjModel) -> None:
-    """Hide the geoms that collide of those bodies that have a shown group of geoms that do not."""
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    shown = model.geom_group < SHOWN_GROUPS
-    for body in range(1, model.nbody):
-        mine = shown & (model.geom_bodyid == body)
-        groups = set(model.geom_group[mine & ~collides]) - set(model.geom_group[mine & collides])
-        if groups:
-            model.geom_group[mine & collides] = HIDDEN_GROUP
 
 
 def _triangles(model: mujoco.MjModel, mesh: int) -> Mesh:

@@ -82,17 +82,6 @@ def draw_scene(
     drawing, data = drawn(scene)
     abstract = drawing.scene(data)
     draw_goals(abstract, scene.goals)
-    _aim(abstract, camera)
-    if drawing.model.nlight == 0:
-        _light(abstract, scene.light, camera, float(drawing.model.stat.extent))
-    rgb, there = _canvas(drawing, (camera.height, camera.width), library).picture(abstract)
-    if not (drawing.model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any():
-        rgb[~there] = sky
-    return rgb
-
-
-def _aim(abstract: mujoco.MjvScene, camera: Camera) -> None:
-    """Look with a camera; the headlight goes with it."""
     _, up, back = camera.axes()
     top = camera.near * math.tan(math.radians(camera.field_of_view) / 2.0)
     for eye in abstract.camera:
@@ -104,6 +93,12 @@ def _aim(abstract: mujoco.MjvScene, camera: Camera) -> None:
     for lamp in abstract.lights[: abstract.nlight]:
         if lamp.headlight:
             lamp.pos[:], lamp.dir[:] = camera.eye, -back
+    if drawing.model.nlight == 0:
+        _light(abstract, scene.light, camera, float(drawing.model.stat.extent))
+    rgb, there = _canvas(drawing, (camera.height, camera.width), library).picture(abstract)
+    if not (drawing.model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any():
+        rgb[~there] = sky
+    return rgb
 
 
 def _light(abstract: mujoco.MjvScene, light: Light, camera: Camera, extent: float) -> None:

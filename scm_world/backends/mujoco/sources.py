@@ -155,8 +155,9 @@ def read_source(
             ]
         )
     name = stem if spec.modelname in ("", _UNNAMED) else spec.modelname
-    if not fixed_base and urdf:
-        _free(spec)
+    for body in spec.worldbody.bodies if urdf and not fixed_base else ():
+        if not body.joints:  # MuJoCo fixes the root link of a URDF to the world
+            body.add_freejoint()
     whole = spec.copy()
     try:
         files = _located(spec, folder, where)
@@ -339,13 +340,6 @@ def _repair(spec: mujoco.MjSpec, where: str) -> None:
         if "inertia" not in str(error):
             raise
         spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
-
-
-def _free(spec: mujoco.MjSpec) -> None:
-    """Free the root link of a URDF, which MuJoCo fixes to the world."""
-    for body in spec.worldbody.bodies:
-        if not body.joints:
-            body.add_freejoint()
 
 
 def _add_motors(spec: mujoco.MjSpec) -> None:

@@ -177,7 +177,11 @@ class Planner:
         ]
         best: Move | None = None
         for grip in grips(start) if ways else ():
-            strength, ease = self._beginning(grip, start)
+            over = self._above(start)  # how it is taken hold of: with which force, how easily
+            opens = self._opens(grip, start, over)
+            strength = self._strength(grip, start) if opens else 0.0
+            ease = FIRMNESS * grip.firm - TIGHT * (grip.opening < max(OPENINGS))
+            ease += self._transit(grip, start, over) if opens else 0.0
             for end, turn, height in ways if strength > 0.0 else ():
                 above = self._above(start, *[end] * release)
                 worth = ease - TURNING * abs(turn) + 1.0 + 3.0 * PLENTY
@@ -226,14 +230,6 @@ class Planner:
         return max(LOWEST, *(body.top + OVER for body in (*self._others, *blocks)))
 
     # --- judging ------------------------------------------------------------------------------
-
-    def _beginning(self, grip: Grip, start: Cuboid) -> tuple[float, float]:
-        """Judge how a block is taken hold of: with which force [N], and how easily."""
-        above = self._above(start)
-        if not self._opens(grip, start, above):
-            return 0.0, 0.0
-        ease = FIRMNESS * grip.firm - TIGHT * (grip.opening < max(OPENINGS))
-        return self._strength(grip, start), ease + self._transit(grip, start, above)
 
     def _judged(self, move: Move, wanted: float) -> Move:
         """Judge a way as a whole; its strength is 0 if the fingers cannot go it."""

@@ -158,17 +158,6 @@ def write_state(
             velocities[v + 3 + axis] = last_velocities[lv + 3 + axis] if same else spin[axis]
 
 
-@numba.njit("b1(f8[::1], f8[::1])", cache=True)
-def finite(positions: Floats, velocities: Floats) -> bool:
-    """Tell whether no number is infinite or not a number."""
-    total = 0.0
-    for value in positions:
-        total += value * 0.0
-    for value in velocities:
-        total += value * 0.0
-    return total == 0.0
-
-
 _OUTPUT = numba.types.Array(numba.float64, 2, "C", readonly=True)
 
 
@@ -202,7 +191,12 @@ def read_states(
         velocity[:] = velocities[i]
         torque[:] = torques[i, :N_JOINTS]
         read_state(position, velocity, torque, into[i, :end])
-        if not finite(position, velocity):
+        total = 0.0
+        for value in position:
+            total += value * 0.0
+        for value in velocity:
+            total += value * 0.0
+        if total != 0.0:  # also where it is not a number
             wrong = i
     return wrong
 
