@@ -6,6 +6,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.speed.scenes import CASES, ENGINES, SEED, Case, actions, cases
 from benchmarks.speed.subprocesses import answer, asked
 from benchmarks.speed.timing import MILLI, Settings, micros
+from scm_world.curricula import CurriculumEnv, everything
 from scm_world.env import ScmWorldEnv
 
 TIMES = 40
@@ -43,6 +45,7 @@ def changes(case: Case, engine: str, settings: Settings) -> dict[str, float]:
         found[f"do: {title} [µs]"] = statistics.median(
             doing(env, request()) for _ in range(times + 2)
         )
+    found |= compared(case, env, engine, found["reset [µs]"], times)
     env.reset(seed=SEED)
     for action in actions(INTO):
         env.step(action)
@@ -53,9 +56,33 @@ def changes(case: Case, engine: str, settings: Settings) -> dict[str, float]:
     return found
 
 
-def after(env: ScmWorldEnv, steps: int, act: Callable[[], Any], times: int) -> float:
+def compared(
+    case: Case, env: ScmWorldEnv, engine: str, reset: float, times: int
+) -> dict[str, float]:
+    """Compare with a reset: an intervention after which there are other bodies, or many draws.
+
+    Where which bodies there are is a variable, the structure is compiled anew every time, but for
+    the engine; elsewhere everything is drawn from space A at the reset.
+    """
+    world = env.world
+    if not len(world.structures.head):
+        drawn = CurriculumEnv(case.env(engine), everything("A"))
+        drawn.reset(seed=SEED)
+        spent = after(drawn, BETWEEN, drawn.reset, times)
+        drawn.close()
+        return {"reset, all drawn, to reset": spent / reset}
+    spent = []
+    for _ in range(times // 4 + 2):
+        env.reset(seed=SEED)
+        wanted = next(iter(world.task.nearby(world.values())))
+        world.structures._compiled.clear()
+        spent.append(micros(partial(world.do, wanted)))
+    return {"do: bodies, to reset": statistics.median(spent[2:]) / reset}
+
+
+def after(env: Any, steps: int, act: Callable[[], Any], times: int) -> float:
     """Time something after some control steps, as a median [µs]."""
-    rest, found = at_rest(env), []
+    rest, found = at_rest(env.unwrapped), []
     for _ in range(times + 2):
         for _ in range(steps):
             env.step(rest)

@@ -79,4 +79,4 @@ def beginning_structure(world: World, acts: Mapping[str, Any]) -> CompiledTask:
             except InterventionError:  # the reset will say so
                 continue
     found = family.after(mine, family.head, family.head.solve(), world.noise_key(0))
-    return found or family.natural(None)
+    return family.natural(None) if found is None else family.compiled(found)

@@ -42,6 +42,7 @@ from scm_world.variables import (
     divided,
     whole_of,
 )
+from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
 """The step whose noise is that of the instant before the first step."""
@@ -71,7 +72,9 @@ def flatten(
     flat: dict[str, Any] = {}
     problems: list[InterventionError] = []
     for name, value in request.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Frozen):  # an intervention
+            parts = {name: value}
+        elif isinstance(value, Mapping):
             if not value:
                 said = f"do({name}): an empty dictionary sets nothing; leave {name!r} out"
                 problems.append(InterventionError(said, variable=name, value=value))
@@ -80,9 +83,9 @@ def flatten(
         else:
             held = isinstance(value, list | tuple) or hasattr(value, "__array__")
             parts = {name: deepcopy(value) if held else value}
-        again = [key for key in parts if key in flat]
-        problems += [ConflictingTargets((key, key), key) for key in again]
-        flat = {**parts, **flat} if again else {**flat, **parts}
+        problems += [ConflictingTargets((key, key), key) for key in parts if key in flat]
+        for key, part in parts.items():
+            flat.setdefault(key, part)
     if twice is None:
         raise_all(problems)
     else:

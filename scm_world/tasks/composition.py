@@ -272,13 +272,14 @@ class Composition(ABC):
         return ()
 
     def thin(  # noqa: B027 # a composition that knows nothing of bodies leaves all
-        self, candidates: Any, before: Iterable[Overlap]
+        self, candidates: Any, before: Iterable[Overlap], *, whole: bool = True
     ) -> None:
         """Leave out candidates that put two bodies in one place; it may leave in such.
 
         Args:
             candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
             before: The bodies that lie in one another already, and may go on doing so.
+            whole: Whether all candidates have the blocks and obstacles of this structure.
         """
 
     def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 from functools import lru_cache
-from typing import final
 
 import numpy as np
 
@@ -28,7 +27,6 @@ def word_of(text: str) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
-@final
 class Noise:
     """All the noise of one seed.
 

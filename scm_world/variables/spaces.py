@@ -204,6 +204,8 @@ class Box(_Space):
 
     def bounds(self, shape: tuple[int, ...], values: Values) -> tuple[Floats, Floats]:
         """Evaluate both corners, each of shape ``(..., *shape)``."""
+        if not self._followed:
+            return _constant(self.low, shape), _constant(self.high, shape)
         return _evaluate(self.low, shape, values), _evaluate(self.high, shape, values)
 
     @cached_property

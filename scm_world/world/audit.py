@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._types import Value
 from scm_world.backends import Backend
-from scm_world.models import Difference
+from scm_world.models import Difference, Parameters
 from scm_world.variables import Hard
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.feasibility import Present
@@ -86,6 +86,7 @@ def report(
     before: Present,
     now: Present,
     inertia: Mapping[str, Value],
+    reported: Parameters,
     backend: Backend,
 ) -> Audit:
     """Return what a committed intervention did.
@@ -97,11 +98,15 @@ def report(
         before: What the backend had before; its values are not overwritten.
         now: What it has now.
         inertia: Principal moments before, of the bodies whose mass or size changed.
+        reported: Parameters that were read back already.
         backend: That took over the plan.
     """
+    model, keys = plan.compiled.model, plan.compiled.parameter_keys
+    wanted = {keys[t] for name in plan.asked for t in model.targets(name) if t in keys}
+    reported = {**reported, **backend.parameters(wanted - reported.keys())}
     targets = {}
     for name in plan.asked:
-        applied, read_back = _asked(plan, now, backend, name)
+        applied, read_back = _asked(plan, now, reported, name)
         targets[name] = Applied(name, request[name], applied, read_back)
     bundles = plan.compiled.bundles
     known = {*targets, *(part for name in targets for part in bundles.get(name, ()))}
@@ -134,27 +139,27 @@ def _typed(old: Value, new: Value) -> Value:
 
 
 def _asked(
-    plan: InterventionPlan, now: Present, backend: Backend, name: str
+    plan: InterventionPlan, now: Present, reported: Parameters, name: str
 ) -> tuple[Value | None, Value | None]:
     """Give what was applied and read back of what was asked for: also coordinates, or a bundle."""
     compiled = plan.compiled
     targets = compiled.model.targets(name)
-    outcomes = [_outcome(plan, now, backend, target) for target in targets]
+    outcomes = [_outcome(plan, now, reported, target) for target in targets]
     if targets == (name,):
         return outcomes[0]
     values = [applied for applied, _ in outcomes if applied is not None]
-    reported = [back for _, back in outcomes if back is not None]
+    backs = [back for _, back in outcomes if back is not None]
     if len(values) < len(targets):
         return None, None
     applied = compiled.in_coordinates(name, *values)
-    if len(reported) < len(targets):
+    if len(backs) < len(targets):
         return applied, None
-    exact = all(map(same, reported, values))
-    return applied, applied if exact else compiled.in_coordinates(name, *reported)
+    exact = all(map(same, backs, values))
+    return applied, applied if exact else compiled.in_coordinates(name, *backs)
 
 
 def _outcome(
-    plan: InterventionPlan, now: Present, backend: Backend, target: str
+    plan: InterventionPlan, now: Present, reported: Parameters, target: str
 ) -> tuple[Value | None, Value | None]:
     """Give the value that a target has now, and what the backend reports; None if unknown."""
     compiled = plan.compiled
@@ -167,4 +172,4 @@ def _outcome(
     if target in compiled.slices:
         return applied, np.array(compiled.view(target, now.state))
     key = compiled.parameter_keys.get(target)
-    return applied, None if key is None else np.array(backend.parameters([key])[key])
+    return applied, None if key is None else np.array(reported[key])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, final
 
@@ -11,9 +11,10 @@ import numpy as np
 from scm_world._types import Integers, Value
 from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
+from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard, Natural, Rotations, Variable, whole_of
 from scm_world.variables.noise import word_of
-from scm_world.world.compiled_task import StepBase
+from scm_world.world.compiled_task import Plan, StepBase
 from scm_world.world.philox import philox
 from scm_world.world.plan import InterventionPlan
 from scm_world.world.solver import Solver, same
@@ -130,10 +131,12 @@ class Candidates:
         new = [*map(self._value, parents)]
         if self._varying.isdisjoint(parents):
             return self._as_planned(name), False
-        if name in solver.base.fresh:
-            raise Unknown
         variable, old = self._carried[name], [solver.before(parent) for parent in parents]
         present = self._task.view(name, solver.base.state)
+        if name in solver.base.fresh:
+            if variable.start is None:
+                return present[None], False
+            return self._rows(variable.start.bind(), new, present.shape, varies=True), True
 
         def moved(*given: Value) -> Value:
             both = zip(parents, old, given, strict=True)
@@ -176,32 +179,81 @@ class Candidates:
         return found
 
 
-def promising(base: StepBase, plan: InterventionPlan, key: NoiseKey, count: int) -> Iterator[int]:
-    """Yield the numbers of further draws that may be feasible, and that of the last one.
+def promising(
+    base: StepBase,
+    made: Mapping[Plan | None, InterventionPlan],
+    structure: Callable[[NoiseKey], Plan | None] | None,
+    key: NoiseKey,
+    count: int,
+) -> Iterator[tuple[int, Plan | None]]:
+    """Yield the further draws that may be feasible, and the last one.
 
-    A draw that is left out puts two bodies in one place. Where that cannot be told, all are
-    yielded.
+    A draw that is left out puts two bodies in one place. Where that cannot be told, it is yielded.
 
     Args:
         base: The world as physics left it.
-        plan: Of an earlier draw.
+        made: Plans of earlier draws by their structure, one at least. Where it is drawn which
+            bodies there are, a structure is looked at from the draw on after which it is in here.
+        structure: Gives the structure of a draw, or None where that is refused; None where all
+            draws have the same.
         key: Where to draw.
         count: How many draws there are; the first one was number 0.
+
+    Yields:
+        The number of a draw, and its structure.
     """
-    compiled, solver = plan.compiled, plan.solver
     before = base.compiled.composition.overlaps(
         base.compiled.describe(base.static, base.state), 0.0
     )
+    here, plan = next(iter(made.items()))
+    # What is asked of a body is refused where the body is not there.
+    asked = {name.partition(".")[0] for name in (*plan.asked, *plan.removals)}
+    alike_everywhere = asked.isdisjoint(plan.compiled.entity_names)
     first, size = 1, CHUNK
-    while first < count and solver is not None:
-        attempts = np.arange(first, min(first + size, count))
-        candidates = Candidates(solver, replace(key, attempt=1), attempts)
-        try:
-            with np.errstate(all="ignore"):
-                compiled.composition.thin(candidates, before)
-        except Exception:  # planning says what is wrong
-            candidates.attempts = attempts
-        yield from candidates.attempts[candidates.attempts < count - 1].tolist()
+    while first < count - 1:
+        attempts = list(range(first, min(first + size, count - 1)))
+        if structure is None:
+            places: dict[int, Plan | None] = dict.fromkeys(attempts, here)
+        else:
+            if alike_everywhere:
+                attempts = _thinned(plan, before, key, attempts, whole=False)
+            places = {attempt: structure(replace(key, attempt=attempt)) for attempt in attempts}
+        thinned: dict[Plan | None, frozenset[int]] = {}
+        for attempt, where in places.items():
+            if where in made and where not in thinned:
+                alike = [a for a, other in places.items() if other == where and a >= attempt]
+                thinned[where] = frozenset(_thinned(made[where], before, key, alike))
+            if where not in thinned or attempt in thinned[where]:
+                yield attempt, where
         first, size = first + size, 4 * CHUNK
     if count > 1:
-        yield count - 1
+        yield count - 1, None
+
+
+def _thinned(
+    plan: InterventionPlan,
+    before: Iterable[Overlap],
+    key: NoiseKey,
+    attempts: list[int],
+    *,
+    whole: bool = True,
+) -> list[int]:
+    """List the draws that may be feasible.
+
+    Args:
+        plan: Of an earlier draw.
+        before: The bodies that lie in one another already.
+        key: Where to draw.
+        attempts: Numbers of draws.
+        whole: Whether all of them have the bodies of the plan.
+    """
+    if plan.solver is None:
+        return attempts
+    candidates = Candidates(plan.solver, replace(key, attempt=1), np.array(attempts))
+    try:
+        with np.errstate(all="ignore"):
+            plan.compiled.composition.thin(candidates, before, whole=whole)
+    except Exception:  # planning says what is wrong
+        return attempts
+    left: list[int] = candidates.attempts.tolist()
+    return left

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, final
 
 import numpy as np
@@ -17,10 +18,10 @@ from scm_world.variables import Draw, Hard
 from scm_world.variables.checks import coerce
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.candidates import promising
-from scm_world.world.compiled_task import CompiledTask, StepBase
-from scm_world.world.plan import InterventionPlan, plan_intervention
+from scm_world.world.compiled_task import CompiledTask, Plan, StepBase
+from scm_world.world.plan import InterventionPlan, draws_bodies, plan_intervention
 from scm_world.world.solver import same
-from scm_world.world.structures import StructureCache
+from scm_world.world.structures import StructureCache, asked_structure
 
 _SURFACES = ("size", "height", "position", "orientation")
 """Parameters that change where the surfaces of bodies are."""
@@ -28,6 +29,8 @@ _PLACES = ("m", "rad", "1")
 """Units of states that do so: positions, angles and quaternions, not velocities."""
 ATTEMPTS = 1000
 """How often is drawn; one in sixty draws of the joints from A leaves all fingers apart."""
+REMEMBERED = 32
+"""In how many structures draws are looked at together, where it is drawn which bodies there are."""
 
 
 @final
@@ -101,6 +104,62 @@ class Present:
         return not (joints and same(now.blocks[:, :7], then.blocks[:, :7]))
 
 
+@final
+@dataclass(frozen=True)
+class CarriedOut:
+    """A request with draws that was carried out, for when it comes again from the same base.
+
+    Episodes without noise of their own begin alike, and most have the same request. What it asks
+    has been checked then, and what does not follow from a draw has been computed.
+
+    Attributes:
+        base: What it started from.
+        request: The intervention, with dotted names.
+        space: Every target has to lie in, if any.
+        plan: Of the draw that was taken.
+        kept: The draws that move no body.
+    """
+
+    base: StepBase
+    request: Mapping[str, Any]
+    space: AnyRegion | None
+    plan: InterventionPlan
+    kept: frozenset[str]
+
+    def is_again(self, base: StepBase, request: Mapping[str, Any], space: AnyRegion | None) -> bool:
+        """Tell whether a request is the same, but for where it is drawn."""
+        mine = self.base
+        return (
+            (mine.compiled, mine.index, mine.at_start) == (base.compiled, base.index, base.at_start)
+            and mine.model is base.model
+            and mine.static is base.static
+            and same(mine.state.vector, base.state.vector)
+            and not base.pending
+            and self.space == space
+            and [*self.request] == [*request]
+            and all(map(_is_same_act, self.request.values(), request.values()))
+        )
+
+
+def _is_same_act(one: Any, other: Any) -> bool:
+    return one is other or (isinstance(one, Draw) and one == other)
+
+
+def carried_out(
+    structures: StructureCache,
+    base: StepBase,
+    request: Mapping[str, Any],
+    space: AnyRegion | None,
+    plan: InterventionPlan,
+) -> CarriedOut | None:
+    """Keep a request that may come again; None where it has no draws, or bodies are drawn."""
+    again = base.at_start and not base.pending and not draws_bodies(structures, request)
+    if not again or not any(isinstance(act, Draw) for act in request.values()):
+        return None
+    kept = _immaterial(structures, plan.compiled, request)
+    return CarriedOut(base, request, space, plan, kept)
+
+
 def feasible_plan(
     structures: StructureCache,
     base: StepBase,
@@ -109,6 +168,7 @@ def feasible_plan(
     space: AnyRegion | None,
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
+    earlier: CarriedOut | None = None,
 ) -> tuple[InterventionPlan, Difference]:
     """Plan an intervention that puts no two bodies in one place.
 
@@ -124,6 +184,7 @@ def feasible_plan(
         space: Every target has to lie in, if any.
         key: Where to draw.
         found: Problems of the request that are known already.
+        earlier: The same request, if it was carried out before.
 
     Raises:
         InterventionError: See ``plan_intervention``.
@@ -131,12 +192,16 @@ def feasible_plan(
             draw was.
     """
     draws = any(isinstance(act, Draw) for act in request.values())
-    last: InterventionPlan | None = None
-    attempts: Iterator[int] = iter((0,))
+    made: dict[Plan | None, InterventionPlan] = {}
+    attempts: Iterator[tuple[int, Plan | None]] = iter(((0, None),))
     tried = ""
-    while (attempt := next(attempts, None)) is not None:
-        key = replace(key, attempt=attempt)
-        last = plan = plan_intervention(structures, base, request, space, key, last, found)
+    start = None if earlier is None else earlier.plan
+    while (drawn := next(attempts, None)) is not None:
+        attempt, where = drawn
+        key, last = replace(key, attempt=attempt), made.get(where, start)
+        plan = plan_intervention(structures, base, request, space, key, last, found)
+        if len(made) < REMEMBERED:
+            made.setdefault(plan.compiled.plan, plan)
         change = present.difference(plan)
         problems = present.overlaps(base, plan, change)
         if draws and not problems:
@@ -144,17 +209,30 @@ def feasible_plan(
         if not problems:
             return plan, change
         if draws and not attempt:
-            kept = _immaterial(structures, plan.compiled, request)
-            if _stay(structures, plan.compiled, request, kept, problems):
-                tried = "whatever is drawn, "
-                break
+            if earlier is not None:
+                kept = earlier.kept
+            else:
+                kept = _immaterial(structures, plan.compiled, request)
+                if _stay(structures, plan.compiled, request, kept, problems):
+                    tried = "whatever is drawn, "
+                    break
             key = replace(key, kept=kept)
             tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
-            attempts = iter(range(1, ATTEMPTS))
-            drawn = {name for name, act in request.items() if isinstance(act, Draw)}
-            if drawn.isdisjoint(structures.head):  # which bodies there are is not drawn
-                attempts = promising(base, plan, key, ATTEMPTS)
+            structure = None
+            if draws_bodies(structures, request):
+                structure = partial(_structure, structures, base, request)
+            attempts = promising(base, made, structure, key, ATTEMPTS)
     raise refusal(structures, base, present, plan, request, problems, key, tried)
+
+
+def _structure(
+    structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: NoiseKey
+) -> Plan | None:
+    """Give the structure of a draw; None where that is refused."""
+    try:
+        return asked_structure(structures, base, request, key)
+    except InterventionError:
+        return None
 
 
 def _immaterial(

@@ -6,12 +6,14 @@ Source:
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numba import njit
 
 from scm_world._types import Floats
+from scm_world.variables import Noise
+from scm_world.variables.noise import word_of
 
 _MULTIPLIERS = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _INCREMENTS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
@@ -51,3 +53,23 @@ def philox(where: Any, keys: Any, out: Floats) -> None:
             words = (c0, c1, c2, c3)
             for i in range(min(4, n - 4 * block)):
                 out[row, 4 * block + i] = np.float64(words[i] >> _LAST) * 2.0**-53
+
+
+@final
+class CompiledNoise(Noise):
+    """The noise of one seed, with the same numbers; one episode is drawn by the compiled generator.
+
+    Args:
+        seed: Any whole number that is not negative.
+    """
+
+    def uniforms(
+        self, variable: str, *, n: int, episode: int = 0, step: int = 0, count: int = 1
+    ) -> Floats:
+        """Draw the uniform numbers of a variable, shape ``(count, n)``; see ``Noise``."""
+        if count != 1:
+            return super().uniforms(variable, n=n, episode=episode, step=step, count=count)
+        found = np.empty((1, n))
+        where = np.array([self.key, episode, step], dtype=np.uint64)
+        philox(where, np.array([word_of(variable)], dtype=np.uint64), found)
+        return found

@@ -24,7 +24,12 @@ from scm_world.variables import Draw, Hard, Intervention, Natural, Null, divided
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
 from scm_world.world.solver import Solver
-from scm_world.world.structures import StructureCache, restructured, wrong_structure
+from scm_world.world.structures import (
+    StructureCache,
+    asked_structure,
+    restructured,
+    wrong_structure,
+)
 
 
 @final
@@ -90,8 +95,8 @@ def plan_intervention(
         request: The intervention, with dotted names.
         space: Every target has to lie in, if any.
         key: Where to draw.
-        last: An earlier attempt at the same. What is the same again is taken from there; nothing
-            comes out differently for that.
+        last: An earlier attempt at the same. What is the same again is taken from there, where
+            the structure is; nothing comes out differently for that.
         found: Problems of the request that are known already.
 
     Raises:
@@ -100,9 +105,14 @@ def plan_intervention(
         UnknownOption: There is no such space.
     """
     space = as_region("space", space)
-    draws = (name for name, act in request.items() if isinstance(act, Draw))
     earlier = None if last is None else last.solver
-    if earlier is None or any(name in structures.head for name in draws):
+    if (
+        last is not None
+        and draws_bodies(structures, request)
+        and asked_structure(structures, base, request, key) != last.compiled.plan
+    ):
+        earlier = None
+    if earlier is None:
         wrong = wrong_structure(structures, base, request)
         request = {n: act for n, act in request.items() if n not in wrong}
         base = restructured(structures, base, request, key)
@@ -123,6 +133,11 @@ def plan_intervention(
         solver,
         {name: act for name, act in request.items() if isinstance(act, Null)},
     )
+
+
+def draws_bodies(structures: StructureCache, request: Mapping[str, Any]) -> bool:
+    """Tell whether it is drawn which bodies there are."""
+    return any(isinstance(act, Draw) and name in structures.head for name, act in request.items())
 
 
 def _accepted(

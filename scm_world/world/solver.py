@@ -30,6 +30,7 @@ from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions, StepBase
+from scm_world.world.draws import Draws
 
 
 def same(a: Value, b: Value) -> bool:
@@ -73,7 +74,9 @@ class Solver:
         self._earlier = earlier
         self._draws: list[str] = []
         self.order: tuple[str, ...] = ()
-        self._unchanged: frozenset[str] | None = None
+        self._unchanged: frozenset[str] = frozenset()
+        self._same: dict[frozenset[str], frozenset[str]] = {}
+        self._together: Draws | None = None
         self.static: dict[str, Value] = dict(base.static)
         self.model = base.model
         self.state = base.state
@@ -124,9 +127,11 @@ class Solver:
                 self.order = tuple(n for n in self.model.structure.order if n in follow)
         else:
             self.model, self.order = self._earlier.model, self._earlier.order
-            if self._earlier._unchanged is None:
-                self._earlier._unchanged = self._earlier.same_at(self._key)
-            self._unchanged = self._earlier._unchanged
+            self._unchanged = self._earlier.same_at(self._key)
+            self._together = self._earlier._together
+            if self._together is None:
+                self._together = Draws(self._task.model, self.acts, self.order)
+                self._earlier._together = self._together
         known = dict(self.static)
         for target in targets:
             del known[target]
@@ -155,10 +160,18 @@ class Solver:
 
     def same_at(self, key: NoiseKey) -> frozenset[str]:
         """Name what was computed and does not follow from anything that is drawn anew."""
+        mine = self._key
+        here = (key.noise, key.episode, key.step) == (mine.noise, mine.episode, mine.step)
+        kept = key.kept if here else frozenset()
+        if kept not in self._same:
+            self._same[kept] = self._without_draws(kept)
+        return self._same[kept]
+
+    def _without_draws(self, kept: frozenset[str]) -> frozenset[str]:
         anew = {
             target
             for target, (name, act) in self.acts.items()
-            if isinstance(act, Draw) and whole_of(act, name) not in key.kept
+            if isinstance(act, Draw) and whole_of(act, name) not in kept
         }
         for name in self.order:
             bounds = self._task.model.declared(name).bounds
@@ -178,7 +191,8 @@ class Solver:
         A mechanism never meets values that its parents cannot have.
         """
         impossible: set[str] = set()
-        earlier, unchanged = self._earlier, self._unchanged or ()
+        earlier, unchanged = self._earlier, self._unchanged
+        drawn = {} if self._together is None else self._together.at(self._key)
         for name in order:
             if earlier is not None and name in unchanged:
                 known[name] = self.static[name] = earlier.static[name]
@@ -187,10 +201,13 @@ class Solver:
             if impossible and not impossible.isdisjoint(p.name for p in variable.all_parents):
                 impossible.add(name)
                 continue
+            if name in drawn:
+                known[name] = self.static[name] = drawn[name]
+                continue
             follows = variable.bounds is not None and variable.bounds.parents()
             try:
                 known[name] = value = self.model.evaluate(name, known, self._key)
-                if np.shape(value) != variable.shape:  # of a mechanism that a user gave
+                if value.shape != variable.shape:  # of a mechanism that a user gave
                     raise WrongShape(name, value, variable.shape, np.shape(value))
                 check_bounds(variable, value, self._context() if follows else {})
             except InterventionError as problem:

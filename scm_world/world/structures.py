@@ -99,7 +99,7 @@ class StructureCache:
 
     def after(
         self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey
-    ) -> CompiledTask | None:
+    ) -> Plan | None:
         """Give the structure after an intervention; None where it has nothing to do with it.
 
         Args:
@@ -124,7 +124,7 @@ class StructureCache:
         values = model.solve(known, key=key)
         if not all(_possible(variable, values) for variable in self.head.variables):
             return None  # the intervention will be refused, with the reason
-        return self.compiled(self.plan(values))
+        return self.plan(values)
 
 
 def as_task(task: Any) -> Task:
@@ -218,21 +218,10 @@ def restructured(
         key: Where to draw.
     """
     present = base.compiled
-    before = {name for name, act in base.pending.values() if isinstance(act, Null)}
-    gone = before | {name for name, act in request.items() if isinstance(act, Null)}
-    compiled: CompiledTask | None = None
-    if len(structures.head):
-        acts = dict(base.pending.values())
-        for name, value in request.items():
-            if name in structures.head:
-                with suppress(InterventionError):  # what is wrong is reported later
-                    acts[name] = present.model.accept(name, value)
-        compiled = structures.after(acts, base.model, base.static, key)
-    absent = present.task.absent | gone
-    if absent:
-        compiled = structures.compiled(((compiled or present).task.plan, absent))
-    if compiled is None or compiled is present:
+    plan = asked_structure(structures, base, request, key)
+    if plan == present.plan:
         return base
+    compiled = structures.compiled(plan)
     kept = {n: act for n, act in base.model.interventions.items() if n in compiled.model}
     model = compiled.model.with_interventions(kept)
     held = {target for name in kept for target in model.targets(name)}
@@ -250,6 +239,24 @@ def restructured(
         state=_state(base, compiled),
         fresh=frozenset(compiled.slices.keys() - present.slices.keys()),
     )
+
+
+def asked_structure(
+    structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: NoiseKey
+) -> Plan:
+    """Give the structure that a request asks for; see ``restructured``."""
+    present = base.compiled
+    before = {name for name, act in base.pending.values() if isinstance(act, Null)}
+    gone = before | {name for name, act in request.items() if isinstance(act, Null)}
+    after: Plan | None = None
+    if len(structures.head):
+        acts = dict(base.pending.values())
+        for name, value in request.items():
+            if name in structures.head:
+                with suppress(InterventionError):  # what is wrong is reported later
+                    acts[name] = present.model.accept(name, value)
+        after = structures.after(acts, base.model, base.static, key)
+    return (after or present.plan)[0], present.task.absent | gone
 
 
 def _state(base: StepBase, compiled: CompiledTask) -> State:

@@ -27,10 +27,10 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.models import ControlMode, Difference, Scene, State
+from scm_world.models import ControlMode, Difference, Parameters, Scene, State
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
-from scm_world.variables import Draw, Intervention, Mechanism, Noise, Subset
+from scm_world.variables import Draw, Intervention, Mechanism, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.variables.subsets import AnyRegion, as_region
@@ -43,7 +43,14 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.feasibility import Present, feasible_plan, refusal
+from scm_world.world.feasibility import (
+    CarriedOut,
+    Present,
+    carried_out,
+    feasible_plan,
+    refusal,
+)
+from scm_world.world.philox import CompiledNoise
 from scm_world.world.plan import InterventionPlan
 from scm_world.world.snapshot import WorldSnapshot
 from scm_world.world.solver import same
@@ -120,13 +127,14 @@ class World(WorldAttributes):
         )
         self.structures = as_structures(shared or kind, self.options)
         self._started = self._checked = False
-        self.noise, self.episode = Noise(0), 0
+        self.noise, self.episode = CompiledNoise(0), 0
         self.version = 0  # counts changes of anything but what physics moves
         self._origin: EngineSnapshot | None = None
         self._origin_static: Values = {}
         self._lost = ""
         self._index = 0
         self._base: StepBase | None = None
+        self._earlier: CarriedOut | None = None
         compiled = self.structures.natural(None)
         self._values = PresentValues(compiled)
         self._adopt_model(compiled.model)
@@ -226,10 +234,10 @@ class World(WorldAttributes):
             InterventionError: The intervention was refused. The episode has begun without it.
         """
         if seed is not None:
-            self.noise = Noise(whole_number("seed", seed, least=0))
+            self.noise = CompiledNoise(whole_number("seed", seed, least=0))
             self.episode = whole_number("episode", episode, least=0)
         elif not self._started:
-            self.noise, self.episode = Noise(secrets.randbits(63)), 0
+            self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
             self.episode += 1
         self._begin()
@@ -393,10 +401,14 @@ class World(WorldAttributes):
         twice += self._wrong_actions(flat)
         region = self.variables_space if space is None else space
         key = self.noise_key(base.index)
+        earlier = self._earlier
+        if earlier is not None and (twice or not earlier.is_again(base, flat, region)):
+            earlier = None
         plan, change = feasible_plan(
-            self.structures, base, self._present(), flat, region, key, twice
+            self.structures, base, self._present(), flat, region, key, twice, earlier
         )
         audit = self._commit(plan, change, flat)
+        self._earlier = earlier or carried_out(self.structures, base, flat, region, plan)
         self._base = replace(base, pending=plan.pending)
         if base.at_start:
             self._forget()
@@ -455,11 +467,13 @@ class World(WorldAttributes):
         undo = before.inverse(change)
         with self._all_or_nothing(lambda: self.backend.apply(undo) if change else None):
             inertia = self._inertia(change)
+            reported: Parameters = {}
             if change:
                 self.backend.apply(change)
-                self._check_applied(change)
+                reported = self._applied(change)
             self._adopt(plan.compiled, plan.model, plan.static, plan.index)
-            return report(request, plan, change, before, self._present(), inertia, self.backend)
+            now = self._present()
+            return report(request, plan, change, before, now, inertia, reported, self.backend)
 
     @contextmanager
     def _all_or_nothing(self, undo: Callable[[], None]) -> Iterator[None]:
@@ -486,7 +500,12 @@ class World(WorldAttributes):
         bodies -= {*self.composition.obstacles}
         return {body: self.backend.inertia(body) for body in sorted(bodies)}
 
-    def _check_applied(self, change: Difference) -> None:
+    def _applied(self, change: Difference) -> Parameters:
+        """Read back what was applied.
+
+        Raises:
+            EngineFailure: The engine did not take it over.
+        """
         reported = self.backend.parameters(change.parameters)
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
@@ -498,6 +517,7 @@ class World(WorldAttributes):
         if wrong:
             problem = f"the engine did not take over {', '.join(wrong)}"
             raise EngineFailure(problem, self.backend.name)
+        return reported
 
     def _adopt(
         self,
@@ -647,7 +667,7 @@ class World(WorldAttributes):
                 raise
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
         self._lost = ""
-        self.noise, self.episode = Noise(snapshot.seed), snapshot.episode
+        self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self._base = base
         self.structures.checked[snapshot] = found
 

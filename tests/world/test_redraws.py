@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scm_world import Draw, Mechanism, Shift, World
-from scm_world.errors import Infeasible
+from scm_world.errors import Infeasible, InterventionError
 from scm_world.variables import Box, Function
 from scm_world.variables.noise import Noise, word_of
 from scm_world.world import feasibility
@@ -127,6 +127,28 @@ def test_what_no_draw_changes_is_refused_without_drawing_again(
     assert max(attempts) == 0
 
 
+def test_what_was_asked_in_other_episodes_changes_nothing() -> None:
+    """A request that comes again is carried out, or refused, as in a world that never had it."""
+    beyond = {**CROWDED, "tool_block.mass": Draw(Box(-0.02, 0.03))}  # none is negative
+    requests = [CROWDED] * 4 + [{**CROWDED, "goal_block.polar": Draw("A")}, beyond, beyond, beyond]
+    used, refused = World("pushing", backend="fake"), 0
+    for episode, request in enumerate(requests):
+        found: list[Any] = []
+        for world in (used, World("pushing", backend="fake")):
+            try:
+                world.reset(seed=3, episode=episode, do=request)
+            except InterventionError as error:
+                refused += 1
+                found.append(str(error))
+            else:
+                saved = world.snapshot()
+                assert saved.base is not None
+                found.append([saved.interventions, saved.base.pending, world.vector.tobytes()])
+                found[-1] += [value.tobytes() for value in world.values().values()]
+        assert found[0] == found[1]
+    assert 0 < refused < 6
+
+
 TURNED = {"tool_block.euler_orientation": [0.3, 0.2, 0.0]}
 SCREENED: list[tuple[str, dict[str, Any], bool]] = [
     ("pushing", CROWDED, True),
@@ -138,6 +160,17 @@ SCREENED: list[tuple[str, dict[str, Any], bool]] = [
         True,
     ),
     ("reaching", {"number_of_obstacles": 2, "joint_positions": Draw("A")}, True),
+    ("reaching", {"number_of_obstacles": Draw("A|B"), "joint_positions": Draw("A")}, True),
+    (
+        "stacked_blocks",
+        {"stack_levels": Draw("A"), "wall_noise": Draw("A"), "joint_positions": Draw("A")},
+        True,
+    ),
+    (
+        "general",
+        {"nums_objects": Draw("A"), "tool_0.cartesian_position": [0.0, 0.0, 0.0]},
+        False,
+    ),
 ]
 
 
@@ -149,7 +182,7 @@ def test_draws_are_looked_at_together_and_the_same_one_is_taken(
     planned: list[int] = []
 
     def one_after_another(*args: Any) -> Any:
-        return iter(range(1, feasibility.ATTEMPTS))
+        return ((attempt, None) for attempt in range(1, feasibility.ATTEMPTS))
 
     def noted(*args: Any) -> InterventionPlan:
         planned.append(args[4].attempt)

@@ -125,6 +125,8 @@ def thin(
         allowed[pair] = max(allowed[pair], overlap.depth + 1e-6)
     robot = [*range(*links.indices(len(names))), len(names) - 2, len(names) - 1]
     stages = [((), (), allowed[np.ix_(robot, robot)]), (blocks, obstacles, allowed)]
+    if not blocks and not obstacles:
+        del stages[1:]
     for some, fixed, depths in stages:
         joints = candidates.state(slice(0, hardware.N_JOINTS))
         heights = candidates.parameter(("robot", "height"))

@@ -112,11 +112,12 @@ class BlockWorld(Composition):
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
 
-    def thin(self, candidates: Any, before: Iterable[Overlap]) -> None:
+    def thin(self, candidates: Any, before: Iterable[Overlap], *, whole: bool = True) -> None:
         """Leave out candidates in which fingers, blocks or obstacles lie in one another."""
         if not self.hulls:
             tolerances = self.conventions.robot_tolerance, self.conventions.tolerance
-            thin(candidates, self.blocks, self.obstacles, before, tolerances)
+            blocks, obstacles = (self.blocks, self.obstacles) if whole else ((), ())
+            thin(candidates, blocks, obstacles, before, tolerances)
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable, with the states coupled to all physical quantities."""
