@@ -37,11 +37,11 @@ from typing import Any
 
 from evaluation_policy import Mlp
 from evaluation_steps import shares
-
-from scm_world.evaluation.benchmark import protocols_of
-from scm_world.evaluation.pipeline import evaluate, played
-from scm_world.evaluation.setups import SHARD, prepare
 from scm_world.evaluation.shards import FOLDER
+
+from scm_world.evaluation.pipeline import evaluate, played
+from scm_world.evaluation.protocols import protocols_of
+from scm_world.evaluation.setups import SHARD, prepare
 
 TASK = "pushing"
 PUBLISHED = 200  # episodes of a protocol in the predecessor's benchmark

@@ -10,10 +10,9 @@ from typing import Any
 from evaluation_policy import Mlp
 
 from scm_world.env import ScmWorldEnv
-from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.episodes import Arena, Fingerprint
 from scm_world.evaluation.players import as_player
-from scm_world.evaluation.protocols import Protocol
+from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.world import WorldSnapshot
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from scm_world.evaluation import evaluate
 from scm_world.policies import save_policy
-from scm_world.training.tuned import ENV
+from scm_world.training.settings import ENV
 
 GOALS = [f"goal_{finger}.cartesian_position" for finger in (60, 120, 300)]
 FORM = {**ENV, "observation_mode": "custom", "observe": ["end_effector_positions", *GOALS]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Collection, Container, Iterable
 from importlib import import_module
 from typing import Any
 
@@ -21,6 +21,16 @@ def whole_number(option: str, value: Any, *, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise UnknownOption(option, value, (f"any whole number from {least} on",))
     return int(value)
+
+
+def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
+    """Refuse an option that is none of those allowed; None is left out of the message.
+
+    Raises:
+        UnknownOption: It is none of them.
+    """
+    if value not in allowed:
+        raise UnknownOption(option, value, [one for one in allowed if one is not None])
 
 
 def load(module: str, library: str, extra: str = "") -> Any:

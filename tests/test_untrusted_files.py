@@ -22,7 +22,7 @@ from scm_world.evaluation import files as evaluation_files
 from scm_world.evaluation.recording import Recording, record
 from scm_world.evaluation.setups import task_of
 from scm_world.graph.files import from_json
-from scm_world.policies import NetworkPolicy, save_policy
+from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries import Plan, load_episode, save_episode
 from scm_world.training.recipe import Recipe, recipe
 
@@ -100,7 +100,7 @@ def _read_recipe(reference: str) -> None:
 
 def _read_policy(reference: str) -> None:
     weights = {"layers.0.weight": np.zeros((9, 56), "f4"), "layers.0.bias": np.zeros(9, "f4")}
-    save_policy("it.safetensors", NetworkPolicy.of(weights, {"task": reference}))
+    save_policy("it.safetensors", MlpPolicy.of(weights, {"task": reference}))
     task_of("it.safetensors")
 
 

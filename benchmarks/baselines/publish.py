@@ -24,7 +24,7 @@ from benchmarks.baselines.cards import COMMAND, LIMITS, RESULTS, SCORES, page_te
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation
 from scm_world.output.durable import write_whole
-from scm_world.policies import NetworkPolicy, PolicyAbout, file_of, load_policy, save_policy, zoo
+from scm_world.policies import MlpPolicy, PolicyAbout, file_of, load_policy, save_policy, zoo
 from scm_world.training.recipe import Recipe, recipe
 
 LARGEST = 1_000_000  # [bytes] of a file in the package
@@ -101,7 +101,7 @@ def published(
     *,
     command: str | None = None,
     limits: Sequence[str] = (),
-) -> NetworkPolicy:
+) -> MlpPolicy:
     """Give what goes into the zoo: a policy without its value network, with its scores.
 
     Args:
@@ -122,7 +122,7 @@ def published(
             LIMITS: [*limits],
         }
     )
-    return NetworkPolicy(policy.layers, policy.log_std, made_for=about)
+    return MlpPolicy(policy.layers, policy.log_std, made_for=about)
 
 
 def publish(

@@ -31,7 +31,7 @@ import pandas as pd
 from benchmarks.reproduction.paper import paper
 from scm_world.errors import in_one_line
 from scm_world.evaluation import Evaluation, evaluate, protocols_of
-from scm_world.evaluation.reporting import write_outputs
+from scm_world.evaluation.outputs.report import write_outputs
 from scm_world.evaluation.statistics import aggregate
 from scm_world.output.durable import locked, write_whole
 from scm_world.training.loop import train

@@ -15,13 +15,14 @@ from scm_world.cli import console
 from scm_world.cli.datasets import collect, sweep
 from scm_world.cli.discovery import discover, verify
 from scm_world.cli.evaluation import evaluate, explain
-from scm_world.cli.inspection import graph, list_, variables
-from scm_world.cli.queries import counterfactual, do, effect, plan
+from scm_world.cli.inspection import graph, list_
+from scm_world.cli.options import documented
+from scm_world.cli.queries import counterfactual, do, effect
 from scm_world.cli.training import clone, train
 from scm_world.errors import ScmWorldError
 
 
-class Commands(TyperGroup):
+class CommandGroup(TyperGroup):
     """All commands: what this package raises on purpose becomes one line and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -41,7 +42,7 @@ class Commands(TyperGroup):
 
 
 app = typer.Typer(
-    cls=Commands,
+    cls=CommandGroup,
     name="scm-world",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -71,12 +72,11 @@ def root(
 
 
 COMMANDS: tuple[Callable[..., None], ...] = (
-    *(discover, verify, graph, variables, do, effect, counterfactual, plan),
-    *(collect, sweep, evaluate, explain, train, clone),
+    *(discover, verify, graph, do, effect, counterfactual),
+    *(collect, sweep, evaluate, explain, train, clone, list_),
 )
 for _command in COMMANDS:
-    app.command()(_command)
-app.command(name="list")(list_)
+    app.command(_command.__name__.rstrip("_"), help=documented(_command))(_command)
 
 
 def main() -> None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from scm_world.errors import ConflictingTargets, ModelError, ScmWorldError, UnknownOption
+from scm_world.errors import ConflictingTargets, UnknownOption
 
 if TYPE_CHECKING:
     from scm_world.queries import SCM, Outcome, World
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 
 HINT = "'NAME=VALUE...'"
 WORDS = {"true": True, "false": False}
-NO_NUMBERS = ("shape", "terms")  # what is made of them cannot be written on a command line
 
 
 def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
@@ -156,40 +154,15 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
         >>> load_task("towers", ["number_of_blocks_in_tower=1,1,2"]).tools()
         ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
     """
-    from scm_world.tasks import TASKS, make_task
+    from scm_world.tasks import make_task
 
     given = parse_assignments(option, "'--option'")
-    if name in TASKS:
-        hints = get_type_hints(TASKS[name].__init__)
-        known: list[str] = []
-        for parameter in inspect.signature(TASKS[name]).parameters.values():
-            is_open = parameter.kind is inspect.Parameter.VAR_KEYWORD
-            common = get_args(hints[parameter.name])[0] if is_open else None
-            known += get_type_hints(common) if is_open else (parameter.name,)
-        known = [key for key in known if key not in NO_NUMBERS]
-        for key, value in given.items():
-            if known and key not in known:
-                raise UnknownOption(f"argument of {name}", key, known)
-            given[key] = _argument(key, value)
-    try:
-        return make_task(name, **given)
-    except (TypeError, ValueError) as error:
-        if isinstance(error, ScmWorldError) and not (option and isinstance(error, ModelError)):
-            raise
-        said = f"{', '.join(option or ())}: {error}"
-        raise typer.BadParameter(said, param_hint="'--option'") from None
-
-
-def _argument(name: str, value: Any) -> Any:
-    """Turn lists into tuples, and accept words where there are words to choose from."""
-    match value:
-        case list() if all(isinstance(part, int | float) for part in value):
-            return tuple(value)
-        case int() | float():
-            return value
-        case str() if name == "weights" or value.lower() in WORDS:
-            return WORDS.get(value.lower(), value)
-    raise typer.BadParameter(f"{name}: expected numbers, got {value!r}", param_hint="'--option'")
+    for key, value in given.items():
+        if isinstance(value, list):
+            given[key] = tuple(value)
+        elif isinstance(value, str):
+            given[key] = WORDS.get(value.lower(), value)
+    return make_task(name, **given)
 
 
 def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:

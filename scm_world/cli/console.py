@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -13,6 +13,7 @@ from uuid import uuid4
 
 import numpy as np
 import typer
+from pydantic import BaseModel
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -20,8 +21,7 @@ from rich.text import Text
 
 from scm_world.cli.arguments import suffix
 from scm_world.output.durable import made, removed, write_durably
-from scm_world.output.locations import Location
-from scm_world.output.remote import Remote
+from scm_world.output.remote import Location, Remote
 
 WIDTH, PAGE = 160, 200  # [characters] where there is no terminal to ask; for the widest tables
 RESULTS = Path("scm-world-results")
@@ -48,16 +48,28 @@ def written(*paths: Location) -> None:
         say(f"{'         ' if number else 'written: '}{path}")
 
 
-def table(*headers: str, title: str = "", caption: str = "", whole: tuple[int, ...] = ()) -> Table:
-    """Return an empty table whose cells wrap and are never cut off.
+def table(
+    headers: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    *,
+    title: str = "",
+    caption: str = "",
+    whole: tuple[int, ...] = (),
+    width: int = WIDTH,
+    file: IO[str] | None = None,
+) -> None:
+    """Print a table whose cells wrap and are never cut off.
 
     Args:
-        headers: Of the columns.
+        headers: Of the columns; none is shown if all are empty.
+        rows: Texts as they are, with styles if they are a ``Text``.
         title: Above the table.
         caption: Below it.
         whole: Columns whose words are not broken where the terminal is wide enough.
+        width: In characters, where there is no terminal.
+        file: Where to; standard output if None.
     """
-    begun = Table(
+    made = Table(
         title=Text(title) if title else None,
         caption=Text(caption) if caption else None,
         box=box.SIMPLE_HEAD,
@@ -65,21 +77,24 @@ def table(*headers: str, title: str = "", caption: str = "", whole: tuple[int, .
         caption_justify="left",
         title_style="bold",
         pad_edge=False,
+        show_header=any(headers),
     )
     wide = terminal().width >= WIDTH
     for number, header in enumerate(headers):
-        begun.add_column(header, overflow="fold", no_wrap=wide and number in whole)
-    return begun
+        made.add_column(Text(header), overflow="fold", no_wrap=wide and number in whole)
+    for row in rows:
+        made.add_row(*(cell if isinstance(cell, Text) else Text(str(cell)) for cell in row))
+    terminal(width=width, file=file).print(made)
 
 
-def facts(rows: Any) -> Table:
-    """Return a table of a name and a value per line: green if it is good, red if it is bad."""
+def facts(rows: Any) -> None:
+    """Print a name and a value per line: green if it is good, red if it is bad."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(style="bold")
     grid.add_column(overflow="fold")
     for name, value, good in rows:
         grid.add_row(name, Text(value, style={True: "green", False: "bold red"}.get(good, "")))
-    return grid
+    terminal().print(grid)
 
 
 def show(value: Any, *, per_line: int = 3) -> str:
@@ -100,6 +115,8 @@ def show(value: Any, *, per_line: int = 3) -> str:
 def plain(value: Any) -> Any:
     """Return a value as data that JSON can hold; what is not finite becomes None."""
     match value:
+        case BaseModel():
+            return value.model_dump(mode="json")
         case np.ndarray() | np.generic():
             return plain(value.tolist())
         case dict():
@@ -194,9 +211,11 @@ def write_json(path: Path, value: Any) -> None:
 
 @contextmanager
 def staged(folder: Location) -> Iterator[Path]:
-    """Collect files elsewhere, and put them into a folder once all of them are complete."""
+    """Collect files elsewhere; put them into a folder, and name them, once all are complete."""
     with tempfile.TemporaryDirectory(prefix="scm-world-") as draft:
         yield Path(draft)
         made(folder)
-        for file in sorted(Path(draft).iterdir()):
+        files = sorted(Path(draft).iterdir())
+        for file in files:
             write_durably(folder / file.name, file.read_bytes())
+        written(*(folder / file.name for file in files))

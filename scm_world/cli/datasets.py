@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
@@ -22,7 +23,7 @@ from scm_world.cli.arguments import (
     tag,
 )
 from scm_world.errors import UnknownOption
-from scm_world.output.locations import Location
+from scm_world.output.remote import Location
 
 SHOWN, POINTS = 12, 40  # targets, and points of a grid, that are printed
 
@@ -40,41 +41,15 @@ def check_parquet(form: str) -> None:
 
 def collect(
     task: options.System,
-    design: Annotated[
-        str,
-        typer.Option(
-            help="Targets of an episode: observational (none), single, all, or half of them."
-        ),
-    ] = "single",
-    n: Annotated[int, typer.Option("-n", "--n", min=1, help="Number of episodes.")] = 1000,
-    target: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PATTERN",
-            help="Targets of interventions, such as '*.mass'; repeat it for more.",
-            show_default="the causes",
-        ),
-    ] = None,
-    cause: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PATTERN",
-            help="Parameters that are written down; repeat it for more.",
-            show_default="physical ones with a space A",
-        ),
-    ] = None,
+    design: str = "single",
+    n: options.N = 1000,
+    target: options.Patterns = None,
+    cause: options.Patterns = None,
     outcome: options.Outcomes = None,
-    values: Annotated[
-        str,
-        typer.Option(help="Support of interventions: A (training), B (held out) or 'A|B'."),
-    ] = "A",
-    observational_fraction: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Share of episodes without an intervention.")
-    ] = 0.3,
+    values: str = "A",
+    observational_fraction: Annotated[float, typer.Option(min=0.0, max=1.0)] = 0.3,
     nature: options.Nature = None,
-    every_step: Annotated[
-        bool, typer.Option("--every-step", help="A row for each control step.")
-    ] = False,
+    every_step: bool = False,
     steps: options.Steps = 25,
     policy: options.Policy = None,
     backend: options.Backend = None,
@@ -93,6 +68,17 @@ def collect(
     Of a causal model without a backend all variables are written down, and those with lagged edges
     have a row for each control step. After Ctrl-C (exit code 130) the same command resumes.
     Example: scm-world collect pushing --design half -n 1000 --out data
+
+    Args:
+        design: Targets of an episode: observational (none), single, all, or half of them.
+        n: Number of episodes.
+        target: Targets of interventions, such as '*.mass'; the causes by default. Repeat it for
+            more.
+        cause: Parameters that are written down; by default physical ones with a space A. Repeat it
+            for more.
+        values: Support of interventions: A (training), B (held out) or 'A|B'.
+        observational_fraction: Share of episodes without an intervention.
+        every_step: A row for each control step.
     """
     from scm_world.discovery.data import Design, default_causes
     from scm_world.discovery.data import collect as collected
@@ -101,8 +87,7 @@ def collect(
     from scm_world.queries import SCM
     from scm_world.variables.kinds import SPACES
 
-    if values not in SPACES:
-        raise UnknownOption("values", values, SPACES)
+    one_of("values", values, SPACES)
     check_parquet(format_)
     asked: dict[str, Any] = {
         "policy": policy,
@@ -141,46 +126,35 @@ def collect(
                 engine=pool,
                 **asked,
             )
-    title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
-    made = console.table("", "episodes", "rows", title=title)
     _, first = np.unique(found.episode, return_index=True)
-    made.add_row("all", str(len(first)), str(len(found)))
-    rows = [found.regimes[number].targets for number in found.regime]
-    begins = [rows[row] for row in first]
-    made.add_row("nothing done", str(begins.count(())), str(rows.count(())))
+    every = [found.regimes[number].targets for number in found.regime]
+    begins = [every[row] for row in first]
     names = sorted({name for one in begins for name in one})
-    for name in names[:SHOWN]:
-        counts = (sum(name in one for one in regimes) for regimes in (begins, rows))
-        made.add_row(f"do({name})", *map(str, counts))
+    rows: list[tuple[object, ...]] = [
+        ("all", len(first), len(found)),
+        ("nothing done", begins.count(()), every.count(())),
+    ]
+    rows += [
+        (f"do({name})", *(sum(name in one for one in some) for some in (begins, every)))
+        for name in names[:SHOWN]
+    ]
     if len(names) > SHOWN:
-        made.add_row(f"and {len(names) - SHOWN} more targets", "", "")
-    made.add_row("columns", "", str(len(found.columns)))
+        rows.append((f"and {len(names) - SHOWN} more targets", "", ""))
+    rows.append(("columns", "", len(found.columns)))
     if impossible := found.about.get("refused"):
-        made.add_row("refused", str(len(impossible)), f"see {SIDECAR}")
-    console.terminal().print(made)
+        rows.append(("refused", len(impossible), f"see {SIDECAR}"))
+    title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
+    console.table(("", "episodes", "rows"), rows, title=title)
     shards = list[Location](folder.glob("shard-*.*"))
     console.written(folder / SIDECAR, *sorted(shards, key=str)[:1])
 
 
 def sweep(
     task: options.System,
-    over: Annotated[
-        list[str],
-        typer.Option(
-            metavar="NAME=VALUES",
-            help="LOW:HIGH:COUNT, A, B:COUNT, or values with commas; repeat it for more variables.",
-        ),
-    ],
+    over: Annotated[list[str], typer.Option(metavar="NAME=VALUES")],
     outcome: options.Outcomes = None,
-    n: Annotated[int, typer.Option("-n", "--n", min=1, help="Episodes at each point.")] = 50,
-    do: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--do",
-            metavar="NAME=VALUE",
-            help="Further intervention at every point; repeat it for more.",
-        ),
-    ] = None,
+    n: options.N = 50,
+    do: options.Do = None,
     nature: options.Nature = None,
     steps: options.Steps = 25,
     policy: options.Policy = None,
@@ -200,6 +174,11 @@ def sweep(
     Every point has the same episodes, with the same noise. After Ctrl-C (exit code 130) the same
     command resumes.
     Example: scm-world sweep pushing --over tool_block.mass=0.02:0.08:5
+
+    Args:
+        over: LOW:HIGH:COUNT, A, B:COUNT, or values with commas; repeat it for more variables.
+        n: Episodes at each point.
+        do: Further intervention at every point; repeat it for more.
     """
     from scm_world.discovery.data import sweep as swept
     from scm_world.discovery.data.sweeps import ENDS, SUMMARY, TABLE, points_of
@@ -239,18 +218,26 @@ def sweep(
     rows, names = found.rows(), [column.name for column in found.measured]
     results = {name + end for base in names for name in (base, f"{base}.change") for end in ENDS}
     columns = [key for key in rows[0] if key not in results and key not in ("n", "refused")]
-    title = f"Sweep of {tag(task)} on {found.data.about['engine']}, seed {seed}"
-    made = console.table(*columns, "n", *names, title=f"{title}, with 95 % intervals")
-    for row in rows[:POINTS]:
-        cells = []
-        for name in names:
-            ends = (row[name + end] for end in ENDS)
-            mean, low, high = ("-" if number is None else console.show(number) for number in ends)
-            cells.append(f"{mean} ({low} … {high})")
-        made.add_row(*(console.show(row[key]) for key in columns), str(row["n"]), *cells)
-    if len(rows) > POINTS:
-        made.caption = f"and {len(rows) - POINTS} more points, see {TABLE}"
-    console.terminal().print(made)
+
+    def interval(row: Any, name: str) -> str:
+        numbers = (row[name + end] for end in ENDS)
+        mean, low, high = ("-" if one is None else console.show(one) for one in numbers)
+        return f"{mean} ({low} … {high})"
+
+    console.table(
+        (*columns, "n", *names),
+        [
+            (
+                *(console.show(row[key]) for key in columns),
+                row["n"],
+                *(interval(row, n) for n in names),
+            )
+            for row in rows[:POINTS]
+        ],
+        title=f"Sweep of {tag(task)} on {found.data.about['engine']}, seed {seed}, "
+        "with 95 % intervals",
+        caption=f"and {len(rows) - POINTS} more points, see {TABLE}" if len(rows) > POINTS else "",
+    )
     console.written(folder / TABLE, folder / SUMMARY)
 
 
@@ -264,34 +251,30 @@ def read_over(texts: Iterable[str]) -> dict[str, Any]:
         >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
         {'tool_block.mass': [0.02, 0.05, 0.08], ... 'gravity': [-9, -10]}
     """
-    found: dict[str, Any] = {}
-    for text in texts:
-        name, equals, values = (part.strip() for part in text.partition("="))
-        if not equals or not name or not values or name in found:
-            raise refused(text, "expected name=values, each name once", "'--over'")
-        found[name] = _levels(values)
-    return found
-
-
-def _levels(text: str) -> Any:
     from scm_world.discovery.data import Levels
     from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES
 
-    hint = "'--over'"
-    first, *rest = text.split(":")
-    if (first in SPACES and len(rest) == 1) or len(rest) == 2:
-        if not rest[-1].isdecimal() or not int(rest[-1]):
-            raise refused(rest[-1], "is no number of values", hint)
-        check_points(int(rest[-1]))
-    if first in SPACES and len(rest) < 2:
-        return Levels(first, *map(int, rest))
-    if len(rest) == 2:
-        low, high = (parse_value(word, hint) for word in (first, rest[0]))
-        if isinstance(low, int | float) and isinstance(high, int | float):
-            return [round(x, 12) for x in np.linspace(low, high, int(rest[1])).tolist()]
-    value = None if rest else parse_value(text, hint)
-    several = value if isinstance(value, list) else [value]
-    if not all(isinstance(one, int | float) for one in several):
-        raise refused(text, "expected LOW:HIGH:COUNT, A, B:COUNT, or numbers with commas", hint)
-    return several
+    hint, found = "'--over'", dict[str, Any]()
+    for text in texts:
+        name, equals, values = (part.strip() for part in text.partition("="))
+        if not equals or not name or not values or name in found:
+            raise refused(text, "expected name=values, each name once", hint)
+        first, *rest = values.split(":")
+        if (first in SPACES and len(rest) == 1) or len(rest) == 2:
+            if not rest[-1].isdecimal() or not int(rest[-1]):
+                raise refused(rest[-1], "is no number of values", hint)
+            check_points(int(rest[-1]))
+        if first in SPACES and len(rest) < 2:
+            found[name] = Levels(first, *map(int, rest))
+            continue
+        given = None if rest else parse_value(values, hint)
+        if len(rest) == 2:
+            low, high = (parse_value(word, hint) for word in (first, rest[0]))
+            if isinstance(low, int | float) and isinstance(high, int | float):
+                given = [round(x, 12) for x in np.linspace(low, high, int(rest[1])).tolist()]
+        found[name] = given if isinstance(given, list) else [given]
+        if not all(isinstance(one, int | float) for one in found[name]):
+            why = "expected LOW:HIGH:COUNT, A, B:COUNT, or numbers with commas"
+            raise refused(values, why, hint)
+    return found

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
+from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
@@ -24,7 +24,7 @@ from scm_world.cli.arguments import (
     tag,
 )
 from scm_world.errors import UnknownOption
-from scm_world.output.locations import Location
+from scm_world.output.remote import Location
 
 if TYPE_CHECKING:
     from scm_world.discovery import DiscoveryReport
@@ -48,63 +48,26 @@ SMALL: dict[str, tuple[str, ...]] = {
 
 
 def discover(
-    task: Annotated[
-        str,
-        typer.Argument(
-            metavar="SYSTEM",
-            help="A task, a model.xml or model.urdf, or module:function; with --learner also a "
-            "family with a size (er2:20, sf2:50, tanh4:100), the JSON file of an SCM, or several "
-            "with commas between them.",
-        ),
-    ],
+    task: Annotated[str, typer.Argument(metavar="SYSTEM")],
     backend: options.Backend = None,
-    probes: Annotated[int, typer.Option(min=1, help="Number of states to experiment in.")] = 32,
+    probes: options.Count = 32,
     seed: options.Seed = 0,
     preset: options.Preset = None,
     out: options.Out = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if the SHD is not 0.")] = False,
+    strict: bool = False,
     option: options.Option = None,
     resolution: options.Resolution = None,
-    learner: Annotated[
-        str | None,
-        typer.Option(help="Learners to benchmark, with commas; see 'scm-world list'."),
-    ] = None,
-    data: Annotated[
-        str | None,
-        typer.Option(
-            help="Of the benchmark: observational, interventional or paired, with commas.",
-            show_default="what each learner can use best",
-        ),
-    ] = None,
-    budget: Annotated[
-        str,
-        typer.Option(help="Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c."),
-    ] = "1000",
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds of the benchmark.")] = 3,
-    view: Annotated[
-        str, typer.Option(help="Rows of a task: outcome (one per episode) or step (control step).")
-    ] = "outcome",
-    cause: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATTERN", help="What varies, such as '*.mass'; repeat it for more."),
-    ] = None,
-    outcome: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Variable that is measured; repeat it for more."),
-    ] = None,
-    policy: Annotated[
-        str,
-        typer.Option(
-            help="random, sweep, across, grasp or still; usual is sweep, of --view step random."
-        ),
-    ] = "usual",
+    learner: options.Text = None,
+    data: options.Text = None,
+    budget: str = "1000",
+    seeds: options.Count = 3,
+    view: str = "outcome",
+    cause: options.Patterns = None,
+    outcome: Annotated[list[str] | None, typer.Option(metavar="NAME")] = None,
+    policy: str = "usual",
     steps: options.Steps = 25,
-    sensor_noise: Annotated[
-        float, typer.Option(min=0.0, help="Of sensors: deviation, in halves of a range.")
-    ] = 0.005,
-    timeout: Annotated[
-        float, typer.Option(min=0.0, help="Limit of a run in seconds; 0 for none.")
-    ] = 300.0,
+    sensor_noise: options.Amount = 0.005,
+    timeout: options.Amount = 300.0,
     workers: options.Workers = None,
     executor: options.Executor = None,
     address: options.Address = None,
@@ -115,11 +78,29 @@ def discover(
     and for families, learners run over budgets and seeds, and a table, a picture and a report are
     written. After Ctrl-C (exit code 130) the same command resumes.
     Example: scm-world discover er2:20 --learner do_order,gies
+
+    Args:
+        task: A task, a model.xml or model.urdf, or module:function; with --learner also a family
+            with a size (er2:20, sf2:50, tanh4:100), the JSON file of an SCM, or several with
+            commas between them.
+        probes: Number of states to experiment in.
+        strict: Exit 1 if the SHD is not 0.
+        learner: Learners to benchmark, with commas; see 'scm-world list'.
+        data: Of the benchmark: observational, interventional or paired, with commas; by default
+            what each learner can use best.
+        budget: Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c.
+        seeds: Number of seeds of the benchmark.
+        view: Rows of a task: outcome (one per episode) or step (control step).
+        cause: What varies, such as '*.mass'; repeat it for more.
+        outcome: Variable that is measured; repeat it for more.
+        policy: random, sweep, across, grasp or still; usual is sweep, of --view step random.
+        sensor_noise: Of sensors: deviation, in halves of a range.
+        timeout: Limit of a run in seconds; 0 for none.
     """
+    settings = {"backend": backend, "preset": preset, "resolution": resolution}
     if learner or re.search(r":\d+$", task) or task.endswith(".json"):
         from scm_world.discovery.problems import TaskView
 
-        settings = {"backend": backend, "preset": preset, "resolution": resolution}
         chosen = TaskView(
             view=view,
             causes=tuple(cause) if cause else None,
@@ -142,7 +123,6 @@ def discover(
         if value not in (None, "serial", 1):
             allowed = ("left out: discover without --learner runs in this process",)
             raise UnknownOption(name, value, allowed)
-    settings = {"backend": backend, "preset": preset, "resolution": resolution}
     with open_system(task, option, **settings) as system:
         about = (tag(task), backend_of(system), f"seed{seed}")
         folder = console.results_folder(
@@ -158,37 +138,28 @@ def discover(
             )
         names = tuple(system.graph)
     report = replace(report, arguments=tuple(option or ()))
-    terminal = console.terminal()
-    terminal.print(_edge_table(report, names))
+    _edge_table(report, names)
     used = {name for edge in (*report.found, *report.declared) for name in edge[:2]}
     if lonely := [name for name in names if name not in used]:
         from scm_world.discovery.names import by_entity
 
-        terminal.print(Text.assemble(("no edge at all: ", "bold"), ", ".join(by_entity(lonely))))
-        terminal.print()
-    terminal.print(console.facts(_numbers(report)))
+        console.say(f"no edge at all: {', '.join(by_entity(lonely))}", "")
+    console.facts(_numbers(report))
     with console.staged(folder) as draft:
         report.save(draft / "report.json")
         draw_graphs(report, draft / "graphs.png")
-    console.written(folder / "report.json", folder / "graphs.png")
     if report.probes < report.planned:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(strict and report.score.shd > 0))
 
 
-def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> Table:
-    """Return one row per effect; a long list of causes is written out once."""
+def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> None:
+    """Print one row per effect; a long list of causes is written out once."""
     from scm_world.discovery.names import by_entity
 
-    made = console.table(
-        *("effect", "causes at once", "causes one step earlier", "edges"),
-        title=f"Recovered graph of {report.task} ({len(report.found)} edges)",
-        caption="[+] found but not declared   [-] declared but not found",
-        whole=(0,),
-    )
-    made.columns[3].justify = "right"
     found, declared = set(report.found), set(report.declared)
     first: dict[str, str] = {}
+    rows = []
     for effect in names:
         cells = []
         for lag in (0, 1):
@@ -209,8 +180,14 @@ def _edge_table(report: DiscoveryReport, names: Sequence[str]) -> Table:
             cells.append(Text(f"same as {like}", style="italic") if alike else cell)
         if any(cells):
             count = sum(edge[1] == effect for edge in report.found)
-            made.add_row(Text(effect, style="bold"), *cells, str(count))
-    return made
+            rows.append((Text(effect, style="bold"), *cells, count))
+    console.table(
+        ("effect", "causes at once", "causes one step earlier", "edges"),
+        rows,
+        title=f"Recovered graph of {report.task} ({len(report.found)} edges)",
+        caption="[+] found but not declared   [-] declared but not found",
+        whole=(0,),
+    )
 
 
 def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
@@ -265,8 +242,7 @@ def _benchmark(
     if ":" in learner:  # a custom learner, beside where the command is called
         sys.path.insert(0, str(Path.cwd()))
     policies = (*NAMED, "still", "usual")
-    if view.policy not in policies:
-        raise UnknownOption("policy", view.policy, policies)
+    one_of("policy", view.policy, policies)
     view = replace(view, policy=None) if view.policy == "still" else view
     drawn = [n.partition(":")[0] in FAMILIES or n.endswith(".json") for n in problems]
     if option:
@@ -296,15 +272,20 @@ def _benchmark(
     columns = [column for column in COLUMNS if column.key in BRIEF]
     for name, rows in summary(result).items():
         truth = result.problems[name]
-        title = f"{truth.name}: {len(truth.names)} variables, {len(truth.edges)} true edges"
-        made = console.table(*HEADS[1:], *(column.title for column in columns), title=title)
-        for row in rows:  # the means over seeds; the ranges are in results.md
-            means = (
-                Text(row.text(c).partition(" [")[0], "bold" if c.key in row.best else "")
-                for c in columns
-            )
-            made.add_row(*row.heads[1:], *means)
-        console.terminal().print(made)
+        console.table(
+            (*HEADS[1:], *(column.title for column in columns)),
+            [  # the means over seeds; the ranges are in results.md
+                (
+                    *row.heads[1:],
+                    *(
+                        Text(row.text(c).partition(" [")[0], "bold" if c.key in row.best else "")
+                        for c in columns
+                    ),
+                )
+                for row in rows
+            ],
+            title=f"{truth.name}: {len(truth.names)} variables, {len(truth.edges)} true edges",
+        )
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
         console.say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
@@ -316,8 +297,8 @@ def _benchmark(
 def verify(
     task: options.Systems,
     backend: options.Backend = None,
-    both: Annotated[bool, typer.Option("--both", help="On MuJoCo and Bullet; compare.")] = False,
-    probes: Annotated[int, typer.Option(min=1, help="Largest number of probe states.")] = 200,
+    both: bool = False,
+    probes: options.Count = 200,
     seed: options.Seed = 0,
     preset: options.Preset = None,
     out: options.Out = None,
@@ -329,6 +310,10 @@ def verify(
     Exits 1 unless every declared edge is seen and nothing else. 'all' takes small variants of
     tasks with many blocks. Ctrl-C gives the result so far (exit code 130).
     Example: scm-world verify pushing --both
+
+    Args:
+        both: On MuJoCo and Bullet; compare.
+        probes: Largest number of probe states.
     """
     from scm_world.discovery.plots import draw_verification
     from scm_world.queries import SCM
@@ -346,13 +331,14 @@ def verify(
     used = "both" if both else backend or getattr(first, "backend", "equations")
     words = (*(option or ()), resolution or "")
     folder = console.results_folder(out, "verify", tag(task), used, f"seed{seed}", option=words)
-    terminal, interrupted = console.terminal(), False
-    found: list[Verification | Agreement] = []
+    interrupted = False
+    found: list[tuple[Verification | Agreement, tuple[Verification, ...]]] = []
     for name, given in systems.items():
         system = load_system(name, given)
         settings: dict[str, Any] = {"probes": probes, "least": min(LEAST, probes), "seed": seed}
         if not isinstance(system, SCM):
             settings |= {"preset": preset, "resolution": resolution}
+            settings |= {} if both else {"backend": backend}
         one: Verification | Agreement
         try:
             with console.progress("probe states", lines=4, about=f"{tag(name)}: ") as tell:
@@ -363,8 +349,6 @@ def verify(
 
                     one = verify_engines(system, progress=told, **settings)
                 else:
-                    if not isinstance(system, SCM):
-                        settings["backend"] = backend
                     one = verified(system, progress=tell, **settings)
         except KeyboardInterrupt:
             if not found:
@@ -374,50 +358,38 @@ def verify(
         about = {"arguments": tuple(given)}
         reports = one.verifications if isinstance(one, Agreement) else (one,)
         reports = tuple(report.model_copy(update=about) for report in reports)
+        for report in reports:
+            console.say(f"Verification of {report.task} on {report.backend}")
+            console.facts(report.rows())
+            console.say("")
         if isinstance(one, Agreement):
             one = one.model_copy(update={"verifications": reports})
+            console.say(f"Agreement of {' and '.join(one.backends)} on {one.task}")
+            console.facts(one.rows())
         else:
             one = reports[0]
-        found.append(one)
-        for report in reports:
-            terminal.print(Text(f"Verification of {report.task} on {report.backend}", style="bold"))
-            terminal.print(console.facts(report.rows()), "")
-        if isinstance(one, Agreement):
-            title = f"Agreement of {' and '.join(one.backends)} on {one.task}"
-            terminal.print(Text(title, style="bold"))
-            terminal.print(console.facts(one.rows()), "")
-        place = folder / name if every else folder
-        with console.staged(place) as draft:
+        found.append((one, reports))
+        with console.staged(folder / name if every else folder) as draft:
             (draft / "report.json").write_text(one.to_json())
             draw_verification(one, draft / "verify.png")
-        console.written(place / "report.json", place / "verify.png")
         if one.interrupted:
             interrupted = True
             break
     if len(found) > 1:
-        made = console.table(
-            *("task", "backend", "probe states", "seen", "undeclared", "noise floor", "seconds"),
-            "passed",
-            title="All verifications",
-        )
+        rows: list[tuple[object, ...]] = []
         good = {True: Text("yes", "green"), False: Text("no", "bold red")}
-        for one in found:
-            for report in one.verifications if isinstance(one, Agreement) else (one,):
-                made.add_row(
-                    report.task,
-                    report.backend,
-                    str(report.probes),
-                    f"{len(report.fired)} of {len(report.declared)}",
-                    str(len(report.undeclared)),
-                    f"{report.floor:g}",
-                    f"{report.seconds:.1f}",
-                    good[report.passed],
-                )
+        for one, reports in found:
+            for report in reports:
+                seen = f"{len(report.fired)} of {len(report.declared)}"
+                cells = (report.probes, seen, len(report.undeclared), f"{report.floor:g}")
+                time = f"{report.seconds:.1f}"
+                rows.append((report.task, report.backend, *cells, time, good[report.passed]))
             if isinstance(one, Agreement):
                 share = f"same sign: {100 * one.share:.1f} %"
-                cells = (one.task, "both", "", share, "", "", f"{one.seconds:.1f}")
-                made.add_row(*cells, good[one.passed])
-        terminal.print("", made)
+                time = f"{one.seconds:.1f}"
+                rows.append((one.task, "both", "", share, "", "", time, good[one.passed]))
+        heads = ("task", "backend", "probe states", "seen", "undeclared", "noise floor", "seconds")
+        console.table((*heads, "passed"), rows, title="All verifications")
     if interrupted:
         raise typer.Exit(console.INTERRUPTED)
-    raise typer.Exit(int(not all(one.passed for one in found)))
+    raise typer.Exit(int(not all(one.passed for one, _ in found)))

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
-from rich.text import Text
 
+from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import load_task, parse_assignments
 from scm_world.cli.datasets import check_parquet
@@ -21,72 +20,23 @@ SHOWN = 8  # variables that are listed
 
 
 def evaluate(
-    policy: Annotated[
-        str | None,
-        typer.Argument(
-            help="A file (.safetensors, .onnx, .zip, .npz, .parquet), the folder of a training "
-            "run, zoo:NAME, random, still, sweep, grasp, or module:function; several with commas; "
-            "NAME=POLICY names one, and A+B are its runs."
-        ),
-    ] = None,
-    task: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="SYSTEM",
-            help="A task (see 'scm-world list'), a model.xml or model.urdf, or module:function.",
-            show_default="what the policy was trained for, or pushing",
-        ),
-    ] = None,
-    protocols: Annotated[
-        str | None,
-        typer.Option(
-            help="Names with commas, such as P0,P5; P2@100 intervenes within episodes, from "
-            "control step 100 on.",
-            show_default="all of the task",
-        ),
-    ] = None,
-    n: Annotated[int, typer.Option("-n", "--n", min=1, help="Episodes of each protocol.")] = 200,
-    seeds: Annotated[str, typer.Option(help="Seeds of the noise, with commas.")] = "0",
-    backend: Annotated[
-        str | None,
-        typer.Option(
-            help="Physics backend: mujoco, bullet, step or fake; or two with a comma, compared.",
-            show_default="that of the task",
-        ),
-    ] = None,
-    env: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--env",
-            metavar="NAME=VALUE",
-            help="Option of the environment, such as frame_skip=3; repeat it for more.",
-        ),
-    ] = None,
+    policy: Annotated[str | None, typer.Argument()] = None,
+    task: Annotated[str | None, typer.Argument(metavar="SYSTEM")] = None,
+    protocols: options.Text = None,
+    n: options.N = 200,
+    seeds: str = "0",
+    backend: options.Text = None,
+    env: options.Pairs = None,
     option: options.Option = None,
-    metric: Annotated[
-        str | None,
-        typer.Option(
-            help="Score that is shown and drawn; all are written.",
-            show_default="last_fractional_success, or return where a task has none",
-        ),
-    ] = None,
+    metric: options.Text = None,
     workers: options.ManyWorkers = 0,
     executor: options.Executor = None,
     address: options.Address = None,
     format_: options.Files = "parquet",
-    videos: Annotated[
-        bool, typer.Option("--videos", help="Film the best, median and worst episodes.")
-    ] = False,
+    videos: bool = False,
     out: options.Out = None,
-    check: Annotated[
-        Any,  # a Location or None
-        typer.Option(
-            parser=options.read_location,
-            metavar="PATH",
-            help="Repeat a random part of these results, and compare every bit.",
-        ),
-    ] = None,
-    part: Annotated[int, typer.Option(min=1, help="Episodes that --check repeats.")] = 12,
+    check: options.Place = None,
+    part: options.Count = 12,
     trust: options.Trust = None,
 ) -> None:
     """Score policies in protocols, with 95 % intervals.
@@ -95,16 +45,35 @@ def evaluate(
     130) the same command resumes. With --check PATH nothing is evaluated: a part of PATH is
     repeated; exit code 1 if anything differs.
     Example: scm-world evaluate zoo:pushing,random --protocols P0,P5 -n 100
+
+    Args:
+        policy: A file (.safetensors, .onnx, .zip, .npz, .parquet), the folder of a training run,
+            zoo:NAME, random, still, sweep, grasp, or module:function; several with commas;
+            NAME=POLICY names one, and A+B are its runs.
+        task: A task (see 'scm-world list'), a model.xml or model.urdf, or module:function; by
+            default what the policy was trained for, or pushing.
+        protocols: Names with commas, such as P0,P5; all of the task by default. P2@100 intervenes
+            within episodes, from control step 100 on.
+        n: Episodes of each protocol.
+        seeds: Seeds of the noise, with commas.
+        backend: Physics backend: mujoco, bullet, step or fake; or two with a comma, compared. That
+            of the task by default.
+        env: Option of the environment, such as frame_skip=3; repeat it for more.
+        metric: Score that is shown and drawn; all are written. By default
+            last_fractional_success, or return where a task has none.
+        videos: Film the best, median and worst episodes.
+        check: Repeat a random part of these results, and compare every bit.
+        part: Episodes that --check repeats.
     """
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.files import CODECS, false_scores
-    from scm_world.evaluation.reporting import write_outputs
+    from scm_world.evaluation.outputs.report import write_outputs
     from scm_world.evaluation.setups import task_of
-    from scm_world.evaluation.shards import FOLDER
 
+    if trust or policy is not None:
+        sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     if check is not None:
-        _look_here(trust, policy)
         results = evaluation.Evaluation.load(check)
         wrong = list(false_scores(check, results))
         again = None if policy is None else policies_of(policy)
@@ -119,10 +88,8 @@ def evaluate(
 
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
-    if metric not in (None, *METRICS):
-        raise UnknownOption("metric", metric, METRICS)
-    if format_ not in CODECS:
-        raise UnknownOption("format", format_, CODECS)
+    one_of("metric", metric, (None, *METRICS))
+    one_of("format", format_, CODECS)
     check_parquet(format_)
     if videos and find_spec("moviepy") is None:
         needed = ("none, or after: pip install 'scm-world[video]'",)
@@ -130,7 +97,6 @@ def evaluate(
     words = [word.strip() for word in seeds.split(",")]
     if not all(word.isdecimal() for word in words):
         raise UnknownOption("seeds", seeds, ("whole numbers with commas between them",))
-    sys.path.insert(0, str(Path.cwd()))  # for a custom policy, beside where this is called
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)
@@ -142,7 +108,7 @@ def evaluate(
         out, "evaluate", *agents, task, option=(*(option or ()), *(env or ()))
     )
     with (
-        console.resumable(folder, f"{FOLDER}/*.json", "files"),
+        console.resumable(folder, "parts/*.json", "files"),
         options.open_executor(executor, workers, address, "episodes") as (pool, tell),
     ):
         found = evaluation.evaluate(
@@ -164,25 +130,27 @@ def evaluate(
 
     who = [(agent, engine) for engine in found.engines for agent in found.agents]
     heads = [agent if len(found.engines) == 1 else f"{agent}, {engine}" for agent, engine in who]
-    scores = console.table(
-        *("protocol", "varied", *map(escape, heads)),
+    docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
+    console.table(
+        ("protocol", "varied", *heads),
+        [
+            (p, docs.get(p, ""), *(found.score(p, metric, agent=a, engine=e) for a, e in who))
+            for p in found.protocols
+        ],
         title=f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals",
         whole=(0,),
     )
-    docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
-    for protocol in found.protocols:
-        cells = (found.score(protocol, metric, agent=agent, engine=name) for agent, name in who)
-        varied = docs.get(protocol, "")
-        scores.add_row(*(Text(str(cell)) for cell in (protocol, varied, *cells)))
-    console.terminal().print(scores)
     if len(found.engines) == 2:
         one, other = found.engines
-        title = f"{one} minus {other}, the same draws on both"
-        gaps = console.table("protocol", *map(escape, found.agents), title=title, whole=(0,))
-        for protocol in found.protocols:
-            cells = (found.gap(one, other, protocol, metric, agent=name) for name in found.agents)
-            gaps.add_row(protocol, *(Text(str(cell)) for cell in cells))
-        console.terminal().print(gaps)
+        console.table(
+            ("protocol", *found.agents),
+            [
+                (p, *(found.gap(one, other, p, metric, agent=name) for name in found.agents))
+                for p in found.protocols
+            ],
+            title=f"{one} minus {other}, the same draws on both",
+            whole=(0,),
+        )
     console.written(*files, *more)
 
 
@@ -216,51 +184,36 @@ def policies_of(text: str) -> dict[str, list[str]]:
     return found
 
 
-def _look_here(trust: list[str] | None, policy: str | None = None) -> None:
-    """Find custom modules beside where the command is called, if they are asked for."""
-    if trust or policy is not None:
-        sys.path.insert(0, str(Path.cwd()))
-
-
 def explain(
     results: Annotated[
         Any,  # a Location
-        typer.Argument(
-            parser=options.read_location,
-            metavar="RESULTS",
-            help="Folder or results.json of an evaluation.",
-        ),
+        typer.Argument(parser=options.read_location, metavar="RESULTS"),
     ],
-    protocol: Annotated[
-        str | None,
-        typer.Option(help="Name of a protocol.", show_default="all that vary something"),
-    ] = None,
-    episode: Annotated[
-        int | None,
-        typer.Option(min=0, help="Episode whose counterfactuals are run, one for each variable."),
-    ] = None,
-    agent: Annotated[
-        str | None, typer.Option(help="Name of a policy, if there are several.")
-    ] = None,
-    backend: Annotated[str | None, typer.Option(help="Backend, if there are several.")] = None,
-    metric: Annotated[
-        str, typer.Option(help="Score that is explained.")
-    ] = "last_fractional_success",
-    versus: Annotated[
-        str | None,
-        typer.Option(
-            help="Value of the variable instead: A (from the training support) or default."
-        ),
-    ] = None,
+    protocol: options.Text = None,
+    episode: Annotated[int | None, typer.Option(min=0)] = None,
+    agent: options.Text = None,
+    backend: options.Text = None,
+    metric: str = "last_fractional_success",
+    versus: options.Text = None,
     trust: options.Trust = None,
 ) -> None:
     """Say which variables decided the scores, or what an episode would have been without them.
 
     Example: scm-world explain results.json --protocol P8 --episode 3
+
+    Args:
+        results: Folder or results.json of an evaluation.
+        protocol: Name of a protocol; all that vary something by default.
+        episode: Episode whose counterfactuals are run, one for each variable.
+        agent: Name of a policy, if there are several.
+        backend: Backend, if there are several.
+        metric: Score that is explained.
+        versus: Value of the variable instead: A (from the training support) or default.
     """
     from scm_world.evaluation import Evaluation, why
 
-    _look_here(trust)
+    if trust:
+        sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     found = Evaluation.load(results)
     chosen = []
     for name, flag, given in (("agent", "'--agent'", agent), ("engine", "'--backend'", backend)):
@@ -280,35 +233,31 @@ def explain(
                 if protocol is not None:
                     console.say(title, causes if causes.left_out else "nothing is varied in it")
                 continue
-            made = console.table(
-                *("variable", "share of variance", "p (Holm)", "upper - lower third"),
-                title=title,
-                whole=(0,),
-            )
+            rows: list[tuple[object, ...]] = []
             for cause in causes.ranked()[:SHOWN]:
                 column = cause.column
                 of = "" if column.name == cause.variable else f" ({column.name})"
-                contrast = Text(f"{column.contrast}{of}")
-                share = Text(str(cause.share))
-                made.add_row(cause.variable, share, f"{cause.p_holm:.3g}", contrast)
+                contrast = f"{column.contrast}{of}"
+                rows.append((cause.variable, cause.share, f"{cause.p_holm:.3g}", contrast))
             if len(causes.causes) > SHOWN:
-                made.add_row(f"and {len(causes.causes) - SHOWN} more", "", "", "")
-            console.terminal().print(made)
+                rows.append((f"and {len(causes.causes) - SHOWN} more", "", "", ""))
+            heads = ("variable", "share of variance", "p (Holm)", "upper - lower third")
+            console.table(heads, rows, title=title, whole=(0,))
         return
     if protocol is None:
         raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
     asked: dict[str, Any] = {"agent": agent, "engine": engine, "metric": metric, "versus": versus}
     with console.progress("counterfactuals") as tell:
         reasons = why(found, protocol, episode, **asked, trusted=tuple(trust or ()), progress=tell)
-    title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
-    made = console.table("had it been", "instead of", "score", "success", title=title)
-    for other in reasons.others:
-        made.add_row(
-            Text(f"{other.variable} = {console.show(other.would_be)}"),
+    rows = [
+        (
+            f"{other.variable} = {console.show(other.would_be)}",
             console.show(other.was),
             f"{other.would_score:.3g} ({other.gain:+.3g})",
             "yes" if other.would_succeed else "no",
         )
-    for name, reason in reasons.left_out.items():
-        made.add_row(Text(name), "", "left out", Text(reason))
-    console.terminal().print(made)
+        for other in reasons.others
+    ]
+    rows += [(name, "", "left out", reason) for name, reason in reasons.left_out.items()]
+    title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
+    console.table(("had it been", "instead of", "score", "success"), rows, title=title)

@@ -1,17 +1,14 @@
-"""The commands that show what there is: ``graph``, ``variables`` and ``list``."""
+"""The commands that show what there is: ``graph`` and ``list``."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import IO, TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from scm_world.cli import console, options
@@ -20,33 +17,14 @@ from scm_world.errors import UnknownOption
 
 if TYPE_CHECKING:
     from scm_world.graph import SCM
-    from scm_world.variables import Variable
 
 KIND_STYLE = {"exogenous": "yellow", "derived": "green", "measured": "blue", "action": "magenta"}
 LONG = 80  # [characters] what is longer is written once
-HEADINGS = ("variable", "unit", "shape", "role", "default", "possible", "A", "B", "follows", "")
-DO = {
-    "parameter": "holds until the reset",
-    "state": "is set at this instant; physics carries it on",
-    "readout": "is not possible; intervene on a cause",
-    "action": "takes the place of the policy's command until the reset",
-}
-"""What ``do`` means for each role."""
-
-
-class Format(StrEnum):
-    """How a graph is written down."""
-
-    TABLE = "table"
-    DOT = "dot"
-    JSON = "json"
-    PNG = "png"
-    HTML = "html"
-    GML = "gml"
-    GRAPHML = "graphml"
-    NODE_LINK = "node-link"
-    DAGITTY = "dagitty"
-    CSV = "csv"
+Format = StrEnum(
+    "Format",
+    ["table", "dot", "json", "png", "html", "gml", "graphml", "node-link", "dagitty", "csv"],
+)
+"""How a graph is written down."""
 
 
 def _model(name: str, option: Sequence[str] | None, **settings: str | None) -> SCM:
@@ -64,27 +42,21 @@ def _model(name: str, option: Sequence[str] | None, **settings: str | None) -> S
 def graph(
     task: options.System,
     format_: Annotated[
-        Format | None,
-        typer.Option(
-            "--format",
-            help="How to write it; without it the ending of --out says so.",
-            show_default="table",
-        ),
+        Format | None, typer.Option("--format", show_default="table or the ending of --out")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File to write to.")] = None,
-    action_mode: Annotated[
-        str | None,
-        typer.Option(
-            help="Of the TriFinger: joint_positions, joint_torques or end_effector_positions.",
-            show_default="joint_positions",
-        ),
-    ] = None,
+    out: Path | None = None,
+    action_mode: options.Text = None,
     option: options.Option = None,
     resolution: options.Resolution = None,
 ) -> None:
     """Show the declared causal graph of a system.
 
     Example: scm-world graph pushing --out graph.html
+
+    Args:
+        format_: How to write it.
+        out: File to write to.
+        action_mode: Of the TriFinger: joint_positions, joint_torques or end_effector_positions.
     """
     from scm_world.graph import to_json
     from scm_world.graph.exchange import causal_graph, to_html, write_graph
@@ -93,8 +65,8 @@ def graph(
         ending = "" if out is None else out.suffix.lower().removeprefix(".")
         if ending not in {*Format, "", "txt"}:
             raise UnknownOption("format of a graph", ending, tuple(Format))
-        format_ = Format(ending) if ending in {*Format} else Format.TABLE
-    if format_ is Format.PNG and out is None:
+        format_ = Format(ending) if ending in {*Format} else Format.table
+    if format_ is Format.png and out is None:
         out = Path(f"{tag(task)}{suffix(option or ())}-graph.png")
     if out is not None:
         console.check_writable(out, folder=False)
@@ -103,39 +75,32 @@ def graph(
         out.parent.mkdir(parents=True, exist_ok=True)
     title = f"{tag(task)}, as it is declared"
     page = StringIO()
-    match format_:
-        case Format.PNG if out is not None:
+    match format_.value:
+        case "png" if out is not None:
             from scm_world.discovery.plots import draw_model
 
             draw_model(model, out, title=title)
-        case Format.TABLE:
-            console.terminal(file=None if out is None else page, width=console.PAGE).print(
-                _parents_table(model)
-            )
-        case Format.JSON:
+        case "table":
+            _parents_table(model, None if out is None else page)
+        case "json":
             page.write(to_json(model) + "\n")
-        case Format.HTML:
+        case "html":
             page.write(to_html(causal_graph(model), title=title) + "\n")
-        case _:
-            page.write(write_graph(model, format=format_.value) + "\n")
+        case other:
+            page.write(write_graph(model, format=other) + "\n")
     if out is None:
         typer.echo(page.getvalue(), nl=False)
         return
-    if format_ is not Format.PNG:
+    if format_ is not Format.png:
         out.write_text(page.getvalue(), encoding="utf-8")
     console.say(f"written: {out}", stderr=True)
 
 
-def _parents_table(model: SCM) -> Table:
-    """Return one row per variable; rows that differ in a number of the name only become one."""
+def _parents_table(model: SCM, file: IO[str] | None) -> None:
+    """Print one row per variable; rows that differ in a number of the name only become one."""
     from scm_world.discovery.names import braces, by_entity
     from scm_world.graph.exchange import space_lines
 
-    made = console.table(
-        *("variable", "kind", "unit", "shape", "default", "A", "B", "parents"),
-        title=f"{len(model)} variables, {len(model.edges)} edges",
-        whole=(0,),
-    )
     alike: dict[tuple[str, ...], list[str]] = {}
     for variable in model.variables:
         given: Any = variable
@@ -161,6 +126,7 @@ def _parents_table(model: SCM) -> Table:
         )
         alike.setdefault(cells, []).append(variable.name)
     first: dict[str, str] = {}  # the variable at which a long list of parents is written out
+    rows: list[tuple[object, ...]] = []
     for (kind, *rest, links), names in alike.items():
         for name in braces(names):
             lines = links.splitlines()
@@ -169,127 +135,24 @@ def _parents_table(model: SCM) -> Table:
                 if like != name and len(line) >= LONG:
                     lines[number] = f"{line.partition(':')[0]}: same as {like}"
             style = KIND_STYLE.get(kind.partition("\n")[0], "")
-            shown = map(Text, (*rest, "\n".join(lines)))
-            made.add_row(Text(name, style="bold"), Text(kind, style=style), *shown)
-    return made
-
-
-def variables(
-    task: options.Systems,
-    markdown: Annotated[
-        bool, typer.Option("--markdown", help="Write the tables of all tasks as Markdown.")
-    ] = False,
-    option: options.Option = None,
-) -> None:
-    """Show every variable of a system: unit, role, default, and the spaces A and B.
-
-    A is the training support, B the held-out one.
-    Example: scm-world variables pushing
-    """
-    from scm_world.tasks import TASKS
-
-    if markdown:
-        typer.echo(variables_page(), nl=False)
-        return
-    for title, rows in _sections(tuple(TASKS) if task == "all" else (task,), option):
-        made = console.table(*HEADINGS[:5], "A", "B", title=title)
-        for name, unit, shape, role, default, _, a, b, *_ in rows:
-            made.add_row(Text(name), unit, shape, role, default, a, b)
-        console.terminal().print(made)
-
-
-def variables_page() -> str:
-    """Return the tables of all tasks as Markdown: the text of ``docs/variables.md``."""
-    from scm_world.tasks import TASKS
-
-    lines = [
-        "# Variables",
-        "",
-        "Every variable of every task, as it is declared; written by `scm-world variables all "
-        "--markdown`. The tables show the structure that each task begins with; `F` stands for a "
-        "finger (60, 120, 300) and `N` for a number. *Possible* is what physics allows; A is the "
-        "training space and B the held-out one. *Follows* lists the causes: one control step "
-        "earlier for states, at once for everything else; `(set)` marks a cause that acts when "
-        "something is set, and *contacts* stands for every physical quantity of the world.",
-        "",
-        "What `do` means depends on the role:",
-        "",
-        *(f"* **{role}**: {meaning}." for role, meaning in DO.items()),
-        "",
-    ]
-    for title, rows in _sections(TASKS):
-        lines += [f"## {title}", "", "| " + " | ".join(HEADINGS) + " |"]
-        lines += ["|" + "---|" * len(HEADINGS)]
-        lines += ["| " + " | ".join((f"`{name}`", *cells)) + " |" for name, *cells in rows]
-        lines.append("")
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _sections(
-    systems: Iterable[str], option: Sequence[str] | None = None
-) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
-    """Yield the rows that all systems have in common, then what each has besides."""
-    found = {
-        name: list(dict.fromkeys(map(_row, _model(name, option).variables))) for name in systems
-    }
-    common = [row for row in next(iter(found.values())) if all(row in f for f in found.values())]
-    if len(found) > 1:
-        yield "every task", common
-    for name, rows in found.items():
-        yield name, [row for row in rows if len(found) == 1 or row not in common]
-
-
-def _row(variable: Variable) -> tuple[str, ...]:
-    """Describe a variable; those that differ in the numbers of their names only are alike."""
-    from scm_world.graph.exchange import space_lines
-    from scm_world.variables import Derived, Exogenous, Fixed, Measured, names
-
-    default, causes = "", list[str]()
-    match variable:
-        case Exogenous(default=value) | Fixed(value=value):
-            default = _numbers(value)
-        case Measured(default=value, start=None) if value is not None:
-            default = _numbers(value)
-    if isinstance(variable, Measured) and variable.mechanism is None:
-        chosen = [p for p in variable.parents if p.when != "contact"]
-        causes = [f"{p.name}{' (set)' if p.when == 'set' else ''}" for p in chosen] + ["contacts"]
-    elif isinstance(variable, Derived | Measured):
-        causes = list(names(variable.all_parents))
-    causes = list(dict.fromkeys(map(_pattern, causes)))
-    spaces = (variable.bounds, variable.a, variable.b)
-    cells = (
-        variable.name,
-        "" if variable.unit == "1" else variable.unit,
-        "×".join(map(str, variable.shape)),
-        "constant" if isinstance(variable, Fixed) else variable.role,
-        default,
-        *(", ".join(space_lines(space, digits=6)) for space in spaces),
-        ", ".join(causes[:8]) + (", …" if len(causes) > 8 else ""),
-        variable.doc,
+            rows.append((Text(name, "bold"), Text(kind, style), *rest, "\n".join(lines)))
+    console.table(
+        ("variable", "kind", "unit", "shape", "default", "A", "B", "parents"),
+        rows,
+        title=f"{len(model)} variables, {len(model.edges)} edges",
+        whole=(0,),
+        width=console.PAGE,
+        file=file,
     )
-    return tuple(map(_pattern, cells))
 
 
-def _pattern(text: str) -> str:
-    text = re.sub(r"(finger_|goal_)(60|120|300)(?=_|\b)", r"\1F", text)
-    return re.sub(r"(level|col|row|num|tool|goal|block|obstacle)_\d+", r"\1_N", text)
-
-
-def _numbers(value: object) -> str:
-    flat = [f"{x:.6g}" for x in np.ravel(np.asarray(value, dtype=float))]
-    if len(flat) > 1 and len(set(flat)) == 1:
-        return f"{flat[0]} each"
-    return ", ".join(flat) if len(flat) <= 12 else f"{len(flat)} numbers"
-
-
-def list_(
-    zoo: Annotated[
-        bool, typer.Option("--zoo", help="List the trained policies of the package instead.")
-    ] = False,
-) -> None:
+def list_(zoo: bool = False) -> None:
     """List tasks, backends, presets, learners, protocols, environments and trained policies.
 
     Example: scm-world list --zoo
+
+    Args:
+        zoo: List the trained policies of the package instead.
     """
     from scm_world.backends import backends, make_backend
     from scm_world.discovery.learners import learners
@@ -302,20 +165,29 @@ def list_(
     from scm_world.tasks.trifinger.entities.robot import ACTIONS
     from scm_world.tasks.trifinger.hardware import PRESETS
 
+    trained = policies.zoo()
     if zoo:
-        made = console.table("name", "task", "seed", "scores", "command", title="trained policies")
-        for name, about in policies.zoo().items():
-            seed, command = about.card.get("seed", ""), about.card.get("command", "")
-            cells = (name, about.task, seed, policies.best_known(about), command)
-            made.add_row(*(Text(str(cell)) for cell in cells))
-        nothing = "there are no trained policies in this installation"
-        console.terminal().print(made if made.row_count else nothing)
+        cells = [
+            (
+                name,
+                one.task,
+                one.card.get("seed", ""),
+                policies.best_known(one),
+                one.card.get("command", ""),
+            )
+            for name, one in trained.items()
+        ]
+        console.table(
+            ("name", "task", "seed", "scores", "command"), cells, title="trained policies"
+        )
+        if not trained:
+            console.say("there are no trained policies in this installation")
         return
 
     def first_line(text: str | None) -> str:
         return (text or "").strip().partition("\n")[0]
 
-    engines: dict[str, str | Text] = {}
+    engines: dict[str, Text] = {}
     for name in backends():
         try:
             backend = make_backend(name)
@@ -333,10 +205,6 @@ def list_(
     protocols = {p.name: p.doc for p in protocols_of("pushing")}
     for protocol in protocols_of("reaching"):
         protocols.setdefault(protocol.name, f"{protocol.doc}; reaching only")
-    trained = {
-        name: ": ".join(filter(None, (about.task, policies.best_known(about))))
-        for name, about in policies.zoo().items()
-    }
     sections: dict[str, Any] = {
         "tasks": {name: first_line(made.__doc__) for name, made in TASKS.items()},
         "backends": engines,
@@ -345,15 +213,16 @@ def list_(
         "conventions": dict.fromkeys(CONVENTIONS, ""),
         "learners": algorithms,
         "protocols": protocols,
-        "trained policies": trained,
+        "trained policies": {
+            name: ": ".join(filter(None, (one.task, policies.best_known(one))))
+            for name, one in trained.items()
+        },
         "families": {f"{name}:N": first_line(draw.__doc__) for name, draw in FAMILIES.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }
-    shown = console.table("", "name", "")
-    shown.show_header = False
-    for title, rows in sections.items():
-        for number, (name, about) in enumerate(rows.items()):
-            cell = about if isinstance(about, Text) else Text(about)
-            shown.add_row(Text("" if number else title, style="bold"), name, cell)
-        shown.add_section()
-    console.terminal().print(shown)
+    rows = [
+        (Text("" if number else title, style="bold"), name, about)
+        for title, entries in sections.items()
+        for number, (name, about) in enumerate(entries.items())
+    ]
+    console.table(("", "", ""), rows)

@@ -1,20 +1,63 @@
-"""Options that several commands share."""
+"""Options that several commands share, and how the help of all others is read.
+
+What an option means is said in the docstring of its command, or here if several have it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+import inspect
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
 from scm_world.cli.console import progress, say
 from scm_world.errors import ScmWorldError
-from scm_world.output.locations import Location, located
+from scm_world.output.remote import Location, located
 
 if TYPE_CHECKING:
     from scm_world.queries.progress import Progress
     from scm_world.work.executors import Executor as AnyExecutor
+
+
+def documented(command: Callable[..., None]) -> str:
+    """Give the options of a command the help texts that its docstring has under Args.
+
+    Returns:
+        The help text of the command: the rest of the docstring.
+    """
+    text, _, described = (inspect.getdoc(command) or "").partition("\n\nArgs:\n")
+    found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
+    helps = {name: " ".join(said.split()) for name, said in found}
+    hints = get_type_hints(command, include_extras=True)
+    for name in inspect.signature(command).parameters:
+        if name in helps:
+            kind, *given = get_args(hints[name]) if _is_annotated(hints[name]) else (hints[name],)
+            flag = (f"--{name.replace('_', '-')}",) if kind is bool else ()
+            option = copy.copy(given[0]) if given else typer.Option(*flag)
+            option.help = helps[name]
+            command.__annotations__[name] = Annotated[kind, option]
+    return text
+
+
+def _is_annotated(hint: Any) -> bool:
+    return hasattr(hint, "__metadata__")
+
+
+# --- kinds of options -----------------------------------------------------------------------------
+
+Text = str | None
+Count = Annotated[int, typer.Option(min=1)]
+MaybeCount = Annotated[int | None, typer.Option(min=1)]
+NotNegative = Annotated[int, typer.Option(min=0)]
+Amount = Annotated[float, typer.Option(min=0.0)]
+N = Annotated[int, typer.Option("-n", "--n", min=1)]
+Patterns = Annotated[list[str] | None, typer.Option(metavar="PATTERN")]
+Pairs = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")]
+Do = Annotated[list[str] | None, typer.Option("--do", metavar="NAME=VALUE")]
 
 # --- systems --------------------------------------------------------------------------------------
 
@@ -107,6 +150,7 @@ def read_location(text: str) -> Location:
         raise typer.BadParameter(str(error)) from None
 
 
+Place = Annotated[Any, typer.Option(parser=read_location, metavar="PATH")]
 Out = Annotated[
     Any,  # a Location or None, which typer does not know
     typer.Option(
@@ -157,15 +201,12 @@ Executor = Annotated[
         show_default="process; with one worker serial",
     ),
 ]
-
-
-def _workers(usual: str) -> Any:
-    said = "How many run at the same time; 0 for as many as there are cores."
-    return typer.Option(min=0, help=said, show_default=usual)
-
-
-Workers = Annotated[int | None, _workers("1; with --executor as many as there are cores")]
-ManyWorkers = Annotated[int | None, _workers("as many as there are cores")]
+_MANY = "How many run at the same time; 0 for as many as there are cores."
+_ONE = "1; with --executor as many as there are cores"
+Workers = Annotated[int | None, typer.Option(min=0, help=_MANY, show_default=_ONE)]
+ManyWorkers = Annotated[
+    int | None, typer.Option(min=0, help=_MANY, show_default="as many as there are cores")
+]
 Address = Annotated[
     str | None,
     typer.Option(
@@ -200,7 +241,7 @@ def open_executor(
         UnknownOption: There is no such executor, or it cannot have so many workers.
     """
     from scm_world.work.executors import engine_of
-    from scm_world.work.threads import cores
+    from scm_world.work.processes import cores
 
     count = workers or None
     if executor is None:

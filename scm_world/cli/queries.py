@@ -1,10 +1,8 @@
-"""The commands that intervene: ``do``, ``effect``, ``counterfactual`` and ``plan``."""
+"""The commands that intervene: ``do``, ``effect`` and ``counterfactual``."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,18 +31,11 @@ def do(
     task: options.System,
     assignments: options.Assignments,
     backend: options.Backend = None,
-    steps: Annotated[int, typer.Option(min=0, help="Control steps to run afterwards.")] = 25,
+    steps: options.NotNegative = 25,
     seed: options.Seed = 0,
     preset: options.Preset = None,
-    space: Annotated[
-        str | None,
-        typer.Option(
-            help="Refuse values outside this space: A (training support), B (held out) or 'A|B'."
-        ),
-    ] = None,
-    show_all: Annotated[
-        bool, typer.Option("--all", help="Show descendants that did not move, too.")
-    ] = False,
+    space: options.Text = None,
+    show_all: Annotated[bool, typer.Option("--all")] = False,
     out: options.Out = None,
     option: options.Option = None,
 ) -> None:
@@ -52,11 +43,16 @@ def do(
 
     Exits 1 if a variable moves that is no descendant of a target.
     Example: scm-world do pushing tool_block.mass=0.05 --steps 50
+
+    Args:
+        steps: Control steps to run afterwards.
+        space: Refuse values outside this space: A (training support), B (held out) or 'A|B'.
+        show_all: Show descendants that did not move, too.
     """
     from scm_world.queries import World
     from scm_world.queries.experiments.effects import gap
     from scm_world.queries.experiments.versions import versions
-    from scm_world.variables import Draw, Hard, Scale, Shift
+    from scm_world.variables import Draw, Scale, Shift
     from scm_world.variables.kinds import SPACES
 
     if space not in (None, *SPACES):
@@ -106,7 +102,6 @@ def do(
     def changes(pairs: Any) -> dict[str, Any]:
         return {name: {"before": old, "after": new} for name, (old, new) in pairs.items()}
 
-    acts = Hard | Shift | Scale | Draw
     result = {
         "format": "scm_world/do/1",
         "task": task,
@@ -117,14 +112,8 @@ def do(
         "space": space,
         "arguments": option or (),
         "audit": {
-            name: {
-                "requested": entry.requested.model_dump(mode="json")
-                if isinstance(entry.requested, acts)
-                else entry.requested,
-                "applied": entry.applied,
-                "read_back": entry.read_back,
-            }
-            for name, entry in audit.targets.items()
+            name: {part: getattr(one, part) for part in ("requested", "applied", "read_back")}
+            for name, one in audit.targets.items()
         },
         "followed": changes(audit.followed),
         "engine": changes(audit.engine),
@@ -134,75 +123,73 @@ def do(
         "moved_without_a_path": astray,
         "versions": versions(engine),
     }
-    with console.staged(folder) as draft:
-        shown = _pictures(scenes)
-        if shown:
-            _write_pictures(
-                draft, dict(zip(PICTURES, ([shown[0]], [shown[1]], shown), strict=True))
-            )
-        console.write_json(draft / "result.json", result)
-
-    terminal = console.terminal(width=console.PAGE)
-    title = f"do() in {tag(task)} on {engine}, seed {seed}"
-    made = console.table("target", "requested", "applied", "backend reports", title=title)
+    targeted: list[tuple[object, ...]] = []
     for name, entry in audit.targets.items():
         match entry.requested:
             case Shift() | Scale():
                 words = f"{entry.requested.kind} by {console.show(entry.requested.by)}"
             case Draw():
                 words = f"draw from {entry.requested.source}"
-            case Hard():
-                words = console.show(entry.requested.value)
-            case _:
-                words = console.show(entry.requested)
+            case asked:
+                words = console.show(getattr(asked, "value", asked))
         applied = "at every step" if entry.applied is None else console.show(entry.applied)
         back = "-" if entry.read_back is None else console.show(entry.read_back)
-        made.add_row(Text(name, style="bold"), words, applied, back)
-    terminal.print(made)
+        targeted.append((Text(name, style="bold"), words, applied, back))
+    title = f"do() in {tag(task)} on {engine}, seed {seed}"
+    heads = ("target", "requested", "applied", "backend reports")
+    console.table(heads, targeted, title=title, width=console.PAGE)
     for label, pairs in (
         ("followed at once", audit.followed),
         ("backend, inertia [kg m²]", audit.engine),
     ):
         for name, (old, new) in pairs.items():
             change = f"{console.show(old, per_line=9)} -> {console.show(new, per_line=9)}"
-            terminal.print(Text.assemble((f"{label}: ", "bold"), f"{name} {change}"))
+            console.say(f"{label}: {name} {change}")
     for label, names in (("new", audit.came), ("gone", audit.went)):
         if names:
-            terminal.print(Text.assemble((f"{label}: ", "bold"), ", ".join(names)))
-    terminal.print()
-    made = console.table(
-        *("descendant", "unit", "before", "right after", f"after {steps} steps"),
-        *("without the do()", "difference"),
-        title="What followed",
-        whole=(0, 6),
-    )
+            console.say(f"{label}: {', '.join(names)}")
     descendants = [row for row in rows.values() if row["descendant"]]
-    for name, row in rows.items():
-        if row["descendant"] and (row["moved"] or show_all):
-            same = np.array_equal(row["at_once"], row["before"])
-            alike = np.array_equal(row["without"], row["after"])
-            made.add_row(
+    console.table(
+        (
+            *("descendant", "unit", "before", "right after", f"after {steps} steps"),
+            *("without the do()", "difference"),
+        ),
+        [
+            (
                 Text(name, style="bold"),
-                Text(row["unit"]),
+                row["unit"],
                 console.show(row["before"]),
-                SAME if same else console.show(row["at_once"]),
+                _or_same(row["at_once"], row["before"]),
                 console.show(row["after"]),
-                SAME if alike else console.show(row["without"]),
+                _or_same(row["without"], row["after"]),
                 Text(f"{row['difference']:.3g}", style="bold" if row["difference"] else "dim"),
             )
-    terminal.print(made)
+            for name, row in rows.items()
+            if row["descendant"] and (row["moved"] or show_all)
+        ],
+        title="What followed",
+        whole=(0, 6),
+        width=console.PAGE,
+    )
     still = sum(not row["moved"] for row in descendants)
     line = f"{still} of {len(descendants)} descendants did not move"
     line += " (--all shows them)" if still and not show_all else ""
     if not astray:
         line += f"; none of the {len(rows) - len(descendants)} other variables moved"
-    terminal.print(Text(f"{line}."))
+    console.say(f"{line}.")
     if astray:
         wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
-        terminal.print(Text(f"{wrong} The graph is wrong.", style="bold white on red"))
-    there = [name for name in PICTURES if (folder / name).exists()]
-    console.written(*(folder / name for name in (*there, "result.json")))
+        console.terminal().print(Text(f"{wrong} The graph is wrong.", style="bold white on red"))
+    with console.staged(folder) as draft:
+        if shown := _pictures(scenes):
+            for name, frames in zip(PICTURES, ([shown[0]], [shown[1]], shown), strict=True):
+                _write_picture(draft / name, frames)
+        console.write_json(draft / "result.json", result)
     raise typer.Exit(int(bool(astray)))
+
+
+def _or_same(value: Any, other: Any) -> str:
+    return SAME if np.array_equal(value, other) else console.show(value)
 
 
 def _pictures(scenes: Sequence[Any]) -> list[Any]:
@@ -217,30 +204,24 @@ def _pictures(scenes: Sequence[Any]) -> list[Any]:
     return [picture(scene, camera, samples=2) for scene in scenes]
 
 
-def _write_pictures(folder: Path, files: dict[str, list[Any]]) -> None:
-    """Write files, each with one picture or several side by side."""
+def _write_picture(path: Path, frames: Sequence[Any]) -> None:
+    """Write a file with one picture, or several side by side."""
     from scm_world.backends.renderer import write_png
 
-    for name, frames in files.items():
-        white = np.full((frames[0].shape[0], DIVIDER, 3), 255, dtype=np.uint8)
-        strip = [part for frame in frames for part in (frame, white)]
-        write_png(folder / name, np.concatenate(strip[:-1], axis=1))
+    white = np.full((frames[0].shape[0], DIVIDER, 3), 255, dtype=np.uint8)
+    strip = [part for frame in frames for part in (frame, white)]
+    write_png(path, np.concatenate(strip[:-1], axis=1))
 
 
 def effect(
     task: options.System,
-    outcome: Annotated[str, typer.Argument(help="Name of a variable, or of a component: name[2].")],
+    outcome: Annotated[str, typer.Argument()],
     assignments: options.Assignments,
-    versus: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="What it is compared with; nothing by default."),
-    ] = None,
+    versus: options.Pairs = None,
     nature: options.Nature = None,
-    how: Annotated[
-        str, typer.Option(help="final, change, mean, max, min, sum or first.")
-    ] = "final",
-    n: Annotated[int, typer.Option("-n", min=2, help="Number of units.")] = 100,
-    unpaired: Annotated[bool, typer.Option("--unpaired", help="Compare different units.")] = False,
+    how: str = "final",
+    n: Annotated[int, typer.Option("-n", min=2)] = 100,
+    unpaired: bool = False,
     steps: options.Steps = 25,
     policy: options.Policy = None,
     backend: options.Backend = None,
@@ -253,6 +234,13 @@ def effect(
 
     Units are paired by default: the same noise, with and without the intervention.
     Example: scm-world effect pushing reward floor_friction=0.3 --versus floor_friction=0.5
+
+    Args:
+        outcome: Name of a variable, or of a component: name[2].
+        versus: What it is compared with; nothing by default.
+        how: final, change, mean, max, min, sum or first.
+        n: Number of units.
+        unpaired: Compare different units.
     """
     request, other, varies = map(parse_assignments, (assignments, versus, nature))
     measured = parse_outcome(outcome, how)
@@ -274,30 +262,25 @@ def effect(
                 seed=seed,
                 policy=policy_of(policy, system),
             )
-    made = console.table(
-        *("", "mean", "95 % interval"),
-        title=f"{found.outcome}, {tag(task)} on {found.engine}, seed {seed}",
-    )
-    made.add_row(
-        "effect",
-        console.show(found.mean),
-        f"{console.show(found.low)} … {console.show(found.high)}",
-    )
-    made.add_row("with it", console.show(found.treated), "")
-    made.add_row("without", console.show(found.control), "")
-    made.add_row("episodes", str(found.rollouts), "paired" if found.paired else "unpaired")
+    show = console.show
+    rows = [
+        ("effect", show(found.mean), f"{show(found.low)} … {show(found.high)}"),
+        ("with it", show(found.treated), ""),
+        ("without", show(found.control), ""),
+        ("episodes", found.rollouts, "paired" if found.paired else "unpaired"),
+    ]
     if found.paired:
-        made.add_row("variance unpaired : paired", console.show(found.variance_ratio), "")
-    console.terminal().print(made)
+        rows.append(("variance unpaired : paired", show(found.variance_ratio), ""))
+    title = f"{found.outcome}, {tag(task)} on {found.engine}, seed {seed}"
+    console.table(("", "mean", "95 % interval"), rows, title=title)
     with console.staged(folder) as draft:
         (draft / "effect.json").write_text(found.to_json() + "\n")
-    console.written(folder / "effect.json")
 
 
 def counterfactual(
     task: options.System,
     assignments: options.Assignments,
-    at: Annotated[int, typer.Option(min=0, help="Control step of the intervention.")] = 0,
+    at: options.NotNegative = 0,
     steps: options.Steps = 25,
     policy: options.Policy = None,
     backend: options.Backend = None,
@@ -310,6 +293,9 @@ def counterfactual(
 
     Both episodes are saved, except those of equations, which have no file format.
     Example: scm-world counterfactual pushing tool_block.mass=0.1 --at 5
+
+    Args:
+        at: Control step of the intervention.
     """
     from scm_world.queries import SCM, compare, save_episode
 
@@ -323,18 +309,20 @@ def counterfactual(
         episode = system.rollout(acts, seed=seed, steps=length)
         other = episode.counterfactual(request, at=at)
         apart = compare(episode, other)
-    made = console.table(
-        *("variable", "differs from", "most, and when", "at the end"),
+    rows = [
+        (
+            name,
+            one.first,
+            f"{console.show(one.largest)} at {one.at}",
+            console.show(np.abs(one.final).max(initial=0.0)),
+        )
+        for name, one in apart.variables.items()
+    ]
+    console.table(
+        ("variable", "differs from", "most, and when", "at the end"),
+        rows or [("nothing", "", "", "")],
         title=f"{tag(task)} on {used}, seed {seed}: intervention at control step {at}",
     )
-    for name, found in apart.variables.items():
-        most = f"{console.show(found.largest)} at {found.at}"
-        made.add_row(
-            name, str(found.first), most, console.show(np.abs(found.final).max(initial=0.0))
-        )
-    if not apart.variables:
-        made.add_row("nothing", "", "", "")
-    console.terminal().print(made)
     if apart.contacts:
         step, pair, which = apart.contacts[0]
         episode_name = ("the factual", "the counterfactual")[which]
@@ -365,127 +353,3 @@ def counterfactual(
             save_episode(episode, draft / "episode.npz")
             save_episode(other, draft / "counterfactual.npz")
         console.write_json(draft / "difference.json", result)
-        names = [name for name in ("episode.npz", "counterfactual.npz") if (draft / name).exists()]
-    console.written(*(folder / name for name in (*names, "difference.json")))
-
-
-def plan(
-    task: options.System,
-    samples: Annotated[
-        int | None, typer.Option(min=2, help="Sequences of actions in each round.")
-    ] = None,
-    horizon: Annotated[
-        int | None, typer.Option(min=1, help="Control steps that a plan looks ahead.")
-    ] = None,
-    iterations: Annotated[int | None, typer.Option(min=1, help="Rounds of the search.")] = None,
-    every: Annotated[
-        int | None, typer.Option(min=1, help="Control steps for which a plan is followed.")
-    ] = None,
-    objective: Annotated[
-        str | None,
-        typer.Option(help="Variable to maximize, such as reward; nearness to the goal by default."),
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Of the episode; as many as the task has.")
-    ] = None,
-    do: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--do", metavar="NAME=VALUE", help="Intervention in the planner's model only."
-        ),
-    ] = None,
-    given: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="Intervention in the world at the beginning."),
-    ] = None,
-    backend: options.Backend = None,
-    model: Annotated[
-        str | None, typer.Option(help="Backend of the planner; that of the world by default.")
-    ] = None,
-    seed: options.Seed = 0,
-    preset: options.Preset = None,
-    threads: Annotated[
-        int | None, typer.Option(min=1, help="Of the backend; as many as there are cores.")
-    ] = None,
-    out: options.Out = None,
-    option: options.Option = None,
-) -> None:
-    """Run an episode with model-predictive control: actions are tried in copies of the world.
-
-    Writes the episode, pictures of it and result.json. With --do the planner's model differs from
-    the world.
-    Example: scm-world plan pushing --steps 125 --do tool_block.friction=0.2
-    """
-    from scm_world.policies.planning import CrossEntropy
-    from scm_world.queries import World, save_episode
-    from scm_world.queries.experiments.versions import versions
-
-    believed, happens = parse_assignments(do), parse_assignments(given)
-    numbers = {"samples": samples, "horizon": horizon, "iterations": iterations, "every": every}
-    planner: dict[str, Any] = {
-        **{name: number for name, number in numbers.items() if number is not None},
-        "objective": objective,
-        "backend": model,
-        "seed": seed,
-        "threads": threads,
-    }
-    policy = CrossEntropy(do=believed, **planner)
-    scenes: list[Any] = []
-    milliseconds: list[float] = []
-    with World(load_task(task, option), backend=backend, preset=preset) as world:
-        used, engine = backend_of(world), world.engine
-        folder = console.results_folder(out, "plan", tag(task), used, f"seed{seed}", option=option)
-        length = steps or world.max_episode_length
-        names = [n for n in ("fractional_success", "success", "reward") if n in world.model]
-        with console.progress("control steps") as tell:
-
-            def act(seen: Any) -> Any:
-                if seen.index in {0, length // 2, length - 1}:
-                    scenes.append(seen.scene())
-                began = time.perf_counter()
-                action = policy(seen)
-                milliseconds.append(1e3 * (time.perf_counter() - began))
-                tell(seen.index + 1, length)
-                return action
-
-            episode = world.rollout(act, seed=seed, steps=length, do=happens, record=names)
-        values = {name: np.asarray(episode[name]) for name in names}
-
-    found = {"control steps": float(len(milliseconds))}
-    if "fractional_success" in values:
-        found["fractional success at the end"] = float(values["fractional_success"][-1])
-        found["highest fractional success"] = float(values["fractional_success"].max())
-    if "success" in values:
-        found["success at the end"] = float(values["success"][-1])
-    if "reward" in values:
-        found["return"] = float(values["reward"][1:].sum())
-    found["time per action, median [ms]"] = float(np.median(milliseconds))
-    found["time per action, mean [ms]"] = float(np.mean(milliseconds))
-    made = console.table("what", "value", title=f"{tag(task)} on {engine}, seed {seed}, planned")
-    for name, number in found.items():
-        made.add_row(Text(name), console.show(number))  # not markup: there are brackets in it
-    for name, value in believed.items():
-        made.add_row(f"in the planner's model: {name}", Text(str(value)))
-    console.terminal().print(made)
-    result = {
-        "format": "scm_world/planned/1",
-        "task": task,
-        "backend": used,
-        "preset": preset,
-        "seed": seed,
-        "steps": steps,
-        "planner": planner,
-        "believed": {name: str(value) for name, value in believed.items()},
-        "given": {name: str(value) for name, value in happens.items()},
-        "arguments": option or (),
-        "search": {**asdict(policy.search), "every": policy.every},
-        "found": found,
-        "versions": versions(engine),
-    }
-    with console.staged(folder) as draft:
-        save_episode(episode, draft / "episode.npz")
-        if shown := _pictures(scenes):
-            _write_pictures(draft, {"scenes.png": shown})
-        console.write_json(draft / "result.json", result)
-        files = sorted(path.name for path in draft.iterdir())
-    console.written(*(folder / name for name in files))

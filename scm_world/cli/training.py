@@ -9,70 +9,54 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.text import Text
 
 from scm_world.cli import console, options
 from scm_world.cli.arguments import load_task, parse_assignments, parse_json, split, tag
 from scm_world.errors import ConflictingTargets, UnknownOption
 
-OF_TASK = "what works for the task"
-Folder = Annotated[
-    Path | None,
-    typer.Option(help="Folder for all files.", show_default="under scm-world-results"),
-]
-
 
 def train(
     task: options.System,
-    algo: Annotated[str | None, typer.Option(help="ppo, sac or td3.", show_default="ppo")] = None,
-    curriculum: Annotated[
-        str | None,
-        typer.Option(
-            help="0: nothing varies, 1: goals, 2: everything, or the JSON file of a curriculum.",
-            show_default=OF_TASK,
-        ),
-    ] = None,
-    recipe: Annotated[
-        Path | None, typer.Option(help="JSON file of a recipe.", show_default=OF_TASK)
-    ] = None,
+    algo: options.Text = None,
+    curriculum: options.Text = None,
+    recipe: Path | None = None,
     backend: options.Backend = None,
     seed: options.Seed = 0,
-    steps: Annotated[
-        int | None,
-        typer.Option(help="Control steps, of all worlds together.", show_default="of the recipe"),
-    ] = None,
-    out: Folder = None,
+    steps: int | None = None,
+    out: Path | None = None,
     observations: options.Observations = None,
-    hindsight: Annotated[
-        bool, typer.Option("--hindsight", help="Hindsight replay and sparse rewards (sac, td3).")
-    ] = False,
-    worlds: Annotated[
-        int | None,
-        typer.Option(help="Number of parallel worlds.", show_default="of the recipe"),
-    ] = None,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            help="Of the backend and of torch.", show_default="cores for the backend, 1 for torch"
-        ),
-    ] = None,
+    hindsight: bool = False,
+    worlds: int | None = None,
+    threads: int | None = None,
     changes: options.Changes = None,
-    start: Annotated[Path | None, typer.Option(help="Policy to start from.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    evaluate: Annotated[
-        bool,
-        typer.Option("--evaluate/--no-evaluate", help="Evaluate while training; keep the best."),
-    ] = True,
-    onnx: Annotated[bool, typer.Option("--onnx", help="Write the policy as ONNX, too.")] = False,
-    show: Annotated[
-        bool, typer.Option("--show-recipe", help="Print the recipe as JSON, and do nothing.")
-    ] = False,
+    start: Path | None = None,
+    device: str = "auto",
+    evaluate: Annotated[bool, typer.Option("--evaluate/--no-evaluate")] = True,
+    onnx: bool = False,
+    show: Annotated[bool, typer.Option("--show-recipe")] = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Train an agent; write its policy, its learning curve and checkpoints.
 
     Ctrl-C ends after the present round with a checkpoint (exit code 130); the same command resumes.
     Example: scm-world train reaching --set n_steps=128 --out my-reacher
+
+    Args:
+        algo: ppo (by default), sac or td3.
+        curriculum: 0: nothing varies, 1: goals, 2: everything, or the JSON file of a curriculum;
+            by default what works for the task.
+        recipe: JSON file of a recipe; by default what works for the task.
+        steps: Control steps, of all worlds together; those of the recipe by default.
+        out: Folder for all files; by default under scm-world-results.
+        hindsight: Hindsight replay and sparse rewards (sac, td3).
+        worlds: Number of parallel worlds; that of the recipe by default.
+        threads: Of the backend and of torch; by default as many as there are cores for the
+            backend, and one for torch.
+        start: Policy to start from.
+        device: auto, cpu or cuda.
+        evaluate: Evaluate while training; keep the best.
+        onnx: Write the policy as ONNX, too.
+        show: Print the recipe as JSON, and do nothing.
     """
     from scm_world.training.recipe import Recipe
     from scm_world.training.recipe import recipe as usual
@@ -106,19 +90,17 @@ def train(
     used = backend or load_task(task).backend
     folder: Any = console.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
     if not quiet:
-        _about(
-            f"Training {made.algo.upper()} on {made.task}",
-            {
-                "recipe": made.name,
-                "curriculum": json.dumps(made.curriculum["part"]),
-                "steps": f"{made.steps:,} in {made.worlds} worlds of {used}",
-                "actions": made.env.get("action_mode", "joint_positions"),
-                "observations": made.observations + (", with goals" if made.hindsight else ""),
-                "evaluation": ", ".join(made.trials.protocols) or "none while training",
-                "seed": seed,
-                "folder": folder,
-            },
-        )
+        rows = {
+            "recipe": made.name,
+            "curriculum": json.dumps(made.curriculum["part"]),
+            "steps": f"{made.steps:,} in {made.worlds} worlds of {used}",
+            "actions": made.env.get("action_mode", "joint_positions"),
+            "observations": made.observations + (", with goals" if made.hindsight else ""),
+            "evaluation": ", ".join(made.trials.protocols) or "none while training",
+            "seed": seed,
+            "folder": folder,
+        }
+        console.table(("", ""), rows.items(), title=f"Training {made.algo.upper()} on {made.task}")
     bar = nullcontext() if quiet else console.progress("steps", lines=10)
     with console.resumable(folder, "checkpoints/*.pt", "checkpoints"), bar as tell:
         found = loop.train(
@@ -139,49 +121,40 @@ def train(
         f"evaluate: scm-world evaluate {found.best} {made.task}",
     )
     if onnx:
-        from scm_world.training.onnx import to_onnx
+        from scm_world.training.export import to_onnx
 
         console.say(f"ONNX:     {to_onnx(found.best, found.best.with_suffix('.onnx'))}")
 
 
 def clone(
     task: options.System,
-    source: Annotated[
-        str | None,
-        typer.Option(
-            "--from",
-            help="A policy that sees the whole world, such as grasp; a recording (.parquet), or a "
-            "folder of recordings.",
-            show_default=OF_TASK,
-        ),
-    ] = None,
-    episodes: Annotated[
-        int | None, typer.Option(help="Demonstrations of the teacher.", show_default=OF_TASK)
-    ] = None,
-    protocols: Annotated[
-        str | None,
-        typer.Option(help="What varies in them: names with commas.", show_default=OF_TASK),
-    ] = None,
-    noise: Annotated[
-        float | None,
-        typer.Option(help="Largest noise of actions in them.", show_default=OF_TASK),
-    ] = None,
-    rounds: Annotated[
-        int | None,
-        typer.Option(help="Further rounds, in which the network acts, too.", show_default=OF_TASK),
-    ] = None,
+    source: Annotated[str | None, typer.Option("--from")] = None,
+    episodes: int | None = None,
+    protocols: options.Text = None,
+    noise: float | None = None,
+    rounds: int | None = None,
     observations: options.Observations = None,
     backend: options.Backend = None,
     seed: options.Seed = 0,
-    out: Folder = None,
+    out: Path | None = None,
     changes: options.Changes = None,
     quiet: options.Quiet = False,
 ) -> None:
     """Train a network by imitation of a scripted policy, or of recordings.
 
     Episodes that end well are learned from. After an interruption the same command resumes.
-    'scm-world evaluate' takes the policy, and 'scm-world train --start' starts from it.
+    'scm-world evaluate' takes the policy, and 'scm-world train --start' starts from it. What is
+    not given is what works for the task.
     Example: scm-world clone picking --episodes 200 --out my-picker
+
+    Args:
+        source: A policy that sees the whole world, such as grasp; a recording (.parquet), or a
+            folder of recordings.
+        episodes: Demonstrations of the teacher.
+        protocols: What varies in them: names with commas.
+        noise: Largest noise of actions in them.
+        rounds: Further rounds, in which the network acts, too.
+        out: Folder for all files; by default under scm-world-results.
     """
     from scm_world.policies.cards import COMMON, FORM
     from scm_world.policies.scripted import NAMED
@@ -211,7 +184,7 @@ def clone(
             rows["noise"] = f"up to {made.noise:g} of the largest action"
             rows["rounds"] = f"{made.rounds} more, of {made.more} episodes"
         rows |= {"observations": made.observations, "seed": str(seed), "folder": str(folder)}
-        _about(f"Learning {made.task} by imitation", rows)
+        console.table(("", ""), rows.items(), title=f"Learning {made.task} by imitation")
     bar = nullcontext() if quiet else console.progress("episodes")
     with console.resumable(folder, "demonstrations/*.npz", "files of episodes"), bar as tell:
         found = imitation.clone(
@@ -249,12 +222,3 @@ def _fields(changes: list[str] | None, **given: Any) -> dict[str, Any]:
         if name in found:
             raise ConflictingTargets((f"--{name}", f"--set {name}"), name)
     return {**found, **given}
-
-
-def _about(title: str, rows: dict[str, Any]) -> None:
-    """Print what will be done."""
-    shown = console.table("", "", title=title)
-    shown.show_header = False
-    for name, value in rows.items():
-        shown.add_row(name, Text(str(value)))
-    console.terminal().print(shown)

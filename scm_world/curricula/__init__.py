@@ -13,12 +13,23 @@ A curriculum is a sentence::
 """
 
 from scm_world.curricula.agents import InterveningAgent
-from scm_world.curricula.base import Do, Part
-from scm_world.curricula.choices import in_turn, stages, together, weighted
+from scm_world.curricula.base import Do, Memory, Part, Situation
+from scm_world.curricula.combinations import (
+    at_reset,
+    at_step,
+    during,
+    every,
+    in_turn,
+    stages,
+    together,
+    weighted,
+)
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.curricula.moves import Follow, Interpolate
-from scm_world.curricula.parts import Goal, Resample
-from scm_world.curricula.phrases import (
+from scm_world.curricula.parts import (
+    Follow,
+    Goal,
+    Interpolate,
+    Resample,
     everything,
     follow,
     goals,
@@ -30,11 +41,8 @@ from scm_world.curricula.phrases import (
     resample,
 )
 from scm_world.curricula.published import ACTORS, active, published_actor, published_curriculum
-from scm_world.curricula.runner import CurriculumRunner
-from scm_world.curricula.situations import Memory, Situation
-from scm_world.curricula.times import at_reset, at_step, during, every
 from scm_world.curricula.vector import CurriculumVectorEnv, make_vec
-from scm_world.curricula.wrapper import CurriculumEnv
+from scm_world.curricula.wrapper import CurriculumEnv, CurriculumRunner
 from scm_world.variables import AB, A, B, Subset
 
 __all__ = [

@@ -14,7 +14,7 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.curricula.base import words
 from scm_world.curricula.targets import matching
-from scm_world.curricula.wrapper import environment
+from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.variables import Box, Integers, Subset
 from scm_world.variables.kinds import SpaceName, Variable
@@ -72,7 +72,7 @@ class InterveningAgent(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
         data = region.model_dump(mode="json") if isinstance(region, Subset) else region
         RecordConstructorArgs.__init__(self, what=patterns, space=data, most=most, flat=flat)
         super().__init__(env)
-        self._inner = environment(env, "InterveningAgent")
+        self._inner = unwrapped_env(env, "InterveningAgent")
         if not isinstance(env.action_space, gymnasium.spaces.Box):
             allowed = ("one with actions in a box",)
             raise UnknownOption("environment for InterveningAgent", str(env), allowed)

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.curricula.base import AnyPart, as_part, read_from
-from scm_world.curricula.choices import Stages
-from scm_world.curricula.times import AtStep, Every
+from scm_world.curricula.combinations import AtStep, Every, Stages
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.output.reading import read_text
 from scm_world.tasks.rewards import SUCCESS
@@ -159,12 +158,6 @@ class Curriculum(Frozen):
             or step in steps
             or any(step >= first and (step - first) % period == 0 for first, period in series)
         )
-
-    @property
-    def steps_matter(self) -> bool:
-        """Whether it may act after the reset."""
-        steps, series = self._times
-        return bool(series) or max(steps, default=0) > 0
 
 
 def as_curriculum(given: Any) -> Curriculum:

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import one_of
 from scm_world.curricula.base import Do, Part
-from scm_world.curricula.choices import together
+from scm_world.curricula.combinations import AtStep, During, together
 from scm_world.curricula.parts import Goal, Resample
-from scm_world.curricula.times import AtStep, During
 from scm_world.errors import UnknownOption
 from scm_world.variables.kinds import SPACES, SpaceName
 
@@ -57,8 +57,7 @@ def published_actor(
         >>> published_actor("visual_actor", space="A").what
         ('*color',)
     """
-    if space not in SPACES:
-        raise UnknownOption("space", space, SPACES)
+    one_of("space", space, SPACES)
     match name:
         case "base_actor":
             return Do({})
@@ -67,8 +66,7 @@ def published_actor(
         case "joints_actor":
             return Resample("@joints", space=space)
         case "physical_properties_actor":
-            if group not in _PROPERTIES:
-                raise UnknownOption("group", group, _PROPERTIES)
+            one_of("group", group, _PROPERTIES)
             return Resample(_PROPERTIES[group], space=space)
         case "random_actor":
             return Resample(ALL, space=space, exclusive=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -60,7 +60,7 @@ def matching(declaration: CompiledTask, patterns: Iterable[str]) -> tuple[str, .
         if pattern.startswith("@"):
             if pattern[1:] not in GROUPS:
                 raise UnknownVariable(pattern, [f"@{group}" for group in GROUPS])
-            found.update(dict.fromkeys(GROUPS[pattern[1:]](declaration)))
+            found.update(dict.fromkeys(grouped(declaration, pattern[1:])))
             continue
         fits = [name for name in names if fnmatchcase(name, pattern)]
         if not fits:
@@ -97,73 +97,61 @@ def _like(name: str, patterns: Iterable[str]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def _looks(declaration: CompiledTask) -> list[str]:
-    return [v.name for v in _spaced(declaration) if _like(v.name, LOOKS)]
+def grouped(declaration: CompiledTask, group: str) -> list[str]:
+    """List the variables that a group stands for.
 
+    ``physics`` changes how bodies move, and neither where they begin nor how large they are.
+    ``published`` is what the predecessor's random actor draws: never the joints. There a size that
+    follows another variable is drawn through that one, so that block and goal stay alike; so are
+    masses. Where variables decide how many blocks there are, the blocks begin where the task puts
+    them: dozens of them are never drawn apart.
 
-def _poses(declaration: CompiledTask) -> list[str]:
-    return [
-        v.name
-        for v in _spaced(declaration)
-        if v.name.partition(".")[0] in declaration.composition.blocks
-        and v.name.partition(".")[2] in POSE
-    ]
-
-
-def _joints(declaration: CompiledTask) -> list[str]:
-    return ["joint_positions"]
-
-
-def _goals(declaration: CompiledTask) -> list[str]:
-    return [name for name in declaration.task.goal_causes if name in declaration.model]
-
-
-def _physics(declaration: CompiledTask) -> list[str]:
-    """List what changes how bodies move, and neither where they begin nor how large they are."""
-    others = {*_looks(declaration), *_poses(declaration), *_goals(declaration), "joint_positions"}
-    model = declaration.model
-    return [
-        v.name
-        for v in _spaced(declaration)
-        if v.name not in others
-        and v.name != PRESET
-        and v.dtype == "real"
-        and model.declared(model.target(v.name)).role == "parameter"
-        and (v.unit != "m" or v.name.endswith("friction"))
-        and not _like(v.name, (*PLACES, "*euler_orientation", "goal_*", "sensor_noise"))
-    ] + [name for name in ("blocks_mass",) if name in model]
-
-
-def _everything(declaration: CompiledTask) -> list[str]:
-    return [v.name for v in _spaced(declaration) if v.name != PRESET]
-
-
-def _published(declaration: CompiledTask) -> list[str]:
-    """List what the predecessor's random actor draws: never the joints.
-
-    A size that follows another variable is drawn through that one, so that block and goal stay
-    alike; so are masses. Where variables decide how many blocks there are, the blocks begin where
-    the task puts them: dozens of them are never drawn apart.
+    Args:
+        declaration: Of the structure that there is.
+        group: One of ``GROUPS``.
     """
+    model, task = declaration.model, declaration.task
+    spaced = [v for v in _spaced(declaration) if v.name != PRESET]
+    blocks = declaration.composition.blocks
+    looks = [v.name for v in spaced if _like(v.name, LOOKS)]
+    poses = [
+        v.name
+        for v in spaced
+        if v.name.partition(".")[0] in blocks and v.name.partition(".")[2] in POSE
+    ]
+    goals = [name for name in task.goal_causes if name in model]
+    match group:
+        case "everything":
+            return [v.name for v in spaced]
+        case "goals":
+            return goals
+        case "joints":
+            return ["joint_positions"]
+        case "looks":
+            return looks
+        case "poses":
+            return poses
+        case "physics":
+            others = {*looks, *poses, *goals, "joint_positions"}
+            return [
+                v.name
+                for v in spaced
+                if v.name not in others
+                and v.dtype == "real"
+                and model.declared(model.target(v.name)).role == "parameter"
+                and (v.unit != "m" or v.name.endswith("friction"))
+                and not _like(v.name, (*PLACES, "*euler_orientation", "goal_*", "sensor_noise"))
+            ] + [name for name in ("blocks_mass",) if name in model]
     found = []
-    task = declaration.task
-    placed = _poses(declaration) if task.decided_by and declaration.composition.blocks else ()
-    for v in _spaced(declaration):
+    placed = poses if task.decided_by and blocks else ()
+    for v in spaced:
         entity, _, quantity = v.name.rpartition(".")
         is_ours = v.name in placed or _like(v.name, OURS) or (entity == "" and v.role == "state")
-        if not is_ours and v.name != PRESET and (quantity in QUANTITIES or not entity):
+        if not is_ours and (quantity in QUANTITIES or not entity):
             found.append(v.name)
-    goals = [n for n in settable(declaration) if _like(n, ("goal_*.cylindrical_position",))]
-    return list(dict.fromkeys(found + [n for n in goals if declaration.model.declared(n).a]))
+    desired = [n for n in settable(declaration) if _like(n, ("goal_*.cylindrical_position",))]
+    return list(dict.fromkeys(found + [n for n in desired if model.declared(n).a]))
 
 
-GROUPS: Mapping[str, Callable[[CompiledTask], list[str]]] = {
-    "everything": _everything,
-    "goals": _goals,
-    "joints": _joints,
-    "looks": _looks,
-    "physics": _physics,
-    "poses": _poses,
-    "published": _published,
-}
+GROUPS = ("everything", "goals", "joints", "looks", "physics", "poses", "published")
 """The words that stand for variables."""

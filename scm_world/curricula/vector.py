@@ -9,28 +9,20 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import VectorizeMode
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorWrapper
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
-from scm_world.curricula.choices import count
+from scm_world._arguments import one_of, whole_number
+from scm_world.curricula.base import Memory
+from scm_world.curricula.combinations import count
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.curricula.executor import CurriculumExecutor
-from scm_world.curricula.members import Member
-from scm_world.curricula.situations import Memory
 from scm_world.curricula.wrapper import CurriculumEnv, place
-from scm_world.env import IDS, MODEL_ID
-from scm_world.env.batched.executor import fastest
+from scm_world.env import ScmWorldEnv
+from scm_world.env.batched.vector_env import EXECUTORS
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.tasks import Task
 
-NATIVE, PROCESSES, LOOP = "native", "processes", "loop"
 SUCCESS = "is_success"
-MODES = (NATIVE, PROCESSES, LOOP, "sync", "async")
-
 _TIME_LIMIT = "max_episode_steps"
-_OF_MAKE = (_TIME_LIMIT, "disable_env_checker")
-"""Options of ``gymnasium.make`` that are about its wrappers."""
 
 
 def make_vec(
@@ -50,15 +42,14 @@ def make_vec(
         curriculum: What is done in each of them; see ``CurriculumEnv``.
         vectorization_mode: ``"native"``: many in one call of the engine; ``"processes"``:
             several in each of some processes; ``"loop"``: in this process, one after another;
-            ``"sync"``, ``"async"``: Gymnasium's own, each in this process or in one of its own;
-            None: native where the engine has it, else sync. What comes out does not depend on it.
+            None: the fastest that there is. What comes out does not depend on it.
         autoreset_mode: When a member that is done begins anew, as in Gymnasium.
         options: Of the environments; ``threads`` with ``"native"``, ``workers`` with
             ``"processes"``.
 
     Raises:
         UnknownOption: There is no such mode, the number is none, or ``max_episode_steps`` is
-            given with ``"native"``, which has ``max_episode_length``.
+            given: these environments have ``max_episode_length``.
 
     Example:
         >>> envs = make_vec("scm_world/Pushing-v0", 2, {"floor_friction": 0.4}, backend="fake")
@@ -66,50 +57,47 @@ def make_vec(
         (2, 56)
         >>> envs.close()
     """
-    mode = vectorization_mode or (NATIVE if _has_native(env_id, options) else "sync")
-    if mode not in MODES:
-        raise UnknownOption("vectorization_mode", mode, MODES)
-    n = whole_number("num_envs", num_envs, least=1)
+    one_of("vectorization_mode", vectorization_mode, (None, *EXECUTORS))
+    if options.pop(_TIME_LIMIT, None) is not None:
+        raise UnknownOption(_TIME_LIMIT, "a number", ("max_episode_length=…",))
+    options.pop("disable_env_checker", None)  # of single environments
     made = as_curriculum(curriculum)
-    if mode in (NATIVE, PROCESSES, LOOP):
-        return CurriculumVectorEnv(_make(env_id, n, made, autoreset_mode, mode, options), made)
-    one = partial(_one, env_id, made, options)
-    kind: Any = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
-    return CurriculumVectorEnv(kind([one] * n, autoreset_mode=autoreset_mode), made)
-
-
-def _has_native(env_id: str, options: Mapping[str, Any]) -> bool:
-    """Tell whether the engine steps many worlds in one call, and nothing needs single ones."""
-    usual = getattr(options.get("model"), "backend", Task.backend)
-    kind = fastest(str(options.get("backend") or usual), 1, workers=None)
-    return kind == NATIVE and env_id in (*IDS, MODEL_ID) and options.get(_TIME_LIMIT) is None
-
-
-def _make(
-    env_id: str,
-    n: int,
-    curriculum: Curriculum,
-    mode: AutoresetMode,
-    executor: str,
-    options: Mapping[str, Any],
-) -> Any:
-    if options.get(_TIME_LIMIT) is not None:
-        allowed = ("max_episode_length=…", "vectorization_mode='sync'")
-        raise UnknownOption(f"{_TIME_LIMIT} with {executor!r}", options[_TIME_LIMIT], allowed)
-    own = {name: value for name, value in options.items() if name not in _OF_MAKE}
-    if executor != NATIVE:
-        own["member"] = partial(Member.of, curriculum)
-    kind = VectorizeMode.VECTOR_ENTRY_POINT
     envs: Any = gymnasium.make_vec(
-        env_id, n, vectorization_mode=kind, autoreset_mode=mode, executor=executor, **own
+        env_id,
+        whole_number("num_envs", num_envs, least=1),
+        vectorization_mode=VectorizeMode.VECTOR_ENTRY_POINT,
+        autoreset_mode=autoreset_mode,
+        executor=vectorization_mode,
+        member=partial(_member, made),
+        **options,
     )
-    if executor == NATIVE:
-        envs.executor = CurriculumExecutor(envs.executor, curriculum)
-    return envs
+    return CurriculumVectorEnv(envs, made)
 
 
-def _one(env_id: str, curriculum: Curriculum, options: dict[str, Any]) -> CurriculumEnv:
-    return CurriculumEnv(gymnasium.make(env_id, **options), curriculum)
+def _member(curriculum: Curriculum, **options: Any) -> Member:
+    return Member(CurriculumEnv(ScmWorldEnv(**options), curriculum))
+
+
+@final
+class Member:
+    """Does what a ``ScmWorldEnv`` does, with the curriculum at its resets and steps.
+
+    Args:
+        env: Around the environment itself.
+    """
+
+    def __init__(self, env: CurriculumEnv) -> None:
+        self._env = env
+        self._inner: Any = env.unwrapped
+        self.reset, self.step, self.stepped, self.act = env.reset, env.step, env.stepped, env.act
+        self.get_wrapper_attr, self.set_wrapper_attr = env.get_wrapper_attr, env.set_wrapper_attr
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inner, name)
+
+    def sibling(self) -> Member:
+        """Make another one like it; they share what is declared."""
+        return Member(CurriculumEnv(self._inner.sibling(), self._env.curriculum))
 
 
 @final
@@ -124,8 +112,7 @@ class CurriculumVectorEnv(VectorWrapper):
     one began, and its stage is the one of before.
 
     Args:
-        env: A vector environment whose members are each in a ``CurriculumEnv``, or are in a
-            ``CurriculumExecutor``.
+        env: A vector environment whose members are each in a ``CurriculumEnv``.
         curriculum: The same as theirs.
 
     Raises:

@@ -1,37 +1,144 @@
-"""A curriculum for one environment."""
+"""What runs a curriculum: it counts episodes, remembers successes, and intervenes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any, final
 
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
 from scm_world._arguments import whole_number
+from scm_world._types import Value
+from scm_world.curricula.base import Acts, Memory, Situation
+from scm_world.curricula.combinations import count
 from scm_world.curricula.curriculum import Curriculum, as_curriculum
-from scm_world.curricula.runner import CurriculumRunner
-from scm_world.curricula.situations import Memory
+from scm_world.curricula.parts import Interpolate
 from scm_world.env import ScmWorldEnv
+from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import flatten
 from scm_world.world import World
 
 
-def environment(env: Any, wrapper: str) -> ScmWorldEnv:
-    """Give the environment of this package inside of wrappers.
+@final
+class CurriculumRunner:
+    """A curriculum at work.
 
     Args:
-        env: In any wrappers.
-        wrapper: Who asks, for the error.
+        curriculum: What is done.
+        memory: Where it goes on; at the beginning if None.
 
-    Raises:
-        UnknownOption: There is another one.
+    Attributes:
+        curriculum: What is done.
+        memory: The state that decides how it goes on.
     """
-    inner = env.unwrapped
-    if not isinstance(inner, ScmWorldEnv):
-        raise UnknownOption(f"environment for {wrapper}", type(inner).__name__, ("ScmWorldEnv",))
-    return inner
+
+    def __init__(self, curriculum: Any, memory: Memory | None = None) -> None:
+        self.curriculum: Curriculum = as_curriculum(curriculum)
+        self.memory = Memory() if memory is None else memory
+        self._besides: frozenset[str] = frozenset()
+        self._initial: dict[str, Value] = {}
+        self._last = 0
+        parts = self.curriculum.part.walk()
+        self._moved = [
+            name for part in parts if isinstance(part, Interpolate) for name in part.stop
+        ]
+
+    def begin(
+        self, env: ScmWorldEnv, episode: int | None = None, *, besides: Iterable[str] = ()
+    ) -> bool:
+        """Do what is due at a reset, just after it.
+
+        Args:
+            env: At the beginning of an episode.
+            episode: Its number; as many as have ended if None.
+            besides: Variables that are left as they are in this episode, in whatever coordinates.
+
+        Returns:
+            Whether anything was done.
+
+        Raises:
+            InterventionError: It was refused; nothing has changed.
+        """
+        if episode is not None:
+            self.memory.episode = episode
+        self._besides, self._last = frozenset(besides), 0
+        world = env.world
+        self._initial = {name: world[name] for name in self._moved if name in world.model}
+        return self._act(env, 0)
+
+    def may_act(self, step: int) -> bool:
+        """Tell whether anything may be due after so many control steps of the episode."""
+        return self.curriculum.may_act(step)
+
+    def step(self, env: ScmWorldEnv) -> bool:
+        """Do what is due after a control step; tell whether that was anything.
+
+        Where several control steps have passed, what was due in between is done now.
+
+        Raises:
+            InterventionError: It was refused; nothing has changed.
+        """
+        now = env.world.index
+        steps = range(self._last + 1, now + 1) if now > self._last else (now,)
+        self._last = now
+        acted = [self.curriculum.may_act(step) and self._act(env, step) for step in steps]
+        return any(acted)
+
+    def ended(self, *, success: bool) -> None:
+        """Take an episode into account that has ended, and count it."""
+        count(
+            self.curriculum.part.live(self.memory, self.memory.episode),
+            self.memory,
+            success=success,
+        )
+        self.memory.episode += 1
+
+    def _act(self, env: ScmWorldEnv, step: int) -> bool:
+        """Intervene; first on what decides which bodies there are, for others have their names."""
+        besides = self._besides
+        head = frozenset(env.world.structures.head)
+        space = self.curriculum.space
+        first = self._asked(env.world, step, besides, head) if head else {}
+        if not first:
+            acts = self._asked(env.world, step, besides)
+            if acts:
+                env.do(acts, space=space)
+            return bool(acts)
+        before = env.snapshot()
+        env.do(first, space=space)
+        try:
+            rest = self._asked(env.world, step, besides | head)
+            if rest:
+                env.do(rest, space=space)
+        except BaseException:
+            env.restore(before)
+            raise
+        return True
+
+    def _asked(
+        self,
+        world: World,
+        step: int,
+        besides: frozenset[str],
+        first: frozenset[str] | None = None,
+    ) -> Acts:
+        memory, model = self.memory, world.model
+        situation = Situation(world, memory.episode, step, memory, due=step == 0, first=first)
+        situation = replace(situation, initial=self._initial)
+        acts = self.curriculum.part.acts(situation)
+        if first is not None:
+            acts = {name: act for name, act in acts.items() if name in first}
+
+        def targets(name: str) -> tuple[str, ...]:
+            return model.targets(name) if name in model else (name,)
+
+        taken = {target for name in besides for target in targets(name)}
+        return {
+            name: act for name, act in acts.items() if not taken or taken.isdisjoint(targets(name))
+        }
 
 
 @final
@@ -69,7 +176,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         made = as_curriculum(curriculum)
         RecordConstructorArgs.__init__(self, curriculum=_plain(made))
         super().__init__(env)
-        self._inner = environment(env, "CurriculumEnv")
+        self._inner = unwrapped_env(env, "CurriculumEnv")
         _refuse_forgetful(self._layers())
         self._checked = is_checked(made, self._inner.world)
         self._turn = CurriculumRunner(made)
@@ -162,14 +269,13 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             seed, number = self._place
             options = {"episode": number, **(options or {})}
         observation, info = self.env.reset(seed=seed, options=options)
-        self._next = self._place = None
-        self._begun = True
         if not self._checked:
             self.curriculum.check(self._inner.world)
             self._checked = True
         if self._turn.begin(self._inner, besides=flatten((options or {}).get("do") or {})):
             observation, info = self._seen(info)
-        self._running = True
+        self._next = self._place = None
+        self._begun = self._running = True
         return observation, info
 
     def _close(self) -> None:
@@ -187,14 +293,24 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             InterventionError: An intervention was refused; the control step is over.
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._stepped, self._success = True, bool(info.get("is_success"))
-        if terminated or truncated:
-            self._close()
-        elif self._turn.step(self._inner):
+        over, success = terminated or truncated, bool(info.get("is_success"))
+        self.stepped(self._inner.world.index, over=over, success=success)
+        if not over and self.act():
             terms = info["reward_terms"]  # of the step: an intervention earns nothing
             observation, info = self._seen(info)
             info["reward_terms"] = terms
         return observation, reward, terminated, truncated, info
+
+    def stepped(self, step: int, *, over: bool, success: bool) -> bool:
+        """Note a control step; tell whether the curriculum may act after it."""
+        self._stepped, self._success = True, success
+        if over:
+            self._close()
+        return not over and self._turn.may_act(step)
+
+    def act(self) -> bool:
+        """Do what is due; tell whether that was anything."""
+        return self._turn.step(self._inner)
 
     def _seen(self, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Look again, through the wrappers inside of this one."""

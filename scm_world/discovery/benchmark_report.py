@@ -18,8 +18,8 @@ from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.problems import GroundTruth
 from scm_world.output.canvas import PALETTE, blank, save, small_png, styled
 from scm_world.output.durable import write_whole
-from scm_world.output.locations import Location
 from scm_world.output.pages import Entry, render
+from scm_world.output.remote import Location
 from scm_world.queries.experiments.effects import EdgeKey
 
 if TYPE_CHECKING:

@@ -37,8 +37,8 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.output.durable import is_draft, locked, made, write_whole
-from scm_world.output.locations import Location, located
 from scm_world.output.reading import read_bytes, read_text
+from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress

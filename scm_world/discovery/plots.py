@@ -22,7 +22,7 @@ from scm_world.graph.exchange.html import (
     routes_of,
 )
 from scm_world.output.canvas import DPI, FAINT, INK, WIDTH, blank, save
-from scm_world.output.locations import Location
+from scm_world.output.remote import Location
 from scm_world.queries.agreement import FACTORS, Agreement
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.verification import Verification, arrow

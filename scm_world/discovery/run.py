@@ -13,8 +13,8 @@ from scm_world.discovery.metrics import GraphScore, score
 from scm_world.errors import DAMAGED, UnreadableFile
 from scm_world.graph import SCM
 from scm_world.output.durable import made, removed, write_durably, write_whole
-from scm_world.output.locations import Location, located
 from scm_world.output.reading import read_text
+from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.env.vector import box
 from scm_world.errors import UnknownOption
@@ -33,8 +34,7 @@ def checked_mode(mode: Any, task: Task | StructureCache) -> str:
     allowed = (*modes, *(PREFIX + one for one in modes))
     if mode is None:
         return modes[0]
-    if mode not in allowed:
-        raise UnknownOption("action_mode", mode, allowed)
+    one_of("action_mode", mode, allowed)
     return str(mode)
 
 
@@ -75,8 +75,19 @@ class Delta:
         self._world, self._middle, self._half = world, middle, half
         low, high = world.action_low, world.action_high
         self._low, self._high = (low - middle) / half, (high - middle) / half
-        self._gain, self._reach = _steps(self._low, self._high, scale, middle, half)
-        self.reads = _read(world.action_mode, origin)
+        share = scale if isinstance(scale, int | float) else math.nan
+        if not 0.0 < share <= 1.0:
+            raise UnknownOption("delta_scale", scale, ("a number in (0, 1]",))
+        one_of("delta_origin", origin, ORIGINS)
+        # Normalized actions fill [-1, 1] whatever the scale is; others keep their unit.
+        normalized = bool(np.any(half != 1.0) or np.any(middle != 0.0))
+        reach = (self._high - self._low) / 2.0
+        self._gain, self._reach = (share, reach) if normalized else (1.0, share * reach)
+        mode = world.action_mode
+        self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
+        if self.reads not in (None, TIPS, JOINTS):
+            allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
+            raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, (allowed,))
         self._version = self._fresh = -1
 
     def space(self) -> gymnasium.Space[NDArray[np.float32]]:
@@ -129,65 +140,3 @@ class Delta:
             set_now = base and (base.at_start or any(j in base.pending for j in joints))
             self._fresh = world.index if set_now else -1
         return self._fresh == world.index
-
-
-def delta_for(mode: str, world: World, *given: Floats, scale: float, origin: str) -> Delta | None:
-    """Make what turns the actions of a mode into absolute ones, if they are relative.
-
-    Args:
-        mode: One of ``MODES``.
-        world: That takes the actions.
-        given: What absolute actions of 0 and 1 stand for; see ``Delta``.
-        scale: See ``Delta``.
-        origin: Likewise.
-
-    Raises:
-        UnknownOption: See ``Delta``; or actions are absolute, and the options mean nothing.
-    """
-    if mode.startswith(PREFIX):
-        return Delta(world, *given, scale=scale, origin=origin)
-    options = {"delta_scale": (scale, 1.0), "delta_origin": (origin, COMMAND)}
-    for name, (value, usual) in options.items():
-        if value != usual:
-            allowed = f"{usual!r}, or an action_mode that begins with {PREFIX!r}"
-            raise UnknownOption(f"{name} of {mode}", value, (allowed,))
-    return None
-
-
-def _steps(
-    low: Floats, high: Floats, scale: float, middle: Floats, half: Floats
-) -> tuple[float, Floats]:
-    """Work out what an action of 1 adds to an absolute one, and how large actions can be.
-
-    Normalized actions fill [-1, 1] whatever the scale is; others keep their unit.
-    """
-    number = _share("delta_scale", scale)
-    normalized = bool(np.any(half != 1.0) or np.any(middle != 0.0))
-    reach = (high - low) / 2.0
-    return (number, reach) if normalized else (1.0, number * reach)
-
-
-def _read(mode: str, origin: str) -> str | None:
-    """Name the variable that actions of a mode are relative to."""
-    if origin not in ORIGINS:
-        raise UnknownOption("delta_origin", origin, ORIGINS)
-    if mode == TIPS:
-        return TIPS
-    if origin == COMMAND:
-        return None
-    if mode != JOINTS:
-        allowed = f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}"
-        raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, (allowed,))
-    return JOINTS
-
-
-def _share(name: str, share: Any) -> float:
-    """Check that an option is a share of something.
-
-    Raises:
-        UnknownOption: It is no number in (0, 1].
-    """
-    number = share if isinstance(share, int | float) else math.nan
-    if not 0.0 < number <= 1.0:
-        raise UnknownOption(name, share, ("a number in (0, 1]",))
-    return float(number)

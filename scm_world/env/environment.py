@@ -3,26 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Values
-from scm_world.backends import Backend
+from scm_world.env.arguments import (
+    action_scale,
+    asked,
+    begin,
+    beginning_structure,
+    doubles,
+    finite,
+    made_task,
+    names_of,
+)
 from scm_world.env.copies import Copied
-from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode, delta_for
-from scm_world.env.given import action_scale, doubles, finite, made_task, names_of
-from scm_world.env.goals import GoalReward, Goals, reward_scale
-from scm_world.env.looks import Looks
-from scm_world.env.observer import Observation, Observer, Observing, observer
-from scm_world.env.start import asked, begin, beginning_structure
+from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
+from scm_world.env.observer import (
+    Goals,
+    Observation,
+    Observer,
+    Observing,
+    goal_reward,
+    observer,
+    reward_scale,
+)
+from scm_world.env.rendering import Looks, Window
 from scm_world.env.vector import box
-from scm_world.env.window import Window
 from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.clipping import scaled_clip_kernel
 from scm_world.graph import flatten
@@ -44,22 +56,6 @@ _NO_REWARD = (
     "reward=(function, 'hinge.position', …): a function and the names of what it is given"
 )
 _RESETS = ("do", "episode")
-
-
-@final
-@dataclass(frozen=True)
-class Counted:
-    """Which of the variables that count a structure has.
-
-    Attributes:
-        success: Whether it says if the task is solved.
-        fraction: Whether it says to which part.
-        terminated: Whether it says if the episode ends.
-    """
-
-    success: bool
-    fraction: bool
-    terminated: bool
 
 
 class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -111,8 +107,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             the beginning of the next episode.
         variables_space: The space in which every target of an intervention must lie: ``"A"``,
             ``"B"``, ``"A|B"``, a ``Subset``, or the patterns and regions of one.
-        info_contacts: Whether ``info["contacts"]`` lists what touches.
-        info_state: Whether ``info["state"]`` has the values of all variables.
         max_episode_length: In control steps; the task's own if None.
         conventions: ``"scm_world"`` or ``"causal_world"``.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
@@ -162,8 +156,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         random_goal: SpaceName | None = None,
         attempts: int = 1,
         variables_space: AnyRegion | Mapping[str, Any] | None = None,
-        info_contacts: bool = False,
-        info_state: bool = False,
         max_episode_length: int | None = None,
         conventions: str = "scm_world",
         render_mode: str | None = None,
@@ -200,57 +192,51 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             self.world.close()
             raise ModelError([_NO_REWARD.format(self.world.task.name)])
         self._modes = (observation_mode, mode)
-        self._rich = (info_contacts, info_state)
-        self._begin_with(start, random_goal, attempts)
-        self._open(render_mode)
-        self._act(normalize_actions, mode, {"scale": delta_scale, "origin": delta_origin})
-        extra = int(self.world.conventions.extra_step)
-        self.limit = self.world.max_episode_length + extra
+        one_of("random_goal", random_goal, (None, *SPACES))
+        self._start, self._random_goal = asked(start), random_goal
+        self._attempts = whole_number("attempts", attempts, least=1)
+        one_of("render_mode", render_mode, (None, *RENDER_MODES))
+        self.render_mode = render_mode
+        self._window = Window() if render_mode == "human" else None
+        modes = [one for one in RENDER_MODES if one != "human" or Window.is_possible()]
+        fps = round(1 / self.world.control_period)
+        self.metadata = {**type(self).metadata, "render_modes": modes, "render_fps": fps}
+
+        # What an action means; what has no two bounds keeps its unit.
+        low, high = self.world.action_low, self.world.action_high
+        self._middle, self._half = np.zeros(low.size), np.ones(low.size)
+        bounds = (low, high)
+        if normalize_actions:
+            self._middle, self._half = action_scale(self.world)
+            scaled = np.isfinite(low) & np.isfinite(high) & (low < high)
+            bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
+        self._delta = None
+        if mode.startswith(PREFIX):
+            how = {"scale": delta_scale, "origin": delta_origin}
+            self._delta = Delta(self.world, self._middle, self._half, **how)  # type: ignore[arg-type]
+        else:
+            for option, value, usual in (
+                ("delta_scale", delta_scale, 1.0),
+                ("delta_origin", delta_origin, COMMAND),
+            ):
+                if value != usual:
+                    allowed = f"{usual!r}, or an action_mode that begins with {PREFIX!r}"
+                    raise UnknownOption(f"{option} of {mode}", value, (allowed,))
+        self._given = np.empty(low.size)
+        self._range = (self._middle, self._half, low, high)
+        self.action_space = self._delta.space() if self._delta else box(*bounds)
+
+        self.limit = self.world.max_episode_length + int(self.world.conventions.extra_step)
         self._scale = reward_scale(self.world)
         self._terms = tuple(self.world.task.weights)
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
         self._observers: WeakKeyDictionary[
-            CompiledTask, tuple[Observer, Goals | None, Counted, tuple[str, ...]]
+            CompiledTask, tuple[Observer, Goals | None, frozenset[str], tuple[str, ...]]
         ] = WeakKeyDictionary()
         self._arrange(beginning_structure(self.world, self._start))
         if goal_env:
-            self.compute_reward = GoalReward(self.world)
-
-    def _open(self, render_mode: str | None) -> None:
-        """Choose how pictures are shown."""
-        if render_mode not in (None, *RENDER_MODES):
-            raise UnknownOption("render_mode", render_mode, RENDER_MODES)
-        self.render_mode = render_mode
-        self._window = Window() if render_mode == "human" else None
-        modes = [mode for mode in RENDER_MODES if mode != "human" or Window.is_possible()]
-        self.metadata = {
-            **type(self).metadata,
-            "render_modes": modes,
-            "render_fps": round(1 / self.world.control_period),
-        }
-
-    def _begin_with(
-        self, start: Mapping[str, Any] | None, random_goal: str | None, attempts: int
-    ) -> None:
-        if random_goal not in (None, *SPACES):
-            raise UnknownOption("random_goal", random_goal, SPACES)
-        self._start, self._random_goal = asked(start), random_goal
-        self._attempts = whole_number("attempts", attempts, least=1)
-
-    def _act(self, normalize: bool, mode: str, steps: Mapping[str, Any]) -> None:
-        """Choose what an action means; what has no two bounds keeps its unit."""
-        low, high = self.world.action_low, self.world.action_high
-        self._middle, self._half = np.zeros(low.size), np.ones(low.size)
-        bounds = (low, high)
-        if normalize:
-            self._middle, self._half = action_scale(self.world)
-            scaled = np.isfinite(low) & np.isfinite(high) & (low < high)
-            bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
-        self._delta = delta_for(mode, self.world, self._middle, self._half, **steps)
-        self._given = np.empty(low.size)
-        self._range = (self._middle, self._half, low, high)
-        self.action_space = self._delta.space() if self._delta else box(*bounds)
+            self.compute_reward = goal_reward(self.world)
 
     def relative(self) -> Delta:
         """Give what makes relative actions absolute."""
@@ -273,12 +259,10 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if found is None:
             goals = Goals(declaration) if any(declaration.task.goal_names()) else None
             made = observer(self.world, declaration, self._how, goals)
-            counted = tuple(name for name in (SUCCESS, TERMINATED) if name in declaration.model)
-            fraction = (FRACTION,) if FRACTION in declaration.model else ()
+            counted = [n for n in (FRACTION, SUCCESS, TERMINATED) if n in declaration.model]
             wanted = () if goals is None else goals.names
-            needed = (*made.names, *wanted, *self._terms, *fraction, *counted, REWARD)
-            flags = (SUCCESS in counted, bool(fraction), TERMINATED in counted)
-            found = made, goals, Counted(*flags), tuple(dict.fromkeys(needed))
+            needed = (*made.names, *wanted, *self._terms, *counted, REWARD)
+            found = made, goals, frozenset(counted), tuple(dict.fromkeys(needed))
             self._observers[declaration] = found
         self._declaration = declaration
         self._observer, self._goals, self._counted, self._needed = found
@@ -322,7 +306,8 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         now = self._look()
         for own in self.world.task.terms:
             one_number(now, own.name, (own.name,))
-        self._show()
+        if self._window is not None:
+            self._window.show(self.world.scene())
         return self._observer.observe(now), self._info(now)
 
     def _acts(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -347,10 +332,10 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self.world.advance(self._commanded(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
-        terminated = self._counted.terminated and bool(now[TERMINATED])
+        terminated = TERMINATED in self._counted and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
         if self._window is not None:
-            self._show()
+            self._window.show(self.world.scene())
         return self._observer.observe(now), reward, terminated, truncated, self._info(now)
 
     def _commanded(self, action: NDArray[np.float32]) -> Floats:
@@ -406,25 +391,16 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
 
     def _info(self, now: Values) -> dict[str, Any]:
         info: dict[str, Any] = {}
-        if self._counted.success:
+        if SUCCESS in self._counted:
             info["is_success"] = info["success"] = bool(now[SUCCESS])
-        if self._counted.fraction:
+        if FRACTION in self._counted:
             info["fractional_success"] = float(now[FRACTION])
         if self._goals is not None:
             info["achieved_goal"], info["desired_goal"] = self._goals.read(self.world)
         info["reward_terms"] = terms = {}
         for name in self._terms:
             terms[name] = float(now[name])
-        contacts, state = self._rich
-        if contacts:
-            info["contacts"] = _touches(self.world.backend)
-        if state:
-            info["state"] = self.world.values()
         return info
-
-    def _show(self) -> None:
-        if self._window is not None:
-            self._window.show(self.world.scene())
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene, shape (480, 640, 3); None without ``render_mode="rgb_array"``.
@@ -435,8 +411,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             ModelError: There is nothing to draw: a step function has no shapes.
         """
+        if self._window is not None:
+            self._window.show(self.world.scene())
         if self.render_mode != "rgb_array":
-            self._show()
             return None
         from scm_world.backends.renderer import picture
 
@@ -448,11 +425,3 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if self._window is not None:
             self._window.close()
         self.world.close()
-
-
-def _touches(backend: Backend) -> tuple[dict[str, Any], ...]:
-    """Copy what the engine says about contacts."""
-    return tuple(
-        {name: np.copy(value) if isinstance(value, np.ndarray) else value for name, value in fields}
-        for fields in (vars(touch).items() for touch in backend.contacts())
-    )

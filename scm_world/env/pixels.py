@@ -32,34 +32,6 @@ AUTOMATIC = "automatic"
 """A camera that looks at what moves in a model, and follows it."""
 
 
-def pixel_observer(
-    world: World, cameras: Sequence[str | Camera] | None, size: Size | None
-) -> Pixels | ModelPixels:
-    """Return what observes a world by pictures.
-
-    Args:
-        world: That is observed.
-        cameras: Names, or cameras; those of policies if None.
-        size: Height and width of the pictures, or both in one [pixels]; those of the cameras
-            if None.
-
-    Raises:
-        UnknownOption: There is no such camera, or the sizes are none or differ.
-    """
-    drawing = drawing_of(world.structure)
-    if drawing.overview is None:
-        return ModelPixels(world, cameras, size)
-    original = world.conventions.published_observation
-    own = drawing.original_cameras if original else drawing.cameras
-    known = {camera.name: camera for camera in (*own, drawing.overview)}
-    if isinstance(cameras, str) or (cameras is not None and not len(cameras)):
-        raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
-    asked = [camera.name for camera in own] if cameras is None else cameras
-    names = {camera.name for camera in own}
-    follows = tuple(not original and isinstance(c, str) and c in names for c in asked)
-    return Pixels(world, _sized([_camera(camera, known) for camera in asked], size), follows)
-
-
 def _sized(found: Sequence[Camera], size: Size | None) -> tuple[Camera, ...]:
     """Give cameras pictures of one size."""
     if size is not None:
@@ -71,8 +43,8 @@ def _sized(found: Sequence[Camera], size: Size | None) -> tuple[Camera, ...]:
     return tuple(found)
 
 
-def _camera(camera: Any, known: Mapping[str, Camera]) -> Camera:
-    """Look up a camera, or read one that was written down as a dictionary."""
+def _camera(camera: Any, known: Mapping[str, Camera] | None) -> Any:
+    """Look up a camera, or read one that was written down as a dictionary; others are not known."""
     if isinstance(camera, Camera):
         return camera
     if isinstance(camera, Mapping):
@@ -87,6 +59,8 @@ def _camera(camera: Any, known: Mapping[str, Camera]) -> Camera:
             raise UnknownOption(
                 "camera", camera, (f"a dictionary of {', '.join(fields)}",)
             ) from None
+    if known is None:
+        return camera
     if not isinstance(camera, str) or camera not in known:
         raise UnknownOption("camera", camera, known)
     return known[camera]
@@ -102,73 +76,21 @@ def _height_and_width(size: Any) -> tuple[int, int]:
 
 @final
 class Pixels:
-    """What cameras see, and then what they should see.
+    """What cameras see, and in the robot's tasks then what they should see.
 
     Args:
         world: That is observed.
-        cameras: With pictures of one size.
-        followed: Of each, whether it stands where its variables say.
+        cameras: Cameras or names. None: of the robot's tasks those of policies, of a model
+            ``"automatic"``. Those of the robot stand where their variables say, those of a file
+            where they stand now.
+        size: Height and width of the pictures, or both in one [pixels]; if None those of the
+            cameras, or of a model 128.
 
     Attributes:
         names: The variables that have to be computed: none.
         layouts: Where variables stand in vectors: there are none.
-        space: uint8, shape (2 n, 3, h, w); under the predecessor's conventions (2 n, h, w, 3).
-    """
-
-    names: tuple[str, ...] = ()
-
-    def __init__(
-        self, world: World, cameras: tuple[Camera, ...], followed: tuple[bool, ...]
-    ) -> None:
-        self._world, self._cameras, self._followed = world, cameras, followed
-        self.layouts: Layouts = {}
-        self._convention = ORIGINAL if world.conventions.published_observation else PLAIN
-        self._shape = (2 * len(cameras), *self._convention.shape(cameras[0]))
-        self.space: gymnasium.Space[NDArray[np.uint8]] = gymnasium.spaces.Box(
-            0, 255, self._shape, np.uint8
-        )
-        self._goals = np.empty((len(cameras), *self._shape[1:]), dtype=np.uint8)
-        self._version = -1
-
-    def observe(self, now: Values) -> NDArray[np.uint8]:
-        """Draw; pictures of the goals are kept until someone intervenes."""
-        scene, layout = self._world.scene(), self._convention
-        if self._version != self._world.version:
-            self._version = self._world.version
-            self._cameras = self._present_cameras()
-            goal_pixels(scene, self._cameras, self._goals, convention=layout)
-        pictures: Any = np.empty(self._shape, dtype=np.uint8)
-        half = len(self._cameras)
-        now_pixels(scene, self._cameras, pictures[:half], convention=layout)
-        pictures[half:] = self._goals
-        found: NDArray[np.uint8] = pictures
-        return found
-
-    def _present_cameras(self) -> tuple[Camera, ...]:
-        """Put the cameras of the robot where their variables say."""
-        present = {camera.name: camera for camera in self._world.cameras()}
-        return tuple(
-            replace(present[camera.name], height=camera.height, width=camera.width)
-            if follows
-            else camera
-            for camera, follows in zip(self._cameras, self._followed, strict=True)
-        )
-
-
-@final
-class ModelPixels:
-    """What cameras see of a model.
-
-    Args:
-        world: That is observed.
-        cameras: Cameras; names of those in the file, which stand where they stand now; or
-            ``"automatic"``, which is what None stands for.
-        size: Height and width of the pictures, or both in one [pixels]; 128 if None.
-
-    Attributes:
-        names: The variables that have to be computed: none.
-        layouts: Where variables stand in vectors: there are none.
-        space: uint8, shape (n, 3, h, w).
+        space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); under the predecessor's
+            conventions (2 n, h, w, 3).
 
     Raises:
         UnknownOption: There is no such camera, or the sizes are none or differ.
@@ -180,29 +102,58 @@ class ModelPixels:
     def __init__(
         self, world: World, cameras: Sequence[str | Camera] | None, size: Size | None
     ) -> None:
-        given = (AUTOMATIC,) if cameras is None else cameras
+        drawing, published = drawing_of(world.structure), world.conventions.published_observation
+        self._world, self._shows_goals = world, drawing.overview is not None
+        own = drawing.original_cameras if published else drawing.cameras
+        usual = [camera.name for camera in own] if self._shows_goals else [AUTOMATIC]
+        given = usual if cameras is None else cameras
         if isinstance(given, str) or not len(given):
             raise UnknownOption("list of cameras", cameras, ("one or more names or cameras",))
-        self._world, self._given = world, tuple(given)
-        usual = Camera("", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-        scene, shape = world.structure.default_scene(), (usual.height, usual.width)
-        found = [scene_camera(scene, c, shape if isinstance(c, str) else None) for c in given]
+        self._given = tuple(given)
+        if drawing.overview is not None:
+            known = {camera.name: camera for camera in (*own, drawing.overview)}
+            found = [_camera(camera, known) for camera in given]
+        else:
+            plain = Camera("", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+            scene, shape = world.structure.default_scene(), (plain.height, plain.width)
+            found = [
+                scene_camera(scene, _camera(c, None), shape if isinstance(c, str) else None)
+                for c in given
+            ]
+        self._follows = [not published and isinstance(c, str) and c in usual for c in given]
         self._cameras = _sized(found, size)
         self.layouts: Layouts = {}
-        self._shape = (len(given), 3, self._cameras[0].height, self._cameras[0].width)
+        self._convention = ORIGINAL if published else PLAIN
+        one, n = self._convention.shape(self._cameras[0]), len(given)
+        self._goals: NDArray[np.uint8] = np.empty((n, *one), dtype=np.uint8)
+        self._shape = (2 * n if self._shows_goals else n, *one)
         self.space: gymnasium.Space[NDArray[np.uint8]] = gymnasium.spaces.Box(
             0, 255, self._shape, np.uint8
         )
+        self._version = -1
 
     def observe(self, now: Values) -> NDArray[np.uint8]:
-        """Draw."""
-        scene = self._world.scene()
-        pictures: Any = np.empty(self._shape, dtype=np.uint8)
-        pairs = zip(self._given, self._cameras, strict=True)
-        cameras = [placed(scene, given, camera) for given, camera in pairs]
-        now_pixels(scene, cameras, pictures)
-        found: NDArray[np.uint8] = pictures
-        return found
+        """Draw; pictures of the goals are kept until someone intervenes."""
+        scene, layout, n = self._world.scene(), self._convention, len(self._cameras)
+        pictures: NDArray[np.uint8] = np.empty(self._shape, dtype=np.uint8)
+        if not self._shows_goals:
+            pairs = zip(self._given, self._cameras, strict=True)
+            cameras = [placed(scene, given, camera) for given, camera in pairs]
+            now_pixels(scene, cameras, pictures, convention=layout)
+            return pictures
+        if self._version != self._world.version:
+            self._version = self._world.version
+            present = {camera.name: camera for camera in self._world.cameras()}
+            self._cameras = tuple(
+                replace(present[camera.name], height=camera.height, width=camera.width)
+                if follows
+                else camera
+                for camera, follows in zip(self._cameras, self._follows, strict=True)
+            )
+            goal_pixels(scene, self._cameras, self._goals, convention=layout)
+        now_pixels(scene, self._cameras, pictures[:n], convention=layout)
+        pictures[n:] = self._goals
+        return pictures
 
 
 def placed(scene: Scene, given: str | Camera, camera: Camera) -> Camera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
@@ -10,16 +11,149 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Integers, Value
-from scm_world.env.bounds import WIDE
-from scm_world.env.keypoints import KEYPOINTS, Keypoints
+from scm_world._types import Floats, Integers, Value, Values
+from scm_world.geometry import rotation_matrix
 from scm_world.geometry.clipping import scale_rows
+from scm_world.graph import SCM
 from scm_world.tasks import TIME
-from scm_world.variables import Normal
+from scm_world.variables import Box, Categories, Normal, Rotations
+from scm_world.variables import Integers as WholeNumbers
 from scm_world.variables.reserved import SENSOR_NOISE
+from scm_world.variables.spaces import Affine, Switch
 from scm_world.world import World
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import places
+
+# --- bounds ---------------------------------------------------------------------------------------
+
+WIDE = float(np.finfo(np.float32).max)
+"""Stands for no bound: Gymnasium wants finite ones, and no 32-bit number lies beyond."""
+
+_COORDINATES: dict[str, tuple[Any, Any]] = {
+    "cylindrical_position": ((0.0, -np.pi, -1.0), (1.5, np.pi, 1.0)),  # [m, rad, m]
+    "euler_orientation": (-np.pi, np.pi),  # [rad]
+}
+"""Other coordinates of a pose declare no bounds: those of the pose hold for them."""
+
+
+def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
+    """Give the bounds of every component of a variable.
+
+    A declared bound that follows another variable is taken where that one makes it widest.
+
+    Args:
+        model: Where the variable is declared.
+        name: Of the variable.
+
+    Returns:
+        Lower and upper bound, shape (n,) each; ``∓WIDE`` where none is declared.
+
+    Raises:
+        UnknownVariable: No variable has this name.
+    """
+    variable = model.declared(name)
+    extent = _extent(model, variable.bounds, name.rpartition(".")[2])
+    low, high = (spread(np.clip(end, -WIDE, WIDE), variable.shape) for end in extent)
+    room = np.where(high > low, 0.0, 0.5)  # a space with one point is none
+    return low - room, high + room
+
+
+def spread(bound: Any, shape: tuple[int, ...]) -> Floats:
+    """Give one bound to each of the components, shape (n,)."""
+    flat = np.asarray(bound, dtype=np.float64).ravel()
+    return np.broadcast_to(flat, (int(np.prod(shape)),))
+
+
+def _extent(model: SCM, space: Any, quantity: str) -> tuple[Any, Any]:
+    match space:
+        case None:
+            return _COORDINATES.get(quantity, (-WIDE, WIDE))
+        case Box():
+            return _ends(model, space.low)[0], _ends(model, space.high)[1]
+        case WholeNumbers():
+            return space.low, space.high
+        case Categories():
+            return min(space.members), max(space.members)
+        case Rotations():
+            return -1.0, 1.0
+        case _:  # the union of two spaces
+            parts = [_extent(model, part, quantity) for part in (space.first, space.second)]
+            (low_a, high_a), (low_b, high_b) = parts
+            return np.minimum(low_a, low_b), np.maximum(high_a, high_b)
+
+
+def _ends(model: SCM, bound: Any) -> tuple[Any, Any]:
+    """Give the least and the greatest value that a bound can have."""
+    match bound:
+        case tuple():
+            pairs = [_ends(model, part) for part in bound]
+            return tuple(low for low, _ in pairs), tuple(high for _, high in pairs)
+        case Affine():
+            parents = [side[bound.index or 0] for side in bounds(model, bound.parent)]
+            both = [bound.offset + bound.scale * float(parent) for parent in parents]
+            return min(both), max(both)
+        case Switch():
+            return min(bound.below, bound.above), max(bound.below, bound.above)
+        case _:
+            return bound, bound
+
+
+# --- corners --------------------------------------------------------------------------------------
+
+KEYPOINTS = "keypoints"
+"""What the corners are called among the parts of an observation."""
+
+CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+"""The corners of a box with edges of length 1, shape (8, 3)."""
+
+_POSE = ("size", "cartesian_position", "orientation")
+
+
+def corners(size: Floats, position: Floats, orientation: Floats) -> Floats:
+    """Compute the corners of boxes.
+
+    Args:
+        size: Edge lengths, shape (..., 3) [m].
+        position: Centers, shape (..., 3) [m].
+        orientation: Quaternions (x, y, z, w), shape (..., 4).
+
+    Returns:
+        Shape (..., 8, 3) [m]; the last axis of the box changes fastest, from low to high.
+
+    Example:
+        >>> corners(np.array([2.0, 2.0, 2.0]), np.ones(3), np.array([0.0, 0.0, 0.0, 1.0]))[:2]
+        array([[0., 0., 0.], [0., 0., 2.]])
+    """
+    local = CORNERS * np.asarray(size)[..., None, :]  # (..., 8, 3)
+    turned = local @ np.swapaxes(rotation_matrix(np.asarray(orientation)), -1, -2)
+    found: Floats = turned + np.asarray(position)[..., None, :]
+    return found
+
+
+@final
+class Keypoints:
+    """The corners of some bodies of a world.
+
+    Args:
+        bodies: Names of blocks and goals.
+
+    Attributes:
+        names: The variables that they are computed from.
+        size: How many numbers they are: 24 for each body.
+    """
+
+    def __init__(self, bodies: tuple[str, ...]) -> None:
+        self._bodies = bodies
+        self.names = tuple(f"{body}.{part}" for body in bodies for part in _POSE)
+        self.size = CORNERS.size * len(bodies)
+
+    def observe(self, now: Values) -> Floats:
+        """Give the corners body by body, shape (24 n,) [m]."""
+        parts = [np.array([now[f"{body}.{part}"] for body in self._bodies]) for part in _POSE]
+        return corners(*parts).ravel()
+
+
+# --- vectors --------------------------------------------------------------------------------------
 
 Layouts = Mapping[str, Mapping[str, slice]]
 """Where each variable stands, for every vector by its name."""

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world.env.delta import PREFIX, TIPS
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.vector import box
@@ -28,7 +28,16 @@ _MODES = ("structured", "full")
 _STEPS = 7  # nothing, or one of three axes to one of two sides
 
 
-def _unwrapped(env: gymnasium.Env[Any, Any], wrapper: str) -> ScmWorldEnv:
+def unwrapped_env(env: gymnasium.Env[Any, Any], wrapper: str) -> ScmWorldEnv:
+    """Return the environment of this package inside of wrappers.
+
+    Args:
+        env: In any wrappers.
+        wrapper: Who asks, for the error.
+
+    Raises:
+        UnknownOption: There is another one.
+    """
     inner = env.unwrapped
     if not isinstance(inner, ScmWorldEnv):
         raise UnknownOption(f"environment for {wrapper}", type(inner).__name__, ("ScmWorldEnv",))
@@ -60,7 +69,7 @@ class DeltaAction(gymnasium.ActionWrapper[Any, Actions, Actions], RecordConstruc
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         super().__init__(env)
-        inner = _unwrapped(env, "DeltaAction")
+        inner = unwrapped_env(env, "DeltaAction")
         if inner.action_mode.startswith(PREFIX):
             raise UnknownOption("action_mode", inner.action_mode, inner.world.task.action_modes)
         self._delta = inner.relative()
@@ -129,11 +138,10 @@ class ObjectSelector(
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         super().__init__(env)
-        self._inner = inner = _unwrapped(env, "ObjectSelector")
+        self._inner = inner = unwrapped_env(env, "ObjectSelector")
         if inner.action_mode != "joint_positions":
             raise UnknownOption("action_mode", inner.action_mode, ("joint_positions",))
-        if inner.observation_mode not in _MODES:
-            raise UnknownOption("observation_mode", inner.observation_mode, _MODES)
+        one_of("observation_mode", inner.observation_mode, _MODES)
         if not isinstance(inner.observation_space, gymnasium.spaces.Box):
             allowed = ("a vector: without goal_env and context='privileged'",)
             raise UnknownOption("observation for ObjectSelector", "a dictionary", allowed)

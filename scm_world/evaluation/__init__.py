@@ -8,14 +8,12 @@ An evaluation is one call::
     found.save("results")
 """
 
-from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.checking import Check, check
 from scm_world.evaluation.episodes import METRICS
 from scm_world.evaluation.explanation import Explanation, Otherwise, why
-from scm_world.evaluation.files import merge
 from scm_world.evaluation.pipeline import evaluate
 from scm_world.evaluation.players import Player, WorldPolicy, as_player, player_from
-from scm_world.evaluation.protocols import Protocol
+from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.evaluation.recording import Recorder, Recording, record
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Causes, Interval
@@ -36,7 +34,6 @@ __all__ = [
     "as_player",
     "check",
     "evaluate",
-    "merge",
     "player_from",
     "protocols_of",
     "record",

@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.curricula.parts import Do
+from scm_world.curricula import Do
 from scm_world.errors import (
     DAMAGED,
     ModelError,
@@ -25,9 +25,8 @@ from scm_world.evaluation.episodes import EpisodeRunner
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
-from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.results import KEYS, Evaluation
 from scm_world.evaluation.setups import EvaluationPlace, Setup
-from scm_world.evaluation.tables import KEYS
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
@@ -94,7 +93,7 @@ def shard_runner_of(
             about["n"],
             about["versions"],
         )
-        return ShardRunner(setup, trusted)
+        return ShardRunner(setup)
     except DAMAGED as error:
         if isinstance(error, ScmWorldError):
             raise

@@ -5,7 +5,6 @@ from __future__ import annotations
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
 from hashlib import blake2b
@@ -15,7 +14,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.curricula import CurriculumRunner, Memory
-from scm_world.curricula.choices import Stages
+from scm_world.curricula.combinations import Stages
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
 from scm_world.evaluation.players import Actions, Player
@@ -125,11 +124,9 @@ class RunningEpisode:
         player: The policy.
         turn: What acts within the episode.
         place: Agent, run, engine, protocol, seed and episode.
-        remembers: Whether to keep every observation, and the action that followed.
 
     Attributes:
         mark: Sums it up.
-        seen: Observations and actions, if it remembers.
     """
 
     def __init__(
@@ -138,13 +135,10 @@ class RunningEpisode:
         player: Player,
         turn: CurriculumRunner,
         place: tuple[str, int, str, str, int, int],
-        *,
-        remembers: bool = False,
     ) -> None:
         self._drawn = _drawn(env, 0)
         player.begin(env)
         self.mark = Fingerprint(env)
-        self.seen: list[tuple[Any, bytes]] | None = [] if remembers else None
         self._player, self._turn, self._place = player, turn, place
         self._fractions: list[float] = []
         self._success: bool | None = None
@@ -152,11 +146,8 @@ class RunningEpisode:
 
     def act(self, observation: Any) -> Actions:
         """Let the player choose an action, shape (n,)."""
-        shown = observation if self.seen is None else deepcopy(observation)
         action = self._player.act(observation)
         self.mark.act(action)
-        if self.seen is not None:
-            self.seen.append((shown, action.tobytes()))
         return action
 
     def stepped(self, found: Stepped) -> None:

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
 import numpy as np
 from pydantic import PrivateAttr
 
-from scm_world.curricula.parts import Acts, AnyPart, Part
-from scm_world.curricula.situations import Situation
+from scm_world._arguments import one_of
+from scm_world.curricula.base import Acts, AnyPart, Part, Situation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.checking import shard_runner_of
 from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
-from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.setups import Shard
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.variables import Draw
@@ -174,61 +173,63 @@ def why(
     """
     metric = evaluation.metric(metric)
     agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
-    seeds = evaluation.only(agent=agent, engine=engine, protocol=protocol)._listed("seed")
-    seed = seeds[0] if seed is None else seed
+    seeds = evaluation.only(agent=agent, engine=engine, protocol=protocol).columns["seed"]
+    seed = int(seeds[0]) if seed is None else seed
     where = {"agent": agent, "run": run, "engine": engine, "protocol": protocol, "seed": seed}
     one = evaluation.only(**where, episode=episode)
-    if versus not in (None, *VERSUS):
-        raise UnknownOption("versus", versus, VERSUS)
-    shard_runner = shard_runner_of(evaluation, policy=policy, task=task, trusted=trusted)
-    try:
+    one_of("versus", versus, (None, *VERSUS))
+    found, left_out = [], {}
+    with closing(
+        shard_runner_of(evaluation, policy=policy, task=task, trusted=trusted)
+    ) as shard_runner:
         shard = shard_runner.setup.shard_of({**where, "episode": episode})
         row = shard_runner.play(shard, episode)
         if row.hash != one.columns["hash"][0]:
             raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
-        return _others(shard_runner, shard, row, metric, versus, progress)
-    finally:
-        shard_runner.close()
+        if not row.drawn:
+            allowed = ("an episode in which a protocol varies something",)
+            raise UnknownOption("episode", f"{row.protocol}, {row.episode}", allowed)
+        done_there = shard_runner.setup.protocols[shard.protocol]
+        player, runner = shard_runner.setup.agents[shard.agent].player, shard_runner.runner(shard)
+        runner.env.reset(seed=seed, options={"episode": episode})
+        usual = runner.env.world.values()  # where nobody intervenes
+        against: dict[str, Any] = {n: versus or _versus(runner, usual, n, row) for n in row.drawn}
+        for done, (name, how) in enumerate(against.items()):
+            part = Instead(of=done_there.part, name=name, versus=how)
+            seen: list[float] = []
 
+            def look(env: ScmWorldEnv, name: str = name, seen: list[float] = seen) -> None:
+                """Keep the value of the variable at the step of the protocol."""
+                if env.world.index == done_there.step and name in env.world.model:
+                    seen[:] = np.ravel(env.world[name]).astype(float).tolist()
 
-def _others(
-    shard_runner: ShardRunner,
-    shard: Shard,
-    row: EpisodeRow,
-    metric: str,
-    versus: str | None,
-    progress: Progress | None,
-) -> Explanation:
-    protocol = shard_runner.setup.protocols[shard.protocol]
-    if not row.drawn:
-        allowed = ("an episode in which a protocol varies something",)
-        raise UnknownOption("episode", f"{row.protocol}, {row.episode}", allowed)
-    runner = shard_runner.runner(shard)
-    where: Any = {"seed": shard.seed, "episode": row.episode, "who": (row.agent, row.run)}
-    usual = _natural(runner, shard, row)
-    against: dict[str, Any] = {n: versus or _versus(runner, usual, n, row) for n in row.drawn}
-    found, left_out = [], {}
-    for done, (name, how) in enumerate(against.items()):
-        part = Instead(of=protocol.part, name=name, versus=how)
-        other = Protocol(f"{protocol.name} without {name}", act=part)
-        look = _Look(name, protocol.step)
-        try:
-            then = runner.play(shard_runner.player(shard.agent), other, **where, watch=look)
-        except EvaluationError as error:
-            left_out[name] = error.reason
-        else:
-            success = then.scores.get("success")
-            reached = None if success is None else bool(success)
-            scores = row.scores[metric], then.scores[metric], reached
-            would_be = tuple(then.drawn.get(name, look.value))
-            one = Otherwise(name, tuple(row.drawn[name]), would_be, *scores)
-            reason = _no_answer(one, row, then, part.found, runner.env.world)
-            if reason:
-                left_out[name] = reason
+            try:
+                then = runner.play(
+                    player,
+                    Protocol(f"{protocol} without {name}", act=part),
+                    seed=seed,
+                    episode=episode,
+                    who=(row.agent, row.run),
+                    watch=look,
+                )
+            except EvaluationError as error:
+                left_out[name] = error.reason
             else:
-                found.append(one)
-        if progress is not None:
-            progress(done + 1, len(row.drawn))
+                success = then.scores.get("success")
+                would = Otherwise(
+                    name,
+                    tuple(row.drawn[name]),
+                    tuple(then.drawn.get(name, seen)),
+                    row.scores[metric],
+                    then.scores[metric],
+                    None if success is None else bool(success),
+                )
+                if reason := _no_answer(would, row, then, part.found, runner.env.world):
+                    left_out[name] = reason
+                else:
+                    found.append(would)
+            if progress is not None:
+                progress(done + 1, len(row.drawn))
     best_first = tuple(sorted(found, key=lambda one: -one.gain))
     return Explanation(row.scores[metric], best_first, left_out)
 
@@ -237,57 +238,25 @@ def _no_answer(
     one: Otherwise, row: EpisodeRow, then: EpisodeRow, found: set[str], world: World
 ) -> str:
     """Say why what would have been says nothing about a variable; empty if it does."""
-    if one.variable not in found:
+    name, model = one.variable, world.model
+    if name not in found:
         return "the protocol does not set it"
+
+    def follows(other: str) -> bool:
+        """Tell whether the spaces of another variable follow, as a height follows a size."""
+        if other not in model or name not in model:
+            return False
+        variable, causes = model.declared(other), {name, *model.descendants(model.target(name))}
+        spaces = (space for space in (variable.a, variable.b) if space is not None)
+        return any(not causes.isdisjoint(space.parents()) for space in spaces)
+
     changed = [
-        n
-        for n in then.drawn
-        if n != one.variable
-        and then.drawn[n] != row.drawn.get(n)
-        and not _follows(world, n, one.variable)
+        n for n in then.drawn if n != name and then.drawn[n] != row.drawn.get(n) and not follows(n)
     ]
-    gone = [n for n in row.drawn if n != one.variable and n not in then.drawn]
+    gone = [n for n in row.drawn if n != name and n not in then.drawn]
     if changed or gone:
         return f"{', '.join((*changed, *gone))} would have been drawn anew with it"
     return SAME if one.was == one.would_be else ""
-
-
-def _follows(world: World, name: str, cause: str) -> bool:
-    """Tell whether the spaces of a variable follow another one, as a height follows a size."""
-    model = world.model
-    if name not in model or cause not in model:
-        return False
-    variable = model.declared(name)
-    causes = {cause, *model.descendants(model.target(cause))}
-    return any(
-        s is not None and not causes.isdisjoint(s.parents()) for s in (variable.a, variable.b)
-    )
-
-
-@dataclass
-class _Look:
-    """Looks at a variable at one control step.
-
-    Attributes:
-        name: Of the variable.
-        step: The control step.
-        value: What it was; empty if it did not exist.
-    """
-
-    name: str
-    step: int
-    value: tuple[float, ...] = ()
-
-    def __call__(self, env: ScmWorldEnv) -> None:
-        world = env.world
-        if world.index == self.step and self.name in world.model:
-            self.value = tuple(np.ravel(world[self.name]).astype(float).tolist())
-
-
-def _natural(runner: EpisodeRunner, shard: Shard, row: EpisodeRow) -> dict[str, Any]:
-    """Give the values of an episode in which nobody intervenes."""
-    runner.env.reset(seed=shard.seed, options={"episode": row.episode})
-    return runner.env.world.values()
 
 
 def _versus(runner: EpisodeRunner, usual: Mapping[str, Any], name: str, row: EpisodeRow) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from hashlib import blake2b
 from pathlib import PurePosixPath
 from typing import Any
@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import load as load_library
-from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.agents import what_it_is
-from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.tables import KEYS, TEXTS, WHOLE, Columns, joined
+from scm_world._arguments import one_of
+from scm_world.errors import DAMAGED, UnreadableFile
+from scm_world.evaluation.results import KEYS, TEXTS, WHOLE, Columns, Evaluation
 from scm_world.output.durable import locked, removed, write_durably, write_whole
-from scm_world.output.locations import Location
 from scm_world.output.reading import LARGEST_TABLE, read_bytes, read_table, read_text
+from scm_world.output.remote import Location
 
 FORMAT = "scm_world/evaluation/1"
 RESULTS = "results.json"
@@ -30,8 +29,7 @@ ADVICE = "give the folder, or the results.json, that an evaluation wrote"
 
 def save(evaluation: Evaluation, folder: Location, form: str) -> tuple[Location, Location]:
     """Write the table, then the summary that names it; see ``Evaluation.save``."""
-    if form not in CODECS:
-        raise UnknownOption("format", form, CODECS)
+    one_of("format", form, CODECS)
     table, summary = folder / f"{TABLE}.{form}", folder / RESULTS
     content = CODECS[form][0](evaluation.columns)
     data: dict[str, Any] = {
@@ -119,83 +117,6 @@ def load(path: Location) -> Evaluation:
 
 def _said(error: Exception) -> str:
     return f"it has no {error}" if isinstance(error, KeyError) else str(error)
-
-
-def merge(evaluations: Iterable[Evaluation]) -> Evaluation:
-    """Put evaluations of one environment together, such as those of several machines.
-
-    Rows that several of them have must be the same, bit for bit.
-
-    Raises:
-        ModelError: They are of other tasks, options or protocols, of other versions of one engine,
-            of two policies with one name, or differ in a row that both have.
-    """
-    listed = list(evaluations)
-    if not listed:
-        raise ModelError(["there is no evaluation to merge"])
-    problems = [why for other in listed[1:] for why in _differences(listed[0], other)]
-    problems += _clashes(listed)
-    columns = joined(evaluation.columns for evaluation in listed)
-    identity = list(zip(*(columns[key].tolist() for key in KEYS), strict=True))
-    first: dict[Any, int] = {}
-    for place, who in enumerate(identity):
-        before = first.setdefault(who, place)
-        if columns["hash"][before] != columns["hash"][place]:
-            row = ", ".join(f"{k} {v}" for k, v in zip(KEYS, who, strict=True))
-            problems.append(f"{row} did not happen alike in two of them")
-    if problems:
-        raise ModelError(problems)
-    kept = np.array(sorted(first.values()), dtype=np.int64)
-    policies = {who: policy for one in listed for who, policy in one.policies.items()}
-    table = {name: column[kept] for name, column in columns.items()}
-    return Evaluation(_about(listed), table, policies)
-
-
-def _differences(one: Evaluation, other: Evaluation) -> list[str]:
-    """Say what of two evaluations cannot stand in one table."""
-    found = [
-        f"{what} is {one.about.get(what)!r} in one and {other.about.get(what)!r} in another"
-        for what in ("task", "class", "model", "arguments", "env")
-        if one.about.get(what) != other.about.get(what)
-    ]
-    for engine in one.about["versions"].keys() & other.about["versions"].keys():
-        mine, its = one.about["versions"][engine], other.about["versions"][engine]
-        found += [
-            f"{package} is {mine.get(package)} in one and {its.get(package)} in another"
-            for package in sorted(mine.keys() | its.keys())
-            if mine.get(package) != its.get(package)
-        ]
-    return found
-
-
-def _clashes(listed: Sequence[Evaluation]) -> list[str]:
-    """Name protocols and agents that mean two things."""
-    known: dict[tuple[str, Any], Any] = {}
-    found = []
-    for evaluation in listed:
-        named = [(("protocol", p["name"]), p) for p in evaluation.about["protocols"]]
-        named += [
-            (
-                (f"agent {one['agent']}, run", one["run"]),
-                [what_it_is(one["policy"]), one.get("env")],
-            )
-            for one in evaluation.about["agents"]
-        ]
-        for key, content in named:
-            if known.setdefault(key, content) != content:
-                found.append(f"{key[0]} {key[1]} is not the same in two of them")
-    return found
-
-
-def _about(listed: Sequence[Evaluation]) -> dict[str, Any]:
-    """Put what evaluations are about together."""
-    found: dict[str, Any] = dict(listed[0].about)
-    for what in ("engines", "agents", "protocols", "seeds"):
-        every = [one for evaluation in listed for one in evaluation.about[what]]
-        found[what] = [one for place, one in enumerate(every) if one not in every[:place]]
-    found["n"] = max(evaluation.about["n"] for evaluation in listed)
-    found["versions"] = {k: v for one in listed for k, v in one.about["versions"].items()}
-    return found
 
 
 # --- tables -----------------------------------------------------------------------------------

@@ -2,53 +2,54 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
+from hashlib import blake2b
 from typing import Any, final
 
-from scm_world.errors import UnreadableFile
-from scm_world.evaluation.agents import AgentRun
+from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
 from scm_world.evaluation.lockstep import Lockstep
-from scm_world.evaluation.players import Player, as_player
-from scm_world.evaluation.results import Evaluation
+from scm_world.evaluation.results import Evaluation, columns_of
 from scm_world.evaluation.setups import SHARD, Setup, Shard, prepare
-from scm_world.evaluation.shards import read_part, write_part
-from scm_world.evaluation.tables import columns_of
-from scm_world.output.durable import locked
-from scm_world.output.locations import Location, located
+from scm_world.output.durable import locked, made, write_whole
+from scm_world.output.reading import read_text
+from scm_world.output.remote import Location, located
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.work.executors import Executor, Serial, opened
-from scm_world.work.threads import cores
+from scm_world.work.processes import cores
+
+PART = "scm_world/evaluation-part/1"
+"""Format of the file of a finished shard."""
 
 
 @final
 @dataclass
 class ShardRunner:
-    """Runs shards one after another; keeps environments and policies for the next one.
+    """Runs shards one after another; keeps environments for the next one.
 
     Attributes:
         setup: Of the evaluation.
-        trusted: Packages whose functions may be policies.
         threads: Of an engine that steps many worlds in one call; results do not depend on it.
     """
 
     setup: Setup
-    trusted: Sequence[str] | None = None
     threads: int = 1
     runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
     locksteps: dict[str, Lockstep] = field(default_factory=dict)
-    players: dict[int, Player] = field(default_factory=dict)
 
     def __call__(self, shard: Shard) -> list[EpisodeRow]:
         """Play all episodes of a shard, side by side where that is faster."""
         agent_run, numbers = self.setup.agents[shard.agent], range(shard.first, shard.stop)
-        rows = self.lockstep(shard).play(
-            self.player(shard.agent),
+        key, env = self.setup.where(shard), self.runner(shard).env
+        if key not in self.locksteps:
+            self.locksteps[key] = Lockstep(env, min(SHARD, self.setup.n), self.threads)
+        rows = self.locksteps[key].play(
+            agent_run.player,
             self.setup.protocols[shard.protocol],
             seed=shard.seed,
             episodes=numbers,
@@ -60,7 +61,7 @@ class ShardRunner:
         """Play one episode of it."""
         agent_run = self.setup.agents[shard.agent]
         return self.runner(shard).play(
-            self.player(shard.agent),
+            agent_run.player,
             self.setup.protocols[shard.protocol],
             seed=shard.seed,
             episode=episode,
@@ -75,27 +76,6 @@ class ShardRunner:
             self.runners[key] = EpisodeRunner(self.setup.env(shard))
         return self.runners[key]
 
-    def lockstep(self, shard: Shard) -> Lockstep:
-        """Give where the episodes of a shard happen side by side."""
-        key = self.setup.where(shard)
-        if key not in self.locksteps:
-            env, most = self.runner(shard).env, min(SHARD, self.setup.n)
-            self.locksteps[key] = Lockstep(env, most, self.threads)
-        return self.locksteps[key]
-
-    def player(self, number: int) -> Player:
-        """Give who acts.
-
-        Raises:
-            UnreadableFile: It is a file, and another one than it was when the evaluation began.
-        """
-        if number not in self.players:
-            given = self.setup.agents[number]
-            player = as_player(given.policy, trusted=self.trusted)
-            _refuse_another(player, given)
-            self.players[number] = player
-        return self.players[number]
-
     def close(self) -> None:
         """Free the engines."""
         for lockstep in self.locksteps.values():
@@ -104,17 +84,6 @@ class ShardRunner:
             runner.close()
         self.locksteps.clear()
         self.runners.clear()
-
-
-def _refuse_another(player: Player, agent_run: AgentRun) -> None:
-    """Refuse a file that was written anew meanwhile, as a training does it."""
-    if isinstance(agent_run.policy, str | Path):
-        then, now = (about.get("sha256") for about in (agent_run.about, player.about))
-        if then != now:
-            advice = "copy it if a training still writes it, and evaluate the copy"
-            raise UnreadableFile(
-                str(agent_run.policy), "it has changed since the evaluation began", advice
-            )
 
 
 def evaluate(
@@ -192,8 +161,8 @@ def evaluate(
         opened(engine, workers, address) as executor,
         locked(folder) if folder is not None else nullcontext(),
     ):
-        rows = played(setup, executor, folder=folder, trusted=trusted, progress=progress)
-    policies = {(agent_run.agent, agent_run.run): agent_run.policy for agent_run in setup.agents}
+        rows = played(setup, executor, folder=folder, progress=progress)
+    policies = {(one.agent, one.run): one.player.policy for one in setup.agents}
     return Evaluation(setup.about(), columns_of(rows), policies)
 
 
@@ -202,7 +171,6 @@ def played(
     executor: Executor | None = None,
     *,
     folder: Location | None = None,
-    trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> list[EpisodeRow]:
     """Play what has not been played, and give all rows in their order.
@@ -211,7 +179,6 @@ def played(
         setup: Of the evaluation.
         executor: Plays the shards; this process if None.
         folder: For what is finished.
-        trusted: Packages whose functions may be policies.
         progress: Told how many episodes are done, and how many there are.
     """
     shards = setup.shards()
@@ -219,32 +186,73 @@ def played(
     found: dict[int, list[EpisodeRow]] = {}
     for place, (shard, key) in enumerate(zip(shards, keys, strict=True)):
         noisy = setup.agents[shard.agent].about.get("repeats") == "no"  # who may be another by now
-        count = shard.stop - shard.first
-        kept = None if folder is None or noisy else read_part(folder, key, count)
-        if kept is not None:
-            found[place] = kept
+        if folder is not None and not noisy:
+            kept = read_part(folder, key, shard.stop - shard.first)
+            if kept is not None:
+                found[place] = kept
+
+    def tell() -> None:
+        if progress is not None:
+            done = sum(map(len, found.values()))
+            progress(done, sum(shard.stop - shard.first for shard in shards))
+
+    tell()
     missing = [place for place in range(len(shards)) if place not in found]
-    tell = _teller(progress, sum(shard.stop - shard.first for shard in shards))
-    tell(found)
     with opened(executor) as player:
         if not isinstance(player, Serial):
-            setup.place.refuse_unsent(player)
-        for agent_run in setup.agents:
-            player.check(f"policy {agent_run.agent!r} with several workers", agent_run.policy)
+            try:
+                player.check("task with several workers", setup.place.task)
+            except UnknownOption as error:
+                allowed = (
+                    "a name, a file or 'module:function' for a function that makes it",
+                    f"workers=None ({error})",
+                )
+                given = setup.place.name
+                raise UnknownOption("task with several workers", given, allowed) from error
+        for one in setup.agents:
+            player.check(f"policy {one.agent!r} with several workers", one.player.policy)
         threads = cores() if isinstance(player, Serial) else 1  # workers share the cores
-        make = partial(ShardRunner, setup, trusted, threads)
+        make = partial(ShardRunner, setup, threads)
         for index, rows in player.run(make, [shards[place] for place in missing]):
             place = missing[index]
             found[place] = rows
             if folder is not None:
                 write_part(folder, keys[place], rows)
-            tell(found)
+            tell()
     return [row for place in range(len(shards)) for row in found[place]]
 
 
-def _teller(progress: Progress | None, total: int) -> Any:
-    def tell(found: Mapping[int, list[EpisodeRow]]) -> None:
-        if progress is not None:
-            progress(sum(map(len, found.values())), total)
+def write_part(folder: Location, key: str, rows: Sequence[EpisodeRow]) -> None:
+    """Write the episodes of a shard, by its key in the folder of the evaluation.
 
-    return tell
+    Raises:
+        UnwritableFolder: There is no room, or no permission.
+    """
+    plain = [asdict(row) for row in rows]
+    text = json.dumps({"format": PART, "key": key, "sum": _sum(plain), "rows": plain})
+    write_whole(text + "\n", made(folder / "parts") / f"{key}.json")
+
+
+def read_part(folder: Location, key: str, count: int) -> list[EpisodeRow] | None:
+    """Read the episodes of a shard, of which there are ``count``; None if it was not played.
+
+    Raises:
+        UnreadableFile: The file is damaged, or not of this shard.
+    """
+    path = folder / "parts" / f"{key}.json"
+    advice = "delete this file; its episodes are then played again"
+    try:
+        data = json.loads(read_text(path))
+        found = (data["format"], data["key"], data["sum"], len(data["rows"]))
+        if found != (PART, key, _sum(data["rows"]), count):
+            raise ValueError("its content is not what was written")
+        return [EpisodeRow(**row) for row in data["rows"]]
+    except FileNotFoundError:
+        return None
+    except DAMAGED as error:
+        raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
+
+
+def _sum(rows: Any) -> str:
+    text = json.dumps(rows, sort_keys=True)
+    return blake2b(text.encode(), digest_size=12).hexdigest()

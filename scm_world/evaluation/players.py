@@ -6,7 +6,6 @@ import hashlib
 import importlib.metadata
 import math
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world.env import ScmWorldEnv
+from scm_world.env.arguments import action_scale
 from scm_world.env.delta import PREFIX as RELATIVE_MODE
-from scm_world.env.given import action_scale
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.recording_files import Recorded, from_parquet
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
@@ -113,7 +112,9 @@ class Player:
         start: Gives what acts in the episode that an environment has begun.
         made_for: What the policy was trained for, if known.
         is_plain: Whether its actions are known to follow from its observations of the episode.
-        parallel: Whether it can act in several episodes at the same time.
+
+    Attributes:
+        policy: What ``as_player`` was given.
     """
 
     def __init__(
@@ -123,10 +124,10 @@ class Player:
         *,
         made_for: PolicyAbout | None = None,
         is_plain: bool = False,
-        parallel: bool = True,
     ) -> None:
         self._about, self._start = dict(about), start
-        self.made_for, self.is_plain, self.parallel = made_for, is_plain, parallel
+        self.policy: Any = None
+        self.made_for, self.is_plain = made_for, is_plain
         self._env: ScmWorldEnv | None = None
         self._act: Actor | None = None
 
@@ -161,10 +162,6 @@ class Player:
         if self._act is None:
             raise ActionError(f"the policy {name!r} acts in no episode; call begin()", None)
         return checked(self._act(observation), self._env, name)
-
-    def twin(self) -> Player:
-        """Return another player of the policy, for another episode."""
-        return copy(self)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without the episode."""
@@ -324,17 +321,20 @@ def as_player(policy: Any, *, trusted: Sequence[str] | None = None) -> Player:
         >>> about["kind"], player_from(about).about == about
         ('named', True)
     """
-    if isinstance(policy, str | Path):
-        return _of_text(str(policy), trusted)
     if isinstance(policy, Player):
         return policy
-    if isinstance(policy, np.ndarray | list | tuple):
-        return _of_actions(policy, {"kind": "actions", "name": "actions"})
-    if isinstance(policy, Episode | Recorded):
-        return _of_episode(policy, {"kind": "actions", "name": "episode"})
-    if callable(policy) or hasattr(policy, "predict"):
-        return _of_object(policy, _description(policy))
-    raise UnknownOption("policy", policy, FORMS)
+    if isinstance(policy, str | Path):
+        made = _of_text(str(policy), trusted)
+    elif isinstance(policy, np.ndarray | list | tuple):
+        made = _of_actions(policy, {"kind": "actions", "name": "actions"})
+    elif isinstance(policy, Episode | Recorded):
+        made = _of_episode(policy, {"kind": "actions", "name": "episode"})
+    elif callable(policy) or hasattr(policy, "predict"):
+        made = _of_object(policy, _description(policy))
+    else:
+        raise UnknownOption("policy", policy, FORMS)
+    made.policy = policy
+    return made
 
 
 def player_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Player:
@@ -371,7 +371,7 @@ def _of_text(text: str, trusted: Sequence[str] | None) -> Player:
     ours = _library(PACKAGE)
     if text in NAMES:
         about = {"kind": "named", "name": text, **ours}
-        return Player(about, partial(_of_world, partial(_named, text), text), parallel=False)
+        return Player(about, partial(_of_world, partial(_named, text), text))
     part, _, number = text.partition("#")
     if text.startswith(ZOO):
         path, about = file_of(text), {"kind": "zoo", "name": text, **ours}
@@ -454,7 +454,7 @@ def _of_object(policy: Any, about: About) -> Player:
         inside = policy.policy if isinstance(policy, WorldPolicy) else policy
         make = inside if isinstance(inside, type) else partial(_itself, inside)
         start = partial(_of_world, make, about["name"])
-        return Player({**about, "sees": "world"}, start, parallel=False)
+        return Player({**about, "sees": "world"}, start)
     if isinstance(policy, type):
         return _of_object(policy(), about)
     if isinstance(policy, MlpPolicy):
@@ -463,8 +463,7 @@ def _of_object(policy: Any, about: About) -> Player:
         library = type(policy).__module__.partition(".")[0]
         is_plain = library in ("stable_baselines3", "sb3_contrib")  # they keep no state themselves
         return Player(about, partial(_model, policy), is_plain=is_plain)
-    resets = callable(getattr(policy, "reset", None))
-    return Player(about, partial(_function, policy), parallel=not resets)
+    return Player(about, partial(_function, policy))
 
 
 def _description(policy: Any) -> About:

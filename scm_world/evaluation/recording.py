@@ -13,11 +13,12 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
-from scm_world.env.given import doubles, names_of
+from scm_world.env.arguments import doubles, names_of
 from scm_world.env.observer import Observation
+from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -37,9 +38,8 @@ from scm_world.evaluation.recording_files import (
     to_parquet,
 )
 from scm_world.output.durable import write_durably
-from scm_world.output.locations import Location, located
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
-from scm_world.output.remote import said
+from scm_world.output.remote import Location, located, said
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task
@@ -60,6 +60,9 @@ _UNUSED: Mapping[str, Any] = {
     "render_mode": None,
 }
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
+
+_GONE = ("info_contacts", "info_state")
+"""Arguments of earlier versions, which decided nothing that is compared."""
 
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
 
@@ -138,7 +141,8 @@ class Recording:
         """
         if task is None:
             refuse_untrusted(_name(self.environment), self.trusted)
-        arguments = {**self.environment, **_UNUSED}
+        kept = {name: v for name, v in self.environment.items() if name not in _GONE}
+        arguments = {**kept, **_UNUSED}
         unknown = arguments.keys() - inspect.signature(ScmWorldEnv.__init__).parameters.keys()
         if unknown:
             raise SnapshotMismatch(
@@ -339,7 +343,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ) -> None:
         RecordConstructorArgs.__init__(self, infos=infos)
         super().__init__(env)
-        self._inner = _inner(env)
+        self._inner = unwrapped_env(env, "Recorder")
         _refuse_changes(env, self._inner)
         model = self._inner.world.model
         chosen = tuple(name for name in INFOS if name in model) if infos is None else infos
@@ -413,8 +417,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             numbers = {**(before or {}), **dict(_numbers(info))}
             names = tuple(numbers) if names == ALL else names
         for name in names:
-            if name not in numbers:
-                raise UnknownOption("info", name, numbers)
+            one_of("info", name, numbers)
         episode.infos.append({name: numbers[name] for name in names})
         if isinstance(observation, dict):
             copied: Observation = {name: np.array(part) for name, part in observation.items()}
@@ -504,7 +507,7 @@ def record(
     for _ in range(n):
         observation, _info = recorder.reset(**start)
         start = {"options": {"do": do}}  # the next episode, also after attempts that failed
-        player.begin(_inner(env))
+        player.begin(unwrapped_env(env, "Recorder"))
         over = False
         while not over:
             observation, _, ended, cut, _info = recorder.step(player.act(observation))
@@ -512,18 +515,6 @@ def record(
     found = recorder.recording(player.about)
     if out is not None:
         found.save(out)
-    return found
-
-
-def _inner(env: gymnasium.Env[Any, Any]) -> ScmWorldEnv:
-    """Return the environment of this package below its wrappers.
-
-    Raises:
-        UnknownOption: There is none.
-    """
-    found = env.unwrapped
-    if not isinstance(found, ScmWorldEnv):
-        raise UnknownOption("environment", type(found).__name__, ("an environment of scm_world",))
     return found
 
 

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scm_world._arguments import load
 from scm_world._types import Floats, Integers
 from scm_world.env import IDS, MODEL_ID
+from scm_world.env.arguments import asked
 from scm_world.env.observer import Observation
-from scm_world.env.start import asked
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.output.reading import read_table
 from scm_world.policies.cards import RELATIVE, USUAL

@@ -5,34 +5,109 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from hashlib import blake2b
 from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.episodes import FRACTIONS, EpisodeRow
+from scm_world.evaluation.episodes import FRACTIONS, METRICS, EpisodeRow
 from scm_world.evaluation.statistics import (
     LEVEL,
     Causes,
     Interval,
     aggregate,
+    difference_interval,
     find_causes,
+    is_binary,
     mean_interval,
 )
-from scm_world.evaluation.tables import (
-    DRAWN,
-    KEYS,
-    Columns,
-    columns_of,
-    digest_of,
-    is_rate,
-    known,
-    means,
-    measured,
-    paired,
-)
-from scm_world.output.locations import Location, located
+from scm_world.output.remote import Location, located
+
+TEXTS = ("agent", "engine", "protocol", "hash")
+WHOLE = ("run", "seed", "episode", "steps")
+KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
+"""The columns that say which episode a row is of."""
+
+DRAWN = "drawn "
+"""First word of the columns with the values that were drawn."""
+
+Columns = dict[str, NDArray[Any]]
+
+
+def columns_of(rows: Sequence[EpisodeRow]) -> Columns:
+    """Return the table of some episodes: a column of shape (n,) for each field of a row."""
+    found: Columns = {}
+    for name in (*KEYS, "steps"):
+        kind: Any = str if name in TEXTS else np.int64
+        found[name] = np.array([getattr(row, name) for row in rows], dtype=kind)
+    for metric in METRICS:
+        if all(metric in row.scores for row in rows):
+            found[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
+    found["hash"] = np.array([row.hash for row in rows], dtype=str)
+    return {**found, **_drawn(rows)}
+
+
+def _drawn(rows: Sequence[EpisodeRow]) -> Columns:
+    """Give a column for each number of each variable that was drawn; NaN where it was not."""
+    sizes: dict[str, int] = {}
+    for row in rows:
+        for name, values in row.drawn.items():
+            sizes[name] = max(sizes.get(name, 0), len(values))
+    found: Columns = {}
+    for name, size in sizes.items():
+        table = np.full((len(rows), size), np.nan)
+        for place, row in enumerate(rows):
+            values = row.drawn.get(name, [])
+            table[place, : len(values)] = values
+        labels = [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
+        found |= {DRAWN + label: table[:, k].copy() for k, label in enumerate(labels)}
+    return found
+
+
+def means(columns: Columns, metric: str) -> dict[tuple[int, int], float]:
+    """Give the mean score of each episode over the training runs, by seed and number."""
+    found: dict[tuple[int, int], list[float]] = {}
+    seeds, episodes = columns["seed"].tolist(), columns["episode"].tolist()
+    for seed, episode, score in zip(seeds, episodes, columns[metric].tolist(), strict=True):
+        found.setdefault((seed, episode), []).append(score)
+    return {unit: sum(scores) / len(scores) for unit, scores in found.items()}
+
+
+def paired(one: Columns, other: Columns, metric: str) -> Interval:
+    """Estimate by how much the scores of a table are higher, episode by episode.
+
+    Raises:
+        UnknownOption: They do not have the same episodes.
+    """
+    mine, its = means(one, metric), means(other, metric)
+    if mine.keys() != its.keys():
+        differ = sorted(mine.keys() ^ its.keys())[0]
+        allowed = ("episodes that both have played",)
+        raise UnknownOption("seed and episode of a pair", differ, allowed)
+    units = sorted(mine)
+    first, second = (np.array([scores[unit] for unit in units]) for scores in (mine, its))
+    binary = is_rate(metric, first) and is_rate(metric, second)
+    return difference_interval(first, second, proportion=binary)
+
+
+def is_rate(metric: str, scores: NDArray[np.float64]) -> bool:
+    """Tell whether scores are failures and successes: not by chance, as fractions may be."""
+    return metric == "success" and is_binary(scores)
+
+
+def digest_of(columns: Columns) -> str:
+    """Sum up a table, bit for bit, in whatever order its columns are."""
+    found = blake2b(digest_size=16)
+    for name in sorted(columns):
+        column = columns[name]
+        found.update(f"\0{name}\0".encode())
+        text = "\0".join(column) if column.dtype.kind == "U" else ""
+        found.update(text.encode() if text else column.tobytes())
+    return found.hexdigest()
 
 
 @final
@@ -102,7 +177,7 @@ class Evaluation:
     @property
     def metrics(self) -> tuple[str, ...]:
         """What was measured: those of ``METRICS`` that the task has."""
-        return measured(self.columns)
+        return tuple(metric for metric in METRICS if metric in self.columns)
 
     def metric(self, name: str | None = None) -> str:
         """Choose what is looked at; None stands for the first one of ``metrics``.
@@ -113,7 +188,9 @@ class Evaluation:
         Raises:
             UnknownOption: Nothing of this name was measured.
         """
-        return known(self.columns, name)
+        if name is not None and name not in self.metrics:
+            raise UnknownOption("metric", name, self.metrics)
+        return self.metrics[0] if name is None else name
 
     def runs(self, agent: str) -> tuple[int, ...]:
         """List the training runs of an agent."""
@@ -127,8 +204,7 @@ class Evaluation:
         """
         kept = np.ones(len(self), dtype=bool)
         for name, value in wanted.items():
-            if name not in KEYS:
-                raise UnknownOption("column", name, KEYS)
+            one_of("column", name, KEYS)
             if value is not None:
                 if value not in self._listed(name):
                     raise UnknownOption(name, value, tuple(map(str, self._listed(name))))
@@ -145,8 +221,7 @@ class Evaluation:
         known = self._listed(name)
         if given is None and len(known) == 1:
             return str(known[0])
-        if given not in known:
-            raise UnknownOption(name, given, known)
+        one_of(name, given, known)
         return str(given)
 
     # --- what it says -------------------------------------------------------------------------
@@ -326,6 +401,3 @@ class Evaluation:
         from scm_world.evaluation.files import load
 
         return load(located(path))
-
-
-__all__ = ["DRAWN", "KEYS", "Columns", "Evaluation"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import blake2b
@@ -12,20 +12,24 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world.backends import backends
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.agents import AgentRun, LoadedAgent, load_agents, source_of
-from scm_world.evaluation.benchmark import protocols_of
+from scm_world.evaluation.agents import (
+    AgentRun,
+    in_form,
+    load_agents,
+    shared_options,
+    source_of,
+    task_for,
+)
 from scm_world.evaluation.episodes import EpisodeRunner
-from scm_world.evaluation.forms import form_of, in_form, shared_options, task_for
-from scm_world.evaluation.protocols import Protocol, chosen
+from scm_world.evaluation.protocols import Protocol, chosen, protocols_of
 from scm_world.models import Model
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import PACKAGE
 from scm_world.tasks import TASKS, Task, make_task, tasks
-from scm_world.work.executors import Executor
 
 SHARD = 25
 """Episodes that are played and written down at once."""
@@ -46,21 +50,6 @@ class EvaluationPlace:
 
     task: Task | str
     options: Mapping[str, Any] = field(default_factory=dict)
-
-    def refuse_unsent(self, executor: Executor) -> None:
-        """Refuse a task that other processes cannot be given.
-
-        Raises:
-            UnknownOption: With what to do.
-        """
-        try:
-            executor.check("task with several workers", self.task)
-        except UnknownOption as error:
-            allowed = (
-                "a name, a file or 'module:function' for a function that makes it",
-                f"workers=None ({error})",
-            )
-            raise UnknownOption("task with several workers", self.name, allowed) from error
 
     def env(self, engine: str, form: Mapping[str, Any] | None = None) -> ScmWorldEnv:
         """Make the environment on an engine.
@@ -94,9 +83,10 @@ class EvaluationPlace:
             ModelError: Something of it cannot be written down.
         """
         arguments = {} if isinstance(self.task, str) else self.task.given
-        kind = type(self.made)
+        kind, own = type(self.made), dict[str, Any]()
         is_ours = kind.__module__.partition(".")[0] == PACKAGE and isinstance(self.task, str)
-        own = {} if is_ours or kind is TASKS.get(self.name) else {"class": _class(kind)}
+        if not (is_ours or kind is TASKS.get(self.name)):
+            own["class"] = _plain(kind)
         system = getattr(self.made, "system", None)
         if isinstance(system, Model):
             arguments = {name: value for name, value in arguments.items() if name != "model"}
@@ -111,12 +101,6 @@ class EvaluationPlace:
             )
         except (TypeError, ValueError) as error:
             raise ModelError([f"the environment cannot be written down: {error}"]) from None
-
-
-def _class(kind: type[Task]) -> str:
-    """Name a class of tasks that is none of this package, and sum up its text."""
-    text = blake2b(source_of(kind), digest_size=8).hexdigest()
-    return f"{kind.__module__}:{kind.__qualname__} {text}"
 
 
 @final
@@ -256,7 +240,17 @@ def prepare(
         ScmWorldError: What is wrong, by name.
     """
     loaded = load_agents(policy, trusted)
-    place = _place(task, env, loaded, trusted or ())
+    trained = [(agent.agent, agent.player.made_for) for agent in loaded]
+    task = task_for(task, trained, trusted or ())
+    if not isinstance(task, Task | str):
+        raise UnknownOption("task", task, tasks())
+    if not isinstance(env, Mapping | None):
+        raise UnknownOption("env", env, ("options of the environment, by name",))
+    allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]
+    for name in env or {}:
+        one_of("option of the environment", name, allowed)
+    place = EvaluationPlace(task, shared_options(env, trained))
+    place.made  # noqa: B018 # refuses a task that is not there
     engines = _several("backend", backend)
     for engine in engines:
         if not isinstance(engine, str) or engine not in backends():
@@ -264,7 +258,10 @@ def prepare(
     known = protocols_of(place.made if place.name not in tasks() else place.name, engines[0])
     wanted = chosen(protocols, known)
     count = whole_number("n", n, least=1)
-    noises = tuple(_seed(seed) for seed in _several("seeds", seeds))
+    noises = tuple(whole_number("seed", seed, least=0) for seed in _several("seeds", seeds))
+    for noise in noises:
+        if noise >= 2**63:
+            raise UnknownOption("seed", noise, ("any whole number below 2**63",))
     found: dict[str, dict[str, str]] = {}
     agents: tuple[AgentRun, ...] = ()
     for engine in engines:
@@ -273,7 +270,13 @@ def prepare(
             for protocol in wanted:
                 runner.try_out(protocol, seed=noises[0])
             found[engine] = versions(runner.env.world.engine)
-            agents = agents or tuple(_tried_out(loaded, place, runner.env))
+            for agent in loaded if len(agents) < len(loaded) else ():  # on the first engine
+                own = runner.env if agent.form is None else place.env(engine, agent.form)
+                try:
+                    agents += (agent.tried_out(own),)
+                finally:
+                    if own is not runner.env:
+                        own.close()
         finally:
             runner.close()
     setup = Setup(place, agents, engines, wanted, noises, count, found)
@@ -291,48 +294,8 @@ def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
     Raises:
         ScmWorldError: A policy cannot be read, or they were trained for several tasks.
     """
-    agents = [(agent.agent, agent.made_for) for agent in load_agents(policy, trusted)]
+    agents = [(agent.agent, agent.player.made_for) for agent in load_agents(policy, trusted)]
     return str(task_for(None, agents, trusted or ()))
-
-
-def _tried_out(
-    loaded: Sequence[LoadedAgent], place: EvaluationPlace, shared: ScmWorldEnv
-) -> Iterator[AgentRun]:
-    """Try everybody out, each in an environment of its own form if it has one."""
-    engine = shared.world.backend.name
-    for agent in loaded:
-        form = form_of(agent.made_for)
-        env = shared if form is None else place.env(engine, form)
-        try:
-            yield agent.tried_out(env)
-        finally:
-            if env is not shared:
-                env.close()
-
-
-def _place(
-    task: Task | str | None, env: Any, loaded: Sequence[LoadedAgent], trusted: Sequence[str]
-) -> EvaluationPlace:
-    agents = [(agent.agent, agent.made_for) for agent in loaded]
-    task = task_for(task, agents, trusted)
-    if not isinstance(task, Task | str):
-        raise UnknownOption("task", task, tasks())
-    if not isinstance(env, Mapping | None):
-        raise UnknownOption("env", env, ("options of the environment, by name",))
-    allowed = [name for name in inspect.signature(ScmWorldEnv).parameters if name not in _MINE]
-    for name in env or {}:
-        if name not in allowed:
-            raise UnknownOption("option of the environment", name, allowed)
-    place = EvaluationPlace(task, shared_options(env, agents))
-    place.made  # noqa: B018 # refuses a task that is not there
-    return place
-
-
-def _seed(seed: Any) -> int:
-    found = whole_number("seed", seed, least=0)
-    if found >= 2**63:
-        raise UnknownOption("seed", seed, ("any whole number below 2**63",))
-    return found
 
 
 def _several(option: str, given: Any) -> tuple[Any, ...]:

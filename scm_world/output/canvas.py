@@ -8,7 +8,7 @@ from functools import wraps
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from scm_world.output.durable import write_durably
-from scm_world.output.locations import Location
+from scm_world.output.remote import Location
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,8 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from scm_world.errors import UnreadableFile, UnwritableFolder
-from scm_world.output.locations import Location, located
-from scm_world.output.remote import PARTIAL, Remote, draft_name, said
+from scm_world.output.remote import PARTIAL, Location, Remote, draft_name, located, said
 
 
 def is_draft(name: str, of: str = "") -> bool:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import load
-from scm_world.output.locations import Location, located
-from scm_world.output.remote import Remote
+from scm_world.output.remote import Location, Remote, located
 
 LARGEST = 2**28
 """Bytes of a text, a model or a policy: more is none."""

@@ -4,7 +4,6 @@ from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import (
     Layer,
     MlpPolicy,
-    NetworkPolicy,
     load_policy,
     load_sb2,
     save_policy,
@@ -15,7 +14,6 @@ from scm_world.policies.zoo import file_of
 __all__ = [
     "Layer",
     "MlpPolicy",
-    "NetworkPolicy",
     "OnnxPolicy",
     "PolicyAbout",
     "file_of",

@@ -40,8 +40,8 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
 from scm_world.output.durable import write_durably
-from scm_world.output.locations import Location, located
 from scm_world.output.reading import LARGEST, read_arrays, read_bytes, refuse_large, regular
+from scm_world.output.remote import Location, located
 from scm_world.policies.cards import KEY, PolicyAbout
 from scm_world.tasks import tasks
 
@@ -63,6 +63,7 @@ class Layer(NamedTuple):
     bias: Weights
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class MlpPolicy:
     """A normal distribution over actions whose mean is a multilayer perceptron.
@@ -83,7 +84,7 @@ class MlpPolicy:
     made_for: PolicyAbout | None = None
 
     def __post_init__(self) -> None:
-        kind = tasks().get(self._form.task)
+        kind = tasks().get(self.about.task)
         wanted = len(kind.rest) or None if kind is not None else None
         problems = [*_misfits("layers", self.layers, None, wanted)]
         if self.value and not problems:
@@ -96,7 +97,8 @@ class MlpPolicy:
             raise ModelError(problems)
 
     @property
-    def _form(self) -> PolicyAbout:
+    def about(self) -> PolicyAbout:
+        """What it was trained for, and how; if that is not known, what it is taken for."""
         return self.made_for or _ANY
 
     @property
@@ -131,7 +133,7 @@ class MlpPolicy:
             if self.log_std is None:
                 raise UnknownOption("generator", generator, ("None: there is no log_std",))
             found = found + np.exp(self.log_std) * generator.standard_normal(found.shape)
-        found = np.tanh(found) if self._form.output == "tanh" else np.clip(found, -1.0, 1.0)
+        found = np.tanh(found) if self.about.output == "tanh" else np.clip(found, -1.0, 1.0)
         return found.astype(np.float32)
 
     def mean(self, observation: Any) -> Floats:
@@ -152,7 +154,7 @@ class MlpPolicy:
     def _computed(self, layers: tuple[Layer, ...], seen: NDArray[Any]) -> Floats:
         x = np.ascontiguousarray(seen.reshape(-1, self.n_observed), dtype=np.float64)
         doubles = self._doubles if layers is self.layers else _in_doubles(layers)
-        hidden = 1 if self._form.activation == "tanh" else 2
+        hidden = 1 if self.about.activation == "tanh" else 2
         for number, (weight, bias) in enumerate(doubles, start=1):
             x = _dense(x, weight, bias, hidden if number < len(layers) else 0)
         return x.reshape(*seen.shape[:-1], x.shape[1])
@@ -163,7 +165,7 @@ class MlpPolicy:
 
     def joined(self, observation: Any) -> NDArray[Any]:
         """Join the parts of an observation, shape (..., n); errors as above."""
-        inputs = self._form.inputs
+        inputs = self.about.inputs
         if isinstance(observation, Mapping):
             if inputs is None or not observation.keys() >= set(inputs):
                 wanted = "one array" if inputs is None else f"the parts {[*inputs]}"
@@ -239,12 +241,17 @@ class MlpPolicy:
         return hashlib.sha256(self.content()).hexdigest()
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Any], made_for: PolicyAbout | None = None) -> Self:
-        """Make a policy from tensors by name, 32-bit floats; a weight has shape (outputs, inputs).
+    def of(cls, tensors: Mapping[str, Any], about: Any = None) -> Self:
+        """Make a policy from the tensors, and the metadata, of a file.
+
+        Args:
+            tensors: By name, 32-bit floats; a weight has shape (outputs, inputs).
+            about: What it was trained for, if known: a ``PolicyAbout``, its fields, or its JSON.
 
         Raises:
             ModelError: There are others, or they do not fit; all problems.
         """
+        made_for = None if about is None else PolicyAbout.of(about)
         wrong = [
             f"{name}: expected an array of float32, "
             f"got {getattr(array, 'dtype', type(array).__name__)}"
@@ -267,37 +274,16 @@ class MlpPolicy:
         return cls(networks[0], log_std, networks[1], made_for)
 
 
-@final
-class NetworkPolicy(MlpPolicy):
-    """A multilayer perceptron with the metadata of a policy file."""
-
-    @property
-    def about(self) -> PolicyAbout:
-        """What the policy was trained for, and how."""
-        return self._form
-
-    @classmethod
-    def of(
-        cls, tensors: Mapping[str, Any], about: PolicyAbout | Mapping[str, Any]
-    ) -> NetworkPolicy:
-        """Make a policy from the tensors and the metadata of a file.
-
-        Raises:
-            ModelError: They do not fit; all problems.
-        """
-        return cls.from_tensors(tensors, PolicyAbout.of(about))
-
-
 def save_policy(
     path: Location | str,
-    network: NetworkPolicy | Mapping[str, Any],
+    network: MlpPolicy | Mapping[str, Any],
     about: PolicyAbout | Mapping[str, Any] | None = None,
 ) -> Location:
     """Write a trained policy, whole or not at all.
 
     Args:
         path: Of the file; it ends in ``.safetensors``.
-        network: A policy, or its tensors by name; see ``NetworkPolicy.of``.
+        network: A policy, or its tensors by name; see ``MlpPolicy.of``.
         about: What it was trained for; that of the policy if None.
 
     Returns:
@@ -311,13 +297,13 @@ def save_policy(
     target = located(path)
     if target.suffix != ".safetensors":
         raise UnknownOption("ending of a policy file", target.suffix, (".safetensors",))
-    tensors = network.tensors() if isinstance(network, NetworkPolicy) else network
-    said = network.about if about is None and isinstance(network, NetworkPolicy) else about
-    write_durably(target, NetworkPolicy.of(tensors, {} if said is None else said).content())
+    tensors = network.tensors() if isinstance(network, MlpPolicy) else network
+    said = network.made_for if about is None and isinstance(network, MlpPolicy) else about
+    write_durably(target, MlpPolicy.of(tensors, {} if said is None else said).content())
     return target
 
 
-def load_policy(path: Path | str) -> NetworkPolicy:
+def load_policy(path: Path | str) -> MlpPolicy:
     """Read a trained policy. Nothing in the file is executed.
 
     Args:
@@ -339,7 +325,7 @@ def load_policy(path: Path | str) -> NetworkPolicy:
     if text is None:
         raise UnreadableFile(name, f"its metadata has no {KEY!r}, what it is for", _SAVED)
     try:
-        return NetworkPolicy.of(tensors, text)
+        return MlpPolicy.of(tensors, text)
     except ModelError as error:
         raise UnreadableFile(name, "; ".join(error.problems), _SAVED) from None
 
@@ -371,7 +357,7 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
             for number, layer in enumerate((*hidden, last)):
                 tensors[f"{prefix}.{number}.weight"] = found[f"model/{layer}/w:0"].T
                 tensors[f"{prefix}.{number}.bias"] = found[f"model/{layer}/b:0"]
-        return MlpPolicy.from_tensors(tensors)
+        return MlpPolicy.of(tensors)
     except KeyError as error:
         raise UnreadableFile(name, f"it has no entry {error.args[0]!r}", _ARCHIVE) from None
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:  # or encrypted

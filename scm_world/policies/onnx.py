@@ -29,6 +29,7 @@ class OnnxPolicy:
 
     Args:
         path: Of the ONNX file.
+        content: That was read from it; if None it is read.
 
     Attributes:
         made_for: What it was trained for: the metadata entry ``"scm_world"``, if there is one.
@@ -39,7 +40,7 @@ class OnnxPolicy:
         UnreadableFile: It is no network, or its metadata entry is no ``PolicyAbout``.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, content: bytes | None = None) -> None:
         runtime: Any = load("onnxruntime", "onnxruntime", "onnx")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -48,9 +49,10 @@ class OnnxPolicy:
         options.log_severity_level = 4  # it raises what it would print
         self._path, self.library = path, f"onnxruntime {runtime.__version__}"
         try:
-            content = read_bytes(path)
+            content = read_bytes(path) if content is None else content
             if _ELSEWHERE in content:
                 raise ValueError("its weights lie in another file; save it as one file")
+            self._content = content
             cpu = ["CPUExecutionProvider"]
             self._session = runtime.InferenceSession(content, options, providers=cpu)
         except Exception as error:  # its errors have no class of their own in common
@@ -65,8 +67,8 @@ class OnnxPolicy:
             raise UnreadableFile(str(path), reason, _ADVICE) from None
 
     def __reduce__(self) -> Any:
-        """Pickle the path; a copy reads the file again."""
-        return type(self), (self._path,)
+        """Pickle what was read: the file may change meanwhile."""
+        return type(self), (self._path, self._content)
 
     def check(self, observation: Any, n_actions: int) -> None:
         """Check that the network takes an observation; its action is checked when it acts.

@@ -33,7 +33,7 @@ from scm_world.queries.timed import On
 from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, threaded
 from scm_world.tasks.base import Blind
 from scm_world.work.executors import Executor
-from scm_world.work.threads import cores
+from scm_world.work.processes import cores
 from scm_world.world import World
 from scm_world.world.batch import Batch
 

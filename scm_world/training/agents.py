@@ -16,17 +16,18 @@ from typing import Any, final
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.env import IDS
-from scm_world.env.batched.executor import fastest
+from scm_world.env.batched.vector_env import fastest
 from scm_world.errors import Diverged, MissingExtra, UnknownOption, UnreadableFile
 from scm_world.output.durable import made, write_durably, write_whole
 from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress
 from scm_world.training.export import begin_with, exported, mean, scored, words
 from scm_world.training.recipe import Recipe, curriculum_of
-from scm_world.training.sb3 import Sb3VecEnv, sb3_vec_env
+from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Rate
 
 try:
@@ -67,7 +68,7 @@ class Episodes(VecMonitor):
     """Counts episodes, and keeps the actions of those under way, so that they can be run again.
 
     Args:
-        env: What ``sb3_vec_env`` made.
+        env: The worlds.
         length: Control steps of an episode.
         staggered: Whether worlds begin at different steps of their episodes: else a batch shows
             one place of all episodes only.
@@ -150,7 +151,7 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
         **recipe.trained_in,
     )
     try:
-        vec_env = sb3_vec_env(envs, [])
+        vec_env = Sb3VecEnv(envs, [])
         there = vec_env.executor.buffers.infos
         vec_env.names = tuple(name for name in (SUCCESS, FRACTION) if name in there)
         (length,) = vec_env.get_attr("limit", 0)
@@ -212,8 +213,7 @@ def device_for(recipe: Recipe, device: str) -> str:
     Raises:
         UnknownOption: There is no such device.
     """
-    if device not in ("auto", "cpu", "cuda"):
-        raise UnknownOption("device", device, ("auto", "cpu", "cuda"))
+    one_of("device", device, ("auto", "cpu", "cuda"))
     has_gpu = device != "cpu" and torch.cuda.is_available()
     if device == "cuda" and not has_gpu:
         raise UnknownOption("device", device, ("cpu: torch finds no GPU here",))

@@ -14,17 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator
 
-from scm_world._arguments import load, whole_number
+from scm_world._arguments import load, one_of, whole_number
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.episodes import EpisodeRunner
-from scm_world.evaluation.protocols import chosen
+from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording
 from scm_world.output.durable import locked, made, write_durably
 from scm_world.output.reading import read_arrays
-from scm_world.policies import NetworkPolicy, load_policy, save_policy
+from scm_world.policies import MlpPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
@@ -33,6 +32,8 @@ from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
 from scm_world.training.loop import Tell, open_folder, torch_threads
 from scm_world.training.settings import (
+    ENV,
+    LESSONS,
     Count,
     Network,
     NotNegative,
@@ -46,7 +47,6 @@ from scm_world.training.settings import (
     observed,
     refused,
 )
-from scm_world.training.tuned import ENV, LESSONS
 from scm_world.variables.spaces import Frozen
 
 SHARD = 25
@@ -132,8 +132,7 @@ class Lesson(Frozen):
     @classmethod
     def _of_a_policy(cls, env: dict[str, Any]) -> dict[str, Any]:
         for name, value in env.items():
-            if name not in OPTIONS:
-                raise UnknownOption("option of the environment of a lesson", name, OPTIONS)
+            one_of("option of the environment of a lesson", name, OPTIONS)
             if value not in (allowed := ONLY.get(name, (value,))):
                 raise UnknownOption(
                     f"{name} of a lesson", value, [json.dumps(one) for one in allowed]
@@ -207,12 +206,6 @@ class Demonstrations:
         return len(self.observations)
 
 
-def _save(shown: Demonstrations, path: Path) -> None:
-    stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **vars(shown))
-    write_durably(path, stream.getvalue())
-
-
 def _load(path: Path) -> Demonstrations:
     """Read a file of demonstrations.
 
@@ -264,7 +257,7 @@ def demonstrated(
     backend: str,
     seed: int,
     round_: int = 0,
-    learner: NetworkPolicy | None = None,
+    learner: MlpPolicy | None = None,
 ) -> Demonstrations:
     """Let the teacher show some episodes; those that do not end well are left out.
 
@@ -320,7 +313,7 @@ def _episode(
     turn: Any,
     observation: Any,
     random: np.random.Generator,
-    learner: NetworkPolicy | None,
+    learner: MlpPolicy | None,
 ) -> tuple[list[tuple[Any, Any]], dict[str, Any]]:
     """Run an episode; return what was observed and what the teacher would have done, and infos."""
     teacher, size = NAMED[lesson.teacher](), env.world.compiled.n_actions
@@ -560,7 +553,7 @@ def clone(
     else:
         engine = _checked(lesson, backend, number)
     identity = {"lesson": lesson.about(), "seed": number, "backend": backend, "recording": digest}
-    policies: list[NetworkPolicy] = []
+    policies: list[MlpPolicy] = []
     with locked(folder), torch_threads(1):
         open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)
         for round_ in range(lesson.rounds + 1):
@@ -588,7 +581,7 @@ def clone(
                 }
                 form: dict[str, Any] = {"task": lesson.task, "env": lesson.options, "card": card}
                 form["activation"] = lesson.network.activation
-                policy = NetworkPolicy.of(tensors, form)
+                policy = MlpPolicy.of(tensors, form)
                 scores: dict[str, float] = {}
                 if lesson.trials.protocols:
                     given_to = (lesson.task, lesson.options, lesson.trials, backend)
@@ -633,7 +626,10 @@ def _collected(
         path = folder / "demonstrations" / f"{round_:02}-{begin:06}.npz"
         made(path.parent)
         if not path.exists():
-            _save(demonstrated(lesson, numbers, round_=round_, **how), path)
+            stream = io.BytesIO()
+            shown = demonstrated(lesson, numbers, round_=round_, **how)
+            np.savez(stream, allow_pickle=False, **vars(shown))
+            write_durably(path, stream.getvalue())
         found.append(_load(path))
         if progress is not None:
             progress(numbers.stop, lesson.episodes + lesson.rounds * lesson.more)

@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, final
 
-from scm_world._arguments import load, whole_number
+from scm_world._arguments import load, one_of, whole_number
 from scm_world.backends import backends
 from scm_world.errors import DAMAGED, Diverged, UnknownOption, UnreadableFile
 from scm_world.evaluation.setups import EvaluationPlace
@@ -113,9 +113,8 @@ def train(
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
     count = None if threads is None else whole_number("threads", threads, least=1)
-    if backend not in backends():
-        raise UnknownOption("backend", backend, backends())
-    first = None if start is None else named(start)
+    one_of("backend", backend, backends())
+    first = None if start is None else file_of(start)
     given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
     given["device"] = agents.device_for(recipe, device)
     identity = identity_of(recipe, first, **given)
@@ -187,16 +186,6 @@ def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
         if is_main:
             signal.signal(signal.SIGINT, before)
         model.logger.close()
-
-
-def named(start: Path | str) -> Path:
-    """Return the file of a policy: of a run, of the zoo, or the one that is given.
-
-    Raises:
-        UnknownOption: There is none of this name in the zoo.
-        UnreadableFile: The folder is of no run.
-    """
-    return file_of(start)
 
 
 @contextmanager
@@ -279,14 +268,12 @@ def open_folder(
             old = there.get("versions", {}).get(name, one)
             if old != one:
                 tell(f"{name} was {old} and is {one} now: the last bits may be others")
-    elif strangers := sorted(n for n in _names(folder) if not is_draft(n, path.name)):
+    elif folder.exists() and (
+        strangers := sorted(p.name for p in folder.iterdir() if not is_draft(p.name, path.name))
+    ):
         reason = f"it holds something else: {', '.join(strangers[:5])}"
         raise UnreadableFile(str(folder), reason, "give an empty folder, or a new one")
     write_whole(json.dumps({"format": form, **card}, indent=2, allow_nan=False), path)
-
-
-def _names(folder: Path) -> list[str]:
-    return [path.name for path in folder.iterdir()] if folder.exists() else []
 
 
 def _flat(data: Any, where: str = "") -> dict[str, Any]:

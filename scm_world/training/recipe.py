@@ -18,23 +18,23 @@ from pydantic import (
     model_validator,
 )
 
+from scm_world._arguments import one_of
 from scm_world.curricula import Curriculum, as_curriculum, everything, goals
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
-from scm_world.evaluation.benchmark import protocols_of
-from scm_world.evaluation.protocols import chosen
+from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.output.reading import read_text
 from scm_world.tasks import TASKS, make_task, tasks
 from scm_world.tasks.factories import refuse_untrusted
 from scm_world.training.settings import (
     ALGORITHMS,
+    AlgorithmSettings,
     Count,
     Hindsight,
     Network,
     Observations,
     Ppo,
     Rate,
-    Settings,
     TaskName,
     Trials,
     known_task,
@@ -42,8 +42,8 @@ from scm_world.training.settings import (
     nested,
     observed,
     refused,
+    tuned,
 )
-from scm_world.training.tuned import tuned
 from scm_world.variables.spaces import Frozen
 
 FORMAT = "scm_world/recipe/1"
@@ -100,7 +100,7 @@ class Recipe(Frozen):
     curriculum: dict[str, Any] = Field(default_factory=PUBLISHED[0].as_dict)
     worlds: Count = 64
     steps: Count = 1_000_000
-    settings: SerializeAsAny[Settings] = Field(default_factory=Ppo)
+    settings: SerializeAsAny[AlgorithmSettings] = Field(default_factory=Ppo)
     rate: Rate = Field(default_factory=Rate)
     network: Network = Field(default_factory=Network)
     scale_rewards: bool = False
@@ -116,8 +116,7 @@ class Recipe(Frozen):
     def _plain(cls, env: dict[str, Any]) -> dict[str, Any]:
         known = [name for name in signature(ScmWorldEnv).parameters if name not in RESERVED]
         for name in env:
-            if name not in known:
-                raise UnknownOption("option of the environment in a recipe", name, known)
+            one_of("option of the environment in a recipe", name, known)
         if env.get("observation_mode") == "pixel":
             allowed = ("structured", "full", "custom: networks here take vectors of numbers")
             raise UnknownOption("observation_mode of a recipe", "pixel", allowed)
@@ -294,8 +293,7 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
         True
     """
     known_task(task)
-    if algo not in ALGORITHMS:
-        raise UnknownOption("algorithm", algo, ALGORITHMS)
+    one_of("algorithm", algo, ALGORITHMS)
     fields: dict[str, Any] = {"task": task, "algo": algo, "name": "tuned", **tuned(task, algo)}
     if task not in TASKS:
         names: tuple[str, ...] = ("P0",)

@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from scm_world.env.batched import EnvExecutor, ScmWorldVectorEnv
+from scm_world._arguments import one_of
+from scm_world.env.batched import LoopExecutor, ScmWorldVectorEnv
 from scm_world.errors import MissingExtra, UnknownOption
 
 try:
@@ -30,15 +31,16 @@ def make_sb3(
     Args:
         env_id: Such as ``"scm_world/Pushing-v0"``.
         num_envs: How many.
-        infos: As in ``sb3_vec_env``.
+        infos: As in ``Sb3VecEnv``.
         options: Of ``gymnasium.make_vec``.
     """
     mode = AutoresetMode.SAME_STEP
-    return sb3_vec_env(gymnasium.make_vec(env_id, num_envs, autoreset_mode=mode, **options), infos)
+    return Sb3VecEnv(gymnasium.make_vec(env_id, num_envs, autoreset_mode=mode, **options), infos)
 
 
-def sb3_vec_env(envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = USUAL) -> Sb3VecEnv:
-    """Give many worlds the interface of Stable-Baselines3's ``VecEnv``.
+@final
+class Sb3VecEnv(VecEnv):
+    """Many worlds behind the interface of Stable-Baselines3's ``VecEnv``.
 
     Rewards, observations and flags are those that its ``DummyVecEnv`` makes of as many single
     environments, value by value.
@@ -48,37 +50,29 @@ def sb3_vec_env(envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = US
         infos: What is told of ``info`` at every step; all of it if None. Building dictionaries
             takes time: the algorithms read ``is_success`` alone, besides what ends an episode.
 
-    Raises:
-        UnknownOption: Episodes do not begin in the step that ends the last one, or nothing in
-            ``info`` has such a name.
-    """
-    mode = envs.metadata.get("autoreset_mode")
-    if mode is not AutoresetMode.SAME_STEP:
-        raise UnknownOption("autoreset_mode", mode, (AutoresetMode.SAME_STEP.value,))
-    if not isinstance(envs.unwrapped, ScmWorldVectorEnv):
-        raise UnknownOption("envs", envs, ("what gymnasium.make_vec makes of a task",))
-    return Sb3VecEnv(envs, infos)
-
-
-@final
-class Sb3VecEnv(VecEnv):
-    """Many worlds behind Stable-Baselines3's vector interface; see ``sb3_vec_env``.
-
     Attributes:
         worlds: For all that Stable-Baselines3 knows nothing of: ``do``, ``branch``, …
         executor: What simulates them.
         names: What is told of ``info`` at every step; all of it if None.
+
+    Raises:
+        UnknownOption: Episodes do not begin in the step that ends the last one, or nothing in
+            ``info`` has such a name.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None) -> None:
+    def __init__(self, envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = USUAL) -> None:
+        mode = envs.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise UnknownOption("autoreset_mode", mode, (AutoresetMode.SAME_STEP.value,))
+        if not isinstance(envs.unwrapped, ScmWorldVectorEnv):
+            raise UnknownOption("envs", envs, ("what gymnasium.make_vec makes of a task",))
         self.worlds: Any = envs
         bare: Any = envs.unwrapped
-        self.executor: EnvExecutor = bare.executor
+        self.executor: LoopExecutor = bare.executor
         known = self.executor.buffers.infos
         self.names = infos and tuple(name for name in infos if name in known or name not in USUAL)
         for name in self.names or ():
-            if name not in known:
-                raise UnknownOption("info", name, known)
+            one_of("info", name, known)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:

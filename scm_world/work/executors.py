@@ -21,8 +21,7 @@ from types import TracebackType
 from typing import Any, Generic, Self, TypeVar, final
 
 from scm_world.errors import EngineFailure, UnknownOption
-from scm_world.work.processes import PROCESS, Ended, Worker, pickled
-from scm_world.work.threads import cores, single_threaded
+from scm_world.work.processes import PROCESS, Ended, Worker, cores, pickled, single_threaded
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

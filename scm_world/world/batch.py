@@ -12,7 +12,7 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.variables.reserved import CONTROL_INDEX
-from scm_world.work.threads import cores
+from scm_world.work.processes import cores
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.world import World
 

@@ -55,13 +55,14 @@ def test_d04_the_command_is_normalized_once() -> None:
 @pytest.mark.parametrize("backend", ENGINES)
 def test_d06_contacts_are_told_for_every_finger(backend: str) -> None:
     """Three tips that press on the floor are three contacts, each with a force of about 7 N."""
-    env = make(backend=backend, info_contacts=True, action_mode=TIPS, normalize_actions=False)
+    env = make(backend=backend, action_mode=TIPS, normalize_actions=False)
     start = {"robot_height": 0.32, "tool_block.cartesian_position": [0.0, 0.0, 0.0325]}
     env.reset(seed=0, options={"do": start})
     target = env.unwrapped.world[TIPS] * np.tile([0.6, 0.6, 0.0], 3)
     for _ in range(25):
-        info = env.step(target)[-1]
-    forces = {frozenset(touch["bodies"]): float(touch["force"]) for touch in info["contacts"]}
+        env.step(target)
+    touches = env.unwrapped.world.backend.contacts()
+    forces = {frozenset(touch.bodies): float(touch.force) for touch in touches}
     for finger in hardware.FINGERS:
         force = forces[frozenset({"floor", f"robot_finger_{finger}_link_3"})]
         assert 5.0 < force < 9.0  # [N], from 0.36 N m at a leg that is bent

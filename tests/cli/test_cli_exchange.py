@@ -29,7 +29,7 @@ def test_every_format_is_on_offer() -> None:
     assert {form.value for form in Format} == {"table", "json", "png", *FORMATS}
 
 
-@pytest.mark.parametrize("form", ["dot", "gml", "graphml", "node-link"])
+@pytest.mark.parametrize("form", ["gml", "graphml", "node-link"])
 def test_what_is_printed_can_be_read(form: str, pushing: CausalGraph) -> None:
     """Formats with attributes give back the whole graph."""
     result = call("pushing", "--format", form)
@@ -37,9 +37,9 @@ def test_what_is_printed_can_be_read(form: str, pushing: CausalGraph) -> None:
     assert read_graph(result.stdout, format=form) == pushing
 
 
-@pytest.mark.parametrize("form", ["dagitty", "csv"])
-def test_slices_are_put_together_again(form: str, pushing: CausalGraph, tmp_path: Path) -> None:
-    """Formats without time give back names and lags, from a file, too."""
+def test_slices_are_put_together_again(pushing: CausalGraph, tmp_path: Path) -> None:
+    """A format without time gives back names and lags, from a file, too."""
+    form = "csv"
     file = tmp_path / "deep" / "graph.txt"
     result = call("pushing", "--format", form, "--out", str(file))
     assert (result.exit_code, result.stdout) == (0, "")

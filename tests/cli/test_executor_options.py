@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 from scm_world.cli import app
 from scm_world.cli.options import open_executor
 from scm_world.errors import UnknownOption
-from scm_world.work.threads import cores
+from scm_world.work.processes import cores
 
 FAKE = ("--backend", "fake", "--format", "csv")
 SHORT = ("--env", "max_episode_length=1", "--protocols", "P0")

@@ -42,12 +42,12 @@ def call(*arguments: str) -> Result:
     return CliRunner().invoke(app, [*arguments])
 
 
-def test_graph_and_variables_take_options() -> None:
+def test_graph_takes_options() -> None:
     """The declared graph is that of the variant, and so are the tables."""
     shown = call("graph", "general", "--format", "json", *SMALL).stdout
     small = World(load_task("general", ["nums_objects=2"]), backend="fake").model
     assert from_json(shown) == small
-    tables = [call("variables", "general", *given).stdout for given in (SMALL, ())]
+    tables = [call("graph", "general", *given).stdout for given in (SMALL, ())]
     assert tables[0] != tables[1]
 
 
@@ -84,7 +84,7 @@ def test_a_do_may_change_what_there_is() -> None:
 def test_a_factory_that_fails_is_named(text: str, message: str) -> None:
     """With the cause, and without a traceback."""
     Path("own.py").write_text(text)
-    result = call("variables", "own.py:make")
+    result = call("graph", "own.py:make")
     assert result.exit_code == 2
     assert message in " ".join(result.stderr.split())
     assert "Traceback" not in result.output
@@ -141,6 +141,7 @@ def test_values_of_all_kinds_are_read() -> None:
         ("stacked_blocks", "num_of_levels=200", "num_of_levels"),
         ("stacked_blocks", "weights=best", "weights"),
         ("pushing", "terms=1", "terms"),
+        ("stacked_blocks", "num_of_levels=many", "num_of_levels"),
     ],
 )
 def test_wrong_options_are_refused(task: str, argument: str, message: str) -> None:
@@ -149,7 +150,7 @@ def test_wrong_options_are_refused(task: str, argument: str, message: str) -> No
         load_task(task, [argument])
 
 
-@pytest.mark.parametrize("argument", ["num_of_levels=many", "num_of_levels", "num_of_levels="])
+@pytest.mark.parametrize("argument", ["num_of_levels", "num_of_levels="])
 def test_what_cannot_be_read_is_refused(argument: str) -> None:
     """The message is about ``--option``."""
     with pytest.raises(typer.BadParameter) as caught:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from curriculum_envs import PUSHING
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from scm_world.curricula import (
+    CurriculumEnv,
+    CurriculumVectorEnv,
     at_step,
     during,
     every,
@@ -21,6 +25,8 @@ from scm_world.curricula import (
     stages,
     together,
 )
+from scm_world.env.batched.loop import LoopExecutor
+from scm_world.env.batched.native import NativeExecutor
 from scm_world.errors import InterventionError, UnknownOption
 
 FRICTION, MASS = "floor_friction", "tool_block.mass"
@@ -41,13 +47,21 @@ CURRICULA: dict[str, Any] = {
 OPTIONS: dict[str, dict[str, Any]] = {
     "plain": {},
     "delta": {"action_mode": "delta_joint_positions"},
-    "goals": {"goal_env": True, "start": {"sensor_noise": 0.1}, "info_state": True},
+    "goals": {"goal_env": True, "start": {"sensor_noise": 0.1}},
 }
 
 
+def single(part: Any, options: dict[str, Any]) -> CurriculumEnv:
+    """Make one environment under a curriculum."""
+    return CurriculumEnv(gymnasium.make(PUSHING, **options), part)
+
+
 def made(kind: str | None, part: Any, mode: AutoresetMode, n: int = 3, **options: Any) -> Any:
-    """Make environments whose episodes are short."""
+    """Make environments whose episodes are short; ``"sync"`` are single ones of Gymnasium."""
     options = {"max_episode_length": 4, **options}
+    if kind == "sync":
+        one = partial(single, part, options)
+        return CurriculumVectorEnv(SyncVectorEnv([one] * n, autoreset_mode=mode), part)
     return make_vec(PUSHING, n, part, vectorization_mode=kind, autoreset_mode=mode, **options)
 
 
@@ -136,16 +150,15 @@ def test_a_state_goes_on_in_the_other_kind(mode: AutoresetMode) -> None:
 
 
 def test_it_is_what_is_made_where_the_engine_has_it() -> None:
-    """MuJoCo steps many in one call; other engines, and a wrapper's limit, need single ones."""
+    """MuJoCo steps many in one call; others take turns; a wrapper with a limit is refused."""
     part = goals("A")
-    assert isinstance(make_vec(PUSHING, 2, part, backend="fake").env, SyncVectorEnv)
-    assert isinstance(make_vec(PUSHING, 2, part, max_episode_steps=3).env, SyncVectorEnv)
+    assert type(make_vec(PUSHING, 2, part, backend="fake").env.executor) is LoopExecutor
     native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
-    assert not isinstance(native.env, SyncVectorEnv)
+    assert isinstance(native.env.executor, NativeExecutor)
     assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
     assert native.env.get_attr("where") == (None, None)
     with pytest.raises(UnknownOption, match="max_episode_length"):
-        make_vec(PUSHING, 2, part, vectorization_mode="native", max_episode_steps=3)
+        make_vec(PUSHING, 2, part, max_episode_steps=3)
 
 
 def test_what_is_refused_happens_in_none_of_them() -> None:
@@ -177,11 +190,11 @@ def test_a_snapshot_goes_back_to_what_is_due() -> None:
 def test_members_that_are_left_alone_are_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing is due within an episode, only resets ask an environment by itself."""
     envs = made("native", goals("A"), AutoresetMode.NEXT_STEP)
-    executor = envs.env.executor._executor
+    executor = envs.env.executor
     envs.reset(seed=0)
     asked: list[int] = []
-    alone = executor.alone
-    monkeypatch.setattr(executor, "alone", lambda index: asked.append(index) or alone(index))
+    bring = executor._bring
+    monkeypatch.setattr(executor, "_bring", lambda rows: asked.extend(rows) or bring(rows))
     for _ in range(4):
         envs.step(np.zeros((3, 9), np.float32))
     assert asked == []

@@ -346,8 +346,8 @@ def test_whole_numbers_are_drawn_from_whole_numbers() -> None:
 
 def test_a_curriculum_knows_whether_it_acts_within_episodes() -> None:
     """What acts at resets only costs nothing afterwards."""
-    assert not Curriculum(together(at_reset({}), everything())).steps_matter
-    assert Curriculum(together(at_reset({}), during(range(3), at_step(1, {})))).steps_matter
+    assert not Curriculum(together(at_reset({}), everything())).may_act(1)
+    assert Curriculum(together(at_reset({}), during(range(3), at_step(1, {})))).may_act(1)
     found = Curriculum(together(at_step(4, {}), in_turn(every(3, {}, first=5), {}), physics()))
     assert [step for step in range(12) if found.may_act(step)] == [0, 4, 5, 8, 11]
     assert Curriculum(Resample("*.mass")).part.kind == "resample"

@@ -25,6 +25,7 @@ from scm_world.curricula import (
     stages,
     together,
 )
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 
 MODES = list(AutoresetMode)
@@ -33,7 +34,7 @@ COUNTER = interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100)
 """Shows the number of the episode in hundredths."""
 
 
-def made(part: Any, mode: AutoresetMode, n: int = 3, kind: str = "sync", length: int = 3) -> Any:
+def made(part: Any, mode: AutoresetMode, n: int = 3, kind: str = "loop", length: int = 3) -> Any:
     """Make environments without physics whose episodes are short."""
     return make_vec(
         PUSHING,
@@ -68,7 +69,7 @@ def roll(envs: Any, steps: int, mode: AutoresetMode, seed: int | None = 0) -> li
     return found
 
 
-@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("kind", ["loop", "processes"])
 @pytest.mark.parametrize("mode", MODES)
 def test_every_number_is_handed_out_once(mode: AutoresetMode, kind: str) -> None:
     """Episodes have the numbers of one series, in the order in which they begin."""
@@ -99,7 +100,7 @@ def test_some_may_begin_anew_alone(mode: AutoresetMode) -> None:
     assert seen == set(range(max(seen) + 1))
 
 
-@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("kind", ["loop", "processes"])
 @pytest.mark.parametrize("mode", MODES)
 def test_stages_are_shared(mode: AutoresetMode, kind: str) -> None:
     """Successes of all members count together; the next stage holds in each of them."""
@@ -128,8 +129,8 @@ def test_a_single_member_is_like_an_environment() -> None:
     """One member goes through the episodes of a wrapped environment, draw for draw."""
     part = together(COUNTER, resample(MASS), at_step(1, resample(MASS, "B")))
     envs = made(part, AutoresetMode.NEXT_STEP, n=1)
-    one = envs.env.envs[0]
-    alone = CurriculumEnv(gymnasium.make(one.spec).unwrapped, part)
+    (options,) = envs.env.get_attr("made_with")
+    alone = CurriculumEnv(ScmWorldEnv(**options), part)
     found = [envs.reset(seed=4)[0][0]]
     action = np.zeros((1, 9), np.float32)
     found += [envs.step(action)[0][0] for _ in range(7)]
@@ -153,7 +154,7 @@ def test_a_state_goes_on(mode: AutoresetMode) -> None:
     first = numbers(others.reset()[0])
     assert first == [3, 4, 5]
     assert others.env.call("where") == before
-    assert [env.unwrapped.world.noise.seed for env in others.env.envs] == [0, 1, 2]
+    assert [world.noise.seed for world in others.env.get_attr("world")] == [0, 1, 2]
     if mode is not AutoresetMode.DISABLED:
         for _ in range(3):
             observations, *_ = others.step(np.zeros((3, 9), np.float32))

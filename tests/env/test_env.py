@@ -14,7 +14,7 @@ from envs import ABSOLUTE, BACKENDS, MADE, PUSHING, REACHING, RELATIVE, make, ro
 from gymnasium.utils.env_checker import check_env
 
 from scm_world.env import IDS, ScmWorldEnv
-from scm_world.env.window import Window
+from scm_world.env.rendering import Window
 from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.tasks import TASKS
 
@@ -44,7 +44,6 @@ def test_checker_has_nothing_to_say(id_: str, backend: str, mode: str) -> None:
         {"include": ["joint_torques"], "context": "observation"},
         {"context": "privileged"},
         {"goal_env": True, "context": "privileged"},
-        {"info_contacts": True, "info_state": True},
         {"start": {"sensor_noise": 0.05}, "random_goal": "A"},
     ],
     ids=str,

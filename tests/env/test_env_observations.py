@@ -9,8 +9,7 @@ import pytest
 from envs import MADE, PUSHING, REACHING, make, roll
 
 from scm_world.backends.renderer import goal_pixels
-from scm_world.env.bounds import WIDE, bounds
-from scm_world.env.keypoints import corners
+from scm_world.env.vector import WIDE, bounds, corners
 from scm_world.geometry import from_rotation_vector, rotation_matrix
 from scm_world.graph import SCM
 from scm_world.tasks.trifinger.cameras import CAMERAS
@@ -217,22 +216,6 @@ def test_bodies_that_are_there_from_the_start_are_in_the_space() -> None:
     assert env.reset(seed=0)[0].shape == (37 + 33,)
     shape = env.reset(options={"do": {"number_of_obstacles": 1}})[0].shape
     assert shape == env.observation_space.shape == (37 + 11,)
-
-
-def test_info_tells_state_and_contacts() -> None:
-    """On request info lists the contacts of the engine and the values of all variables."""
-    env = make(backend="mujoco", info_contacts=True, info_state=True)
-    taken = roll(env, 3)
-    world = env.unwrapped.world
-    kinds = [{n: (v.shape, v.dtype) for n, v in step[4]["state"].items()} for step in taken]
-    assert all(kind == kinds[0] for kind in kinds)
-    assert set(kinds[0]) == set(world.model)
-    touching = taken[-1][4]["contacts"]
-    assert len(touching) == len(world.backend.contacts()) > 0
-    assert {frozenset(touch["bodies"]) for touch in touching} == {
-        frozenset({"floor", "tool_block"})
-    }
-    assert taken[0][4]["contacts"] == ()
 
 
 def test_layout_names_what_stands_where() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from envs import BACKENDS, REACHING, make
 
-from scm_world.env.window import Window
+from scm_world.env.rendering import Window
 from scm_world.errors import EngineError
 from scm_world.tasks.trifinger.cameras import CAMERAS
 

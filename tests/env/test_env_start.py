@@ -8,7 +8,7 @@ import pytest
 from envs import PUSHING, REACHING, make
 
 from scm_world import Draw
-from scm_world.env.start import asked
+from scm_world.env.arguments import asked
 from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownOption
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing

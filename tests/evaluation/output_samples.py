@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.episodes import METRICS, EpisodeRow
+from scm_world.evaluation.protocols import protocols_of
 from scm_world.evaluation.results import Evaluation
 
 NAMES = ("ppo", "sac", "td3", "random", "sweep", "still", "bc", "cql", "iql")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scm_world.policies import NetworkPolicy, save_policy
+from scm_world.policies import MlpPolicy, save_policy
 
 RELATIVE = {
     "action_mode": "delta_joint_positions",
@@ -29,9 +29,9 @@ def tensors(*sizes: int, seed: int = 0, prefix: str = "layers") -> dict[str, Any
     return found
 
 
-def policy(n: int = 56, *, seed: int = 0, **about: Any) -> NetworkPolicy:
+def policy(n: int = 56, *, seed: int = 0, **about: Any) -> MlpPolicy:
     """Give a policy that observes n numbers."""
-    return NetworkPolicy.of(tensors(n, 16, 9, seed=seed), {"task": "pushing", **about})
+    return MlpPolicy.of(tensors(n, 16, 9, seed=seed), {"task": "pushing", **about})
 
 
 def trained(path: Path, n: int = 56, *, seed: int = 0, **about: Any) -> Path:

@@ -24,7 +24,7 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
 )
-from scm_world.evaluation import METRICS, Evaluation, Protocol, check, merge, why
+from scm_world.evaluation import Evaluation, check, why
 from scm_world.evaluation import files as files_module
 from scm_world.queries import save_episode
 from scm_world.tasks import make_task
@@ -105,7 +105,6 @@ def test_policies_in_memory_are_known_as_long_as_they_are_there() -> None:
     found = small({"mine": lambda observation: np.zeros(9), "other": "still"})
     assert check(found)
     assert why(found.only(agent="mine"), "P6", 0).others
-    assert check(merge([found, small("random")]), episodes=99)
     read = pickle.loads(pickle.dumps(found))  # noqa: S301 # ours
     assert read == found
     with pytest.raises(UnknownOption, match="give the policy itself"):
@@ -121,52 +120,6 @@ def test_other_versions_are_not_compared() -> None:
         check(changed)
 
 
-# --- merging --------------------------------------------------------------------------------------
-
-
-def test_parts_of_several_machines_are_one_evaluation() -> None:
-    """Agents, engines, protocols and seeds of several; the same row may be in two of them."""
-    whole = small({"a": "random", "b": "still"}, "P0,P6", seeds=(0, 1))
-    a, b = small({"a": "random"}, "P0,P6", seeds=(0, 1)), small({"b": "still"}, "P6", seeds=(1, 0))
-    rest = small({"b": "still"}, "P0,P6", seeds=(0, 1))
-    merged = merge([a, b, rest])
-    for agent in ("a", "b"):
-        for metric in METRICS:
-            mine, its = (e.scores(metric, agent=agent) for e in (merged, whole))
-            np.testing.assert_array_equal(mine, its)
-    assert check(merged, episodes=99)
-    assert merged.difference("a", "b", "P6") == whole.difference("a", "b", "P6")
-
-
-def changed(found: Evaluation, **about: Any) -> Evaluation:
-    """Give the same rows with something else said of them."""
-    return Evaluation({**found.about, **about}, found.columns)
-
-
-def test_what_differs_is_not_merged() -> None:
-    """Tasks, options, versions, policies and protocols; all problems are told together."""
-    found = small({"a": "random"}, [Protocol("mine", "*.mass")])
-    versions = {"fake": {**found.about["versions"]["fake"], "numpy": "0.1", "python": "2.7"}}
-    for other, said in [
-        (
-            small({"a": "random"}, [Protocol("mine", "*.mass", "B")]),
-            "protocol mine is not the same",
-        ),
-        (small({"a": "still"}, [Protocol("mine", "*.mass")]), "agent a, run 0 is not the same"),
-        (small({"b": "random"}, "P0", task="picking"), "task is 'pushing' in one and 'picking'"),
-        (small({"b": "random"}, "P0", env={"max_episode_length": 9}), "env is"),
-        (changed(found, versions=versions), r"numpy is .* and 0\.1(.|\n)*python is"),
-    ]:
-        with pytest.raises(ModelError, match=said):
-            merge([found, other])
-    hashes = found.columns["hash"].copy()
-    hashes[0] = "0" * 32
-    with pytest.raises(ModelError, match="episode 0 did not happen alike"):
-        merge([found, Evaluation(found.about, {**found.columns, "hash": hashes})])
-    with pytest.raises(ModelError, match="no evaluation"):
-        merge([])
-
-
 def test_one_file_in_two_places_is_one_policy(tmp_path: Path) -> None:
     """Where a machine keeps a policy does not matter, its content does."""
     episode = World("pushing", backend="fake").rollout("sweep", seed=0, steps=4)
@@ -176,7 +129,7 @@ def test_one_file_in_two_places_is_one_policy(tmp_path: Path) -> None:
         save_episode(episode, tmp_path / name / "policy.npz")
         tables.append(small(str(tmp_path / name / "policy.npz"), out=tmp_path / "out"))
     assert len(contents(tmp_path / "out")) == 2
-    assert merge(tables) == tables[0]
+    assert tables[1] == tables[0]
 
 
 def test_the_formats_are_those_that_are_documented() -> None:

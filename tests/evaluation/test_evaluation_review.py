@@ -10,9 +10,9 @@ import pytest
 
 from scm_world.curricula import every
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, check, evaluate, merge, why
+from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, check, evaluate, why
 from scm_world.evaluation.files import false_scores
-from scm_world.evaluation.reporting import write_outputs
+from scm_world.evaluation.outputs.report import write_outputs
 from scm_world.policies import OnnxPolicy
 from scm_world.tasks import Pushing
 
@@ -66,8 +66,6 @@ def test_a_task_of_ones_own_is_another_one(tmp_path: Path) -> None:
     assert check(own, task=Bigger())
     with pytest.raises(UnknownOption, match="Bigger"):
         check(own, task=Pushing())
-    with pytest.raises(ModelError, match="class is"):
-        merge([tiny(task=Pushing()), tiny(task=Bigger(), protocols="P2")])
 
 
 def test_a_file_does_not_decide_what_is_called() -> None:
@@ -157,13 +155,6 @@ def test_forged_scores_are_found(tmp_path: Path) -> None:
         Evaluation.load(file)
     file.write_text(forged.replace('"checksum"', '"removed"'))
     assert "0.99" in false_scores(file, Evaluation.load(file))[0]
-
-
-def test_agents_of_other_protocols_can_be_merged_and_shown(tmp_path: Path) -> None:
-    """Each has its own; they are not compared over different ones."""
-    both = merge([tiny({"a": "still"}, "P0,P5"), tiny({"b": "sweep"}, "P5,P8")])
-    assert both.scores(agent="b").shape == (1, 2, 2)
-    assert "profile.png" not in {path.name for path in write_outputs(both, tmp_path)}
 
 
 @WorldPolicy

@@ -37,12 +37,11 @@ def found(policy: Any, protocols: Any, threads: int, n: int = 3, **env: Any) -> 
     setup = prepare(
         {"a": policy}, protocols, task=task, n=n, seeds=2, backend="mujoco", env=env, trusted=None
     )
-    shard_runner = ShardRunner(setup, None, threads)
+    shard_runner = ShardRunner(setup, threads)
     rows = [row for shard in setup.shards() for row in shard_runner(shard)]
     executors = [lockstep._executor is not None for lockstep in shard_runner.locksteps.values()]
-    apart = [lockstep._apart for lockstep in shard_runner.locksteps.values()]
     shard_runner.close()
-    return Found(rows, any(executors) and not any(apart))
+    return Found(rows, any(executors))
 
 
 class Cell:
@@ -55,25 +54,6 @@ class Cell:
         last = np.zeros(9, np.float32) if episode_start[0] else state
         state = np.tanh(0.5 * last + linear(observation)).astype(np.float32)
         return state.copy(), state
-
-
-class Hidden:
-    """A model that keeps to itself what it remembers, and begins anew when it is told to."""
-
-    def predict(self, observation: Any, episode_start: Any = None, **how: Any) -> Any:
-        """Count the steps of the episode."""
-        self.steps = 1 if episode_start[0] else self.steps + 1
-        return np.full(9, self.steps / 20), None
-
-
-class Phases:
-    """A function with a memory, which sees by the clock that an episode begins."""
-
-    def __call__(self, observation: Any) -> Any:
-        """Remember the first observation."""
-        if observation[0] >= 1.0:
-            self.first = observation.copy()
-        return np.tanh(self.first[28:37] + observation[9:18])
 
 
 class Reused:
@@ -118,7 +98,7 @@ def small_mlp() -> Any:
 @pytest.mark.parametrize("protocols", [None, "P2@3,P9@1"], ids=["published", "within"])
 def test_every_protocol_gives_the_same_rows(protocols: Any) -> None:
     """Scores, draws and hashes, at the reset and within the episode, bit for bit."""
-    alone, both = (found(linear, protocols, threads) for threads in (1, 2))
+    alone, both = (found(small_mlp(), protocols, threads) for threads in (1, 2))
     assert both.rows == alone.rows
     assert (alone.together, both.together) == (False, True)
 
@@ -126,14 +106,12 @@ def test_every_protocol_gives_the_same_rows(protocols: Any) -> None:
 @pytest.mark.parametrize(
     ("policy", "together"),
     [
-        (linear, True),
+        (linear, False),
         (small_mlp(), True),
-        (Cell(), True),
+        (Cell(), False),
         (np.linspace(-1, 1, 54).reshape(6, 9), True),
         (np.zeros(9, np.float32), True),
-        (Reused(), True),
-        (Hidden(), False),
-        (Phases(), False),
+        (Reused(), False),
         (Waning("nan", 99), False),
         ("random", False),
         (WorldPolicy(lambda world: world["joint_positions"]), False),
@@ -141,7 +119,7 @@ def test_every_protocol_gives_the_same_rows(protocols: Any) -> None:
     ids=lambda value: type(value).__name__,
 )
 def test_every_policy_gives_the_same_rows(policy: Any, together: bool) -> None:
-    """Those with a memory of their own, and those that look at the world, play one by one."""
+    """Functions, models that may have a memory, and who looks at the world play one by one."""
     alone, both = (found(policy, "P6,P2@3", threads) for threads in (1, 2))
     assert both.rows == alone.rows
     assert both.together is together
@@ -167,28 +145,11 @@ def test_a_network_gives_the_same_rows(tmp_path: Path) -> None:
 )
 def test_every_environment_gives_the_same_rows(env: Any, together: bool) -> None:
     """Where bodies may come and go, or something has to be looked at alone, it is one by one."""
-    alone, both = (found(_clock, "P0,P6@2", threads, n=2, **env) for threads in (1, 2))
+    alone, both = (
+        found(np.full(9, 0.1, np.float32), "P0,P6@2", threads, n=2, **env) for threads in (1, 2)
+    )
     assert both.rows == alone.rows
     assert both.together is together
-
-
-def _clock(observation: Any) -> Any:
-    return np.full(9, 0.1 * np.tanh(observation[1]), np.float32)
-
-
-def test_a_policy_that_takes_long_plays_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is asked twice in one shard, not in all of them."""
-    monkeypatch.setattr("scm_world.evaluation.lockstep.LONG", 0.0)
-    calls: list[int] = []
-
-    def counted(observation: Any) -> Any:
-        calls.append(1)
-        return linear(observation)
-
-    rows = found(counted, "P0", 2, n=30).rows
-    assert len(rows) == 30
-    tried = 50  # when the evaluation is prepared, twice at most 25 steps; episodes have 6
-    assert 6 * (25 + 25 + 5) <= len(calls) <= 6 * (25 + 25 + 5) + tried
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -197,7 +158,7 @@ def test_errors_have_their_place(threads: int, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(pipelines, "cores", lambda: threads)
     how: Any = {"n": 6, "seeds": 3, "env": {"max_episode_length": 6}}
     with pytest.raises(EvaluationError, match="not feasible") as refused:
-        evaluate({"a": linear}, [WITHIN], **how)
+        evaluate({"a": small_mlp()}, [WITHIN], **how)
     place = {"agent": "a", "engine": "mujoco", "protocol": "late@3", "seed": 3, "episode": 0}
     assert refused.value.place == {**place, "control step": 3}
     with pytest.raises(EvaluationError, match="gave") as raised:
@@ -220,7 +181,7 @@ def test_what_was_played_alone_goes_on_side_by_side(
     wholes = {}
     for threads in (1, 2):
         monkeypatch.setattr(pipelines, "cores", lambda threads=threads: threads)
-        wholes[threads] = evaluate(linear, "P1,P6", n=30, out=tmp_path / str(threads), **how)
+        wholes[threads] = evaluate(small_mlp(), "P1,P6", n=30, out=tmp_path / str(threads), **how)
     assert contents(tmp_path / "1") == contents(tmp_path / "2")
     assert wholes[1].digest == wholes[2].digest
     shards: list[int] = []
@@ -231,7 +192,7 @@ def test_what_was_played_alone_goes_on_side_by_side(
         return play(self, *given, episodes=episodes, **how)
 
     monkeypatch.setattr(Lockstep, "play", counted)
-    longer = evaluate(linear, "P1,P6", n=50, out=tmp_path / "1", **how)
+    longer = evaluate(small_mlp(), "P1,P6", n=50, out=tmp_path / "1", **how)
     assert shards == [25, 25]  # the first ones were there, the short ones are others now
     assert longer.only(protocol="P6").columns["hash"][:30].tolist() == (
         wholes[1].only(protocol="P6").columns["hash"].tolist()

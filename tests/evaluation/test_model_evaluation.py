@@ -21,12 +21,13 @@ from scm_world.evaluation import (
     WorldPolicy,
     check,
     evaluate,
+    pipeline,
     protocols_of,
     record,
     why,
 )
 from scm_world.evaluation.lockstep import Lockstep
-from scm_world.evaluation.reporting import write_outputs
+from scm_world.evaluation.outputs.report import write_outputs
 from scm_world.tasks.factories import load_factory
 
 FILE = Path(__file__).parents[1] / "env" / "model_tasks.py"
@@ -121,10 +122,10 @@ def test_side_by_side_is_one_after_another(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(Lockstep, "play", play)
     for kind in (Balance, Falling):
-        together = evaluate(proportional if kind is Balance else "random", "A", task=kind(), n=5)
+        together = evaluate([0.3], "A", task=kind(), n=5)
         with monkeypatch.context() as alone:
-            alone.setattr(Lockstep, "_takes", lambda *_: False)
-            other = evaluate(proportional if kind is Balance else "random", "A", task=kind(), n=5)
+            alone.setattr(pipeline, "cores", lambda: 1)
+            other = evaluate([0.3], "A", task=kind(), n=5)
         assert together == other
     assert played[0] in (0, 5)  # one core plays one after another
 

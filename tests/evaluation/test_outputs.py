@@ -18,7 +18,6 @@ from matplotlib.text import Text
 from output_samples import LONG, NAMES, made
 
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.benchmark import protocols_of
 from scm_world.evaluation.outputs import (
     bars_figure,
     causes_figure,
@@ -30,6 +29,7 @@ from scm_world.evaluation.outputs import (
 )
 from scm_world.evaluation.outputs.figures import SURE
 from scm_world.evaluation.outputs.labels import Pairs, best, lines_of, looks_of, metric_words
+from scm_world.evaluation.protocols import protocols_of
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval
 
@@ -228,25 +228,21 @@ def test_the_first_axis_of_a_radar_is_up() -> None:
     (ax,) = figure.axes
     assert (ax.get_theta_offset(), ax.get_theta_direction()) == (np.pi / 2, -1)  # type: ignore[attr-defined]
     figure.canvas.draw()
-    places = {text.get_text(): text.get_window_extent() for text in ax.texts}
+    places = {text.get_text(): text.get_window_extent() for text in ax.get_xticklabels()}
     assert places["P0"].y0 == max(places[name].y0 for name in DOCS)
     assert places["P3"].x0 == max(places[name].x0 for name in DOCS)
     assert {"0.2", "0.4", "0.6", "0.8", "1.0"} <= set(words(figure))
-    assert set(DOCS.values()) <= set(words(figure))
+    assert any(all(doc in word for doc in DOCS.values()) for word in words(figure))
 
 
-@pytest.mark.parametrize(("agents", "panels"), [(6, 1), (7, 7), (9, 9)])
-def test_no_agent_is_dropped_from_a_radar(agents: int, panels: int) -> None:
-    """More than six lines have a radar for each agent; every line has its band."""
-    evaluation = made(agents, 4)
+def test_no_agent_is_dropped_from_a_radar() -> None:
+    """Every line has its band, however many there are."""
+    evaluation = made(9, 4)
     figure = radar_figure(evaluation)
-    assert len(figure.axes) == panels
     for agent in evaluation.agents:
         (line,) = named(figure, rf"{agent}\|mujoco")
         assert line.get_ydata()[2] == evaluation.score("P2", agent=agent).value
         assert len(named(figure, rf"band {agent}\|mujoco")) == 1
-    if panels > 1:
-        assert [ax.get_title() for ax in figure.axes] == list(evaluation.agents)
 
 
 def test_a_radar_grows_with_its_protocols() -> None:

@@ -12,10 +12,9 @@ from scm_world.curricula import Resample, every, stages, together
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ModelError, ScmWorldError, UnknownOption
 from scm_world.evaluation import Protocol, evaluate, protocols_of
-from scm_world.evaluation.benchmark import ROLES, ROWS
 from scm_world.evaluation.episodes import EpisodeRunner
 from scm_world.evaluation.players import as_player
-from scm_world.evaluation.protocols import chosen
+from scm_world.evaluation.protocols import ROLES, ROWS, chosen
 from scm_world.tasks import TASKS
 from scm_world.variables import Box, Mechanism, Normal, Subset
 

@@ -22,7 +22,7 @@ from scm_world.errors import (
     UnwritableFolder,
 )
 from scm_world.evaluation.players import as_player, player_from
-from scm_world.policies import NetworkPolicy, PolicyAbout, load_policy, networks, save_policy
+from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, networks, save_policy
 from scm_world.policies.cards import KEY, OPTIONS, USUAL
 
 SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
@@ -44,9 +44,7 @@ def by_formula(tensors: dict[str, Any], x: Any, activation: str, output: str) ->
 def test_a_network_computes_what_its_formula_says(activation: str, output: str) -> None:
     """For both activations and both ways to bound the actions."""
     given = tensors(56, 32, 16, 9)
-    found = NetworkPolicy.of(
-        given, PolicyAbout(task="pushing", activation=activation, output=output)
-    )
+    found = MlpPolicy.of(given, PolicyAbout(task="pushing", activation=activation, output=output))
     expected = by_formula(given, SEEN, activation, output)
     np.testing.assert_allclose(found(SEEN), expected, atol=1e-7)
     assert found(SEEN).dtype == np.float32

@@ -16,10 +16,10 @@ import pytest
 
 from scm_world.env import ScmWorldEnv
 from scm_world.evaluation import Protocol, protocols_of
-from scm_world.evaluation.benchmark import REACHING as REACHING_ROW
-from scm_world.evaluation.benchmark import ROLES, ROWS
 from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, _drawn
 from scm_world.evaluation.players import as_player
+from scm_world.evaluation.protocols import REACHING as REACHING_ROW
+from scm_world.evaluation.protocols import ROLES, ROWS
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.feasibility import overlaps
 

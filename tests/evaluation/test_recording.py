@@ -195,7 +195,7 @@ def test_wrappers_that_change_something_belong_above() -> None:
         for _ in range(3):
             env.step(np.full(9, 0.1, np.float32))
         assert recorder.recording().replay() > 0
-    with pytest.raises(UnknownOption, match="scm_world"):
+    with pytest.raises(UnknownOption, match="ScmWorldEnv"):
         Recorder(gymnasium.make("CartPole-v1"))
 
 

@@ -164,14 +164,6 @@ def test_a_return_that_is_always_zero_is_not_a_rate() -> None:
         mean_interval([0.5, 1.0], proportion=True)
 
 
-def test_success_rates_of_unlike_protocols_are_more_certain() -> None:
-    """Strata narrow the Wilson interval if rates differ, and hardly change it if they do not."""
-    strata = np.repeat([0, 1], 100)
-    unlike, alike = np.repeat([0.0, 1.0], 100), np.tile([0.0, 1.0], 100)
-    assert mean_interval(unlike, strata).width < 0.3 * mean_interval(unlike).width
-    assert mean_interval(alike, strata).width == pytest.approx(mean_interval(alike).width)
-
-
 def test_one_value_says_nothing_about_its_interval() -> None:
     """A single score has unknown ends; a single success still has a Wilson interval."""
     one = mean_interval([0.4])
@@ -254,19 +246,16 @@ def test_intervals_print_short() -> None:
 @pytest.mark.slow
 def test_intervals_cover_what_they_should() -> None:
     """Over 1,000 data sets the intervals contain the truth in 90 to 99 % of the cases."""
-    hits = {"fraction": 0, "rate": 0, "paired": 0, "unpaired": 0, "strata": 0}
-    levels = np.repeat([0.05, 0.5, 0.99], 40)
+    hits = {"fraction": 0, "rate": 0, "paired": 0, "unpaired": 0}
     for seed in range(1000):
         rng = np.random.default_rng(seed)
         skewed, other = rng.beta(4, 1, 100), rng.beta(4, 1, 100)
         wins = (rng.random(100) < 0.95).astype(float)
-        rates = (rng.random(120) < levels).astype(float)
         found = {
             "fraction": (mean_interval(skewed, seed=seed), 0.8),
             "rate": (mean_interval(wins), 0.95),
             "paired": (difference_interval(wins, wins * (rng.random(100) < 0.9)), 0.095),
             "unpaired": (unpaired_interval(skewed, other, seed=seed), 0.0),
-            "strata": (mean_interval(rates, levels), float(levels.mean())),
         }
         for name, (interval, truth) in found.items():
             hits[name] += interval.low <= truth <= interval.high

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,9 @@ import pytest
 from evaluation_samples import SHORT
 from policy_samples import RELATIVE, policy, trained
 
-from scm_world.errors import EvaluationError, UnknownOption, UnreadableFile
-from scm_world.evaluation import Evaluation, WorldPolicy, check, evaluate, merge, why
-from scm_world.evaluation.forms import shared_options, task_for
+from scm_world.errors import EvaluationError, UnknownOption
+from scm_world.evaluation import Evaluation, WorldPolicy, check, evaluate, why
+from scm_world.evaluation.agents import shared_options, task_for
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.setups import prepare
 from scm_world.policies import PolicyAbout
@@ -79,16 +80,6 @@ def test_results_say_how_each_agent_acted(agents: dict[str, Any], tmp_path: Path
     assert why(again, "P6", 1, agent="two").others or why(again, "P6", 1, agent="two").left_out
 
 
-def test_evaluations_of_policies_can_be_merged(agents: dict[str, Any]) -> None:
-    """What is an agent's own does not make two tables different."""
-    parts = [small({name: agents[name]}, task="picking") for name in ("one", "two", "still")]
-    both = merge(parts)
-    at_once = small({name: agents[name] for name in ("one", "two", "still")})
-    assert both.about["agents"] == at_once.about["agents"]
-    for name in ("one", "two", "still"):
-        assert both.only(agent=name) == at_once.only(agent=name)
-
-
 def test_finished_episodes_are_used_again(agents: dict[str, Any], tmp_path: Path) -> None:
     """But not those of another policy in a file of the same name."""
     first = small(agents, out=tmp_path / "out")
@@ -99,24 +90,18 @@ def test_finished_episodes_are_used_again(agents: dict[str, Any], tmp_path: Path
     assert small(agents, out=tmp_path / "out") != first
 
 
-def test_a_file_that_a_training_replaces_is_told_of(tmp_path: Path) -> None:
-    """What stands in the results is what acted, even if the file changes meanwhile."""
+def test_a_file_that_a_training_replaces_is_read_once(tmp_path: Path) -> None:
+    """What acts is what was read when the evaluation began, in other processes, too."""
     path = trained(tmp_path / "run" / "best.safetensors")
-    setup = prepare(
-        str(path.parent),
-        "P0",
-        task=None,
-        n=1,
-        seeds=0,
-        backend="fake",
-        env=SHORT,
-        trusted=None,
-    )
+    how: Any = {"task": None, "n": 1, "seeds": 0, "backend": "fake", "env": SHORT, "trusted": None}
+    setup = prepare(str(path.parent), "P0", **how)
+    (shard,) = setup.shards()
+    before = ShardRunner(setup)(shard)
     trained(path, seed=1)
-    shard_runner = ShardRunner(setup)
-    with pytest.raises(UnreadableFile, match="changed since the evaluation began"):
-        shard_runner(setup.shards()[0])
-    shard_runner.close()
+    sent = pickle.loads(pickle.dumps(setup))  # noqa: S301 # ours
+    assert ShardRunner(sent)(shard) == before
+    other = prepare(str(path.parent), "P0", **how)
+    assert ShardRunner(other)(shard) != before
 
 
 def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:
@@ -133,7 +118,7 @@ def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:
     )
     rows, executors = [], []
     for threads in (1, 3):
-        shard_runner = ShardRunner(setup, None, threads)
+        shard_runner = ShardRunner(setup, threads)
         rows.append([row for shard in setup.shards() for row in shard_runner(shard)])
         executors.append(
             [lockstep._executor is not None for lockstep in shard_runner.locksteps.values()]

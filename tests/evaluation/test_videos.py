@@ -75,10 +75,11 @@ def test_best_median_and_worst_are_chosen_by_score() -> None:
 
     columns["return"][:] = 0.0
     columns["last_fractional_success"][:] = 0.5
-    first, last = choose(evaluation, agent="ppo", which=("best", "worst")).values()
-    assert (first, last) == (0, np.flatnonzero(columns["agent"] == "ppo")[-1])
+    places = choose(evaluation, agent="ppo")
+    assert places["best"] == 0
+    assert places["worst"] == np.flatnonzero(columns["agent"] == "ppo")[-1]
     columns["return"][5] = 1.0
-    assert choose(evaluation, agent="ppo", which=("best",)) == {"best": 5}
+    assert choose(evaluation, agent="ppo")["best"] == 5
 
 
 def test_an_episode_is_chosen_once() -> None:
@@ -87,21 +88,25 @@ def test_an_episode_is_chosen_once() -> None:
 
 
 def test_choices_that_do_not_exist_are_refused() -> None:
-    """Agents, metrics and kinds of episodes are named."""
+    """Agents and metrics are named."""
     evaluation = made(2, 1)
     with pytest.raises(UnknownOption, match="ppo"):
         choose(evaluation)
     with pytest.raises(UnknownOption, match="metric"):
         choose(evaluation, agent="ppo", metric="luck")
-    with pytest.raises(UnknownOption, match="median"):
-        choose(evaluation, agent="ppo", which=("funniest",))
 
 
-def test_videos_show_the_episodes(setup: Setup, evaluation: Evaluation, tmp_path: Path) -> None:
+def test_videos_show_the_episodes(
+    shard_runner: ShardRunner, evaluation: Evaluation, tmp_path: Path
+) -> None:
     """Each has its frames at 25 a second at most, in real time, with a caption below."""
     told: list[tuple[int, int]] = []
     found = record_videos(
-        setup, evaluation, tmp_path / "new", camera=SMALL, progress=lambda *at: told.append(at)
+        shard_runner,
+        evaluation,
+        tmp_path / "new",
+        camera=SMALL,
+        progress=lambda *at: told.append(at),
     )
     assert sorted(tmp_path.glob("**/*.*")) == sorted(found)
     places = choose(evaluation)
@@ -144,7 +149,7 @@ def test_a_folder_that_cannot_be_made_is_said(
     """A file is in its place."""
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(UnwritableFolder):
-        record_videos(shard_runner, evaluation, tmp_path / "file", camera=SMALL, which=("best",))
+        record_videos(shard_runner, evaluation, tmp_path / "file", camera=SMALL)
 
 
 def test_moviepy_is_optional(
@@ -163,7 +168,7 @@ def test_captions_are_cut_where_they_do_not_fit() -> None:
     """Lines that are too long end with dots; of the values seven lines are shown."""
     frame = np.zeros((20, 641, 3), dtype=np.uint8)
     drawn = ", ".join(f"robot_finger_60.link_{k}.mass 0.{k}" for k in range(400))
-    full = captioned(frame, (["P8: everything", "x " * 300], drawn), "0.00 s")
+    full = captioned(frame, ["P8: everything", "x " * 300], drawn, "0.00 s")
     assert full.shape == (20 + 2 * 8 + 9 * 18, 642, 3)
-    assert captioned(frame, (["P0"], ""), "0.00 s").shape == (20 + 2 * 8 + 18, 642, 3)
+    assert captioned(frame, ["P0"], "", "0.00 s").shape == (20 + 2 * 8 + 18, 642, 3)
     assert full[20:, :641].min() < 100 < 250 < full[20:, :641].max()

@@ -7,8 +7,7 @@ from uuid import uuid4
 
 import pytest
 
-from scm_world.output.locations import located
-from scm_world.output.remote import Remote
+from scm_world.output.remote import Remote, located
 
 fsspec: Any = pytest.importorskip("fsspec")
 memory: Any = pytest.importorskip("fsspec.implementations.memory")

@@ -12,8 +12,7 @@ from stores import Shelf, fresh, fsspec
 
 from scm_world.errors import MissingExtra, UnknownOption, UnreadableFile, UnwritableFolder
 from scm_world.output.durable import write_durably, write_whole
-from scm_world.output.locations import located
-from scm_world.output.remote import Remote
+from scm_world.output.remote import Remote, located
 
 PROTOCOLS = ("memory", "shelf")
 

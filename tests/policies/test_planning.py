@@ -16,7 +16,7 @@ from scm_world.errors import (
 )
 from scm_world.geometry import from_rotation_vector
 from scm_world.policies.planning import CrossEntropy, Model, Score, Search, nearness
-from scm_world.policies.planning.scores import as_score
+from scm_world.policies.planning.model import as_score
 from scm_world.policies.scripted import NAMED
 from scm_world.queries import World
 from scm_world.tasks import Pushing, Reaching

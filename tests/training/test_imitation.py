@@ -14,7 +14,7 @@ import scm_world  # noqa: F401 # registers the environments
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError, MissingExtra, ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.recording import record
-from scm_world.policies import NetworkPolicy, load_policy
+from scm_world.policies import MlpPolicy, load_policy
 from scm_world.training import imitation
 from scm_world.training.imitation import (
     Demonstrations,
@@ -40,19 +40,19 @@ QUICK: dict[str, Any] = {
 }
 
 
-def shown(n: int = 2, learner: NetworkPolicy | None = None, **changes: Any) -> Demonstrations:
+def shown(n: int = 2, learner: MlpPolicy | None = None, **changes: Any) -> Demonstrations:
     """Let a teacher show a few short episodes."""
     how = lesson("picking", **{**QUICK, **changes})
     return demonstrated(how, range(n), backend="mujoco", seed=0, learner=learner)
 
 
-def constant(action: float) -> NetworkPolicy:
+def constant(action: float) -> MlpPolicy:
     """Make a network that always gives one action."""
     tensors = {
         "layers.0.weight": np.zeros((9, 56), np.float32),
         "layers.0.bias": np.full(9, action, np.float32),
     }
-    return NetworkPolicy.of(tensors, {"task": "picking"})
+    return MlpPolicy.of(tensors, {"task": "picking"})
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from scm_world.errors import MissingExtra, UnreadableFile
-from scm_world.policies import NetworkPolicy, save_policy
-from scm_world.training.onnx import to_onnx
+from scm_world.policies import MlpPolicy, save_policy
+from scm_world.training.export import to_onnx
 
 SIZES = {"achieved_goal": 10, "desired_goal": 10, "observation": 36}
 
 
-def policy(**about: Any) -> NetworkPolicy:
+def policy(**about: Any) -> MlpPolicy:
     """Make up a policy of 56 numbers."""
     rng = np.random.default_rng(1)
     tensors = {}
@@ -25,7 +25,7 @@ def policy(**about: Any) -> NetworkPolicy:
         tensors[f"layers.{number}.weight"] = rng.normal(0, 0.5, (outputs, inputs))
         tensors[f"layers.{number}.bias"] = rng.normal(0, 0.5, outputs)
     arrays = {name: array.astype(np.float32) for name, array in tensors.items()}
-    return NetworkPolicy.of(arrays, {"task": "pushing", **about})
+    return MlpPolicy.of(arrays, {"task": "pushing", **about})
 
 
 FORMS: list[dict[str, Any]] = [

@@ -13,7 +13,7 @@ from scm_world.errors import UnknownOption
 
 sb3 = pytest.importorskip("stable_baselines3")
 
-from scm_world.training.sb3 import make_sb3, sb3_vec_env  # noqa: E402 # needs the library
+from scm_world.training.sb3 import Sb3VecEnv, make_sb3  # noqa: E402 # needs the library
 
 PUSHING = "scm_world/Pushing-v0"
 GOALS: dict[str, Any] = {"goal_env": True, "task_options": {"weights": "sparse"}}
@@ -101,7 +101,7 @@ def test_infos_are_as_short_as_they_may_be() -> None:
     assert told == [{"is_success": False, "TimeLimit.truncated": False}] * 2
     *_, told = envs.step(still)
     assert told[0].keys() == {"is_success", "TimeLimit.truncated", "terminal_observation"}
-    more = sb3_vec_env(envs.worlds, infos=("fractional_success", "reward_terms"))
+    more = Sb3VecEnv(envs.worlds, infos=("fractional_success", "reward_terms"))
     more.reset()
     *_, told = more.step(still)
     assert told[0].keys() == {"fractional_success", "reward_terms", "TimeLimit.truncated"}
@@ -110,11 +110,11 @@ def test_infos_are_as_short_as_they_may_be() -> None:
 def test_what_it_cannot_adapt_is_refused() -> None:
     """Another autoreset mode, worlds of another kind, and infos that nobody tells."""
     with pytest.raises(UnknownOption, match="SameStep"):
-        sb3_vec_env(gymnasium.make_vec(PUSHING, 2, backend="fake"))
+        Sb3VecEnv(gymnasium.make_vec(PUSHING, 2, backend="fake"))
     how: dict[str, Any] = {"vectorization_mode": "sync", "backend": "fake"}
     others = gymnasium.make_vec(PUSHING, 2, vector_kwargs={"autoreset_mode": "SameStep"}, **how)
     with pytest.raises(UnknownOption, match="make_vec"):
-        sb3_vec_env(others)
+        Sb3VecEnv(others)
     with pytest.raises(UnknownOption, match="is_success"):
         make_sb3(PUSHING, 2, infos=["success_rate"], backend="fake")
 

@@ -14,7 +14,7 @@ from work_samples import Bench, Task, make, no_bench
 
 from scm_world.errors import ActionError, EngineFailure, MissingExtra, UnknownOption
 from scm_world.work.executors import Executor, Processes, Serial, engine_of, opened
-from scm_world.work.threads import cores
+from scm_world.work.processes import cores
 
 # --- results --------------------------------------------------------------------------------------
 

@@ -11,8 +11,14 @@ import pytest
 from work_samples import Bench, no_bench, product
 
 from scm_world.errors import ActionError, EngineFailure, UnknownOption
-from scm_world.work.processes import Ended, TookTooLong, Worker
-from scm_world.work.threads import THREADS, children_single_threaded, single_threaded
+from scm_world.work.processes import (
+    THREADS,
+    Ended,
+    TookTooLong,
+    Worker,
+    children_single_threaded,
+    single_threaded,
+)
 
 
 def is_gone(pid: int) -> bool:

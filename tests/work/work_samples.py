@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from scm_world.errors import ActionError
-from scm_world.work.threads import THREADS
+from scm_world.work.processes import THREADS
 
 
 class Fussy(Exception):

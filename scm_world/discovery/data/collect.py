@@ -17,7 +17,7 @@ from scm_world.discovery.data.sources import DataSource, ModelSource, SourceRows
 from scm_world.discovery.data.worlds import Experiments, WorldSource
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM
-from scm_world.output.locations import Location
+from scm_world.output.remote import Location
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting

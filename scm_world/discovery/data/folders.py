@@ -25,9 +25,8 @@ from scm_world.discovery.data.sources import FORMAT, SourceRows
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
 from scm_world.output.durable import is_draft, locked, removed, write_durably
-from scm_world.output.locations import Location, located
 from scm_world.output.reading import LARGEST_TABLE, read_bytes, read_text
-from scm_world.output.remote import PARTIAL, said
+from scm_world.output.remote import PARTIAL, Location, located, said
 
 SIDECAR = "dataset.json"
 SHARD = 100

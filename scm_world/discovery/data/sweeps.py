@@ -26,7 +26,7 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.graph.structure import Edge
 from scm_world.output.durable import made, write_whole
-from scm_world.output.locations import Location, located
+from scm_world.output.remote import Location, located
 from scm_world.queries.estimates import CONFIDENCE, difference
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress

@@ -24,8 +24,8 @@ from scm_world.discovery.data.recorded import (
     settable,
 )
 from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell
-from scm_world.env.bounds import WIDE, bounds, spread
 from scm_world.env.observer import published
+from scm_world.env.vector import WIDE, bounds, spread
 from scm_world.errors import BudgetExhausted, InterventionError, UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.policies.scripted import Sequence as Given

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.env.given import doubles, finite
+from scm_world.env.arguments import doubles, finite
 from scm_world.errors import ActionError, UnknownOption
 
 PER_WORLD = ("do", "episode")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -12,17 +12,14 @@ from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.env.environment import Counted, ScmWorldEnv
+from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import InterventionError
-
-Allocate = Callable[[tuple[int, ...], Any], NDArray[Any]]
-"""Gives an array of zeros of a shape and a dtype."""
+from scm_world.tasks.rewards import FRACTION, SUCCESS
 
 Column = NDArray[Any] | dict[str, NDArray[Any]]
 """What all environments say about one thing, shape (n, ...); or several of them, by name."""
 
 FLAGS = ("is_success", "success")
-FRACTION = "fractional_success"
 GOALS = ("achieved_goal", "desired_goal")
 TERMS = "reward_terms"
 
@@ -45,7 +42,7 @@ class Form:
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     goals: tuple[int, int] | None
-    counted: Counted
+    counted: frozenset[str]
     terms: tuple[str, ...]
     metadata: Mapping[str, Any] = field(compare=False)
     render_mode: str | None
@@ -110,8 +107,7 @@ class Buffers:
         rewards: Shape (n,). Only steps write them, and the flags.
         terminations: Shape (n,).
         truncations: Shape (n,).
-        infos: Everything in ``info`` that is numbers, by its key.
-        extras: The rest of ``info``, one dictionary for each environment.
+        infos: Everything in ``info``, by its key.
     """
 
     observations: Any
@@ -119,45 +115,31 @@ class Buffers:
     terminations: NDArray[np.bool_]
     truncations: NDArray[np.bool_]
     infos: dict[str, Column]
-    extras: list[dict[str, Any]]
 
     @classmethod
-    def empty(cls, form: Form, size: int, allocate: Allocate = np.zeros) -> Buffers:
-        """Make one for environments of a form.
-
-        Args:
-            form: What they have in common.
-            size: How many there are.
-            allocate: Called in the same order whenever the arguments are the same.
-        """
+    def empty(cls, form: Form, size: int) -> Buffers:
+        """Make one for some environments of a form."""
         infos: dict[str, Column] = {}
-        if form.counted.success:
-            infos = {name: allocate((size,), np.bool_) for name in FLAGS}
-        if form.counted.fraction:
-            infos[FRACTION] = allocate((size,), np.float64)
+        if SUCCESS in form.counted:
+            infos = {name: np.zeros((size,), np.bool_) for name in FLAGS}
+        if FRACTION in form.counted:
+            infos[FRACTION] = np.zeros((size,), np.float64)
         if form.goals is not None:
             for name, width in zip(GOALS, form.goals, strict=True):
-                infos[name] = allocate((size, width), np.float64)
-        infos[TERMS] = {name: allocate((size,), np.float64) for name in form.terms}
+                infos[name] = np.zeros((size, width), np.float64)
+        infos[TERMS] = {name: np.zeros((size,), np.float64) for name in form.terms}
         return cls(
-            observations=_rows(form.observation_space, size, allocate),
-            rewards=allocate((size,), np.float64),
-            terminations=allocate((size,), np.bool_),
-            truncations=allocate((size,), np.bool_),
+            observations=_rows(form.observation_space, size),
+            rewards=np.zeros((size,), np.float64),
+            terminations=np.zeros((size,), np.bool_),
+            truncations=np.zeros((size,), np.bool_),
             infos=infos,
-            extras=[{} for _ in range(size)],
         )
 
-    def part(self, where: slice) -> Buffers:
-        """Give some rows: what is written there is written here, but for the extras."""
-        return Buffers(
-            _part(self.observations, where),
-            self.rewards[where],
-            self.terminations[where],
-            self.truncations[where],
-            {name: _part(column, where) for name, column in self.infos.items()},
-            self.extras[where],
-        )
+    def put(self, where: slice, other: Buffers) -> None:
+        """Copy what other environments said into some rows."""
+        for name, mine in vars(self).items():
+            _copy(vars(other)[name], mine, where)
 
     def write(self, row: int, observation: Any, info: Mapping[str, Any]) -> None:
         """Write what one environment shows."""
@@ -172,9 +154,6 @@ class Buffers:
                     column[term][row] = value
             else:
                 column[row] = info[name]
-        if len(info) > len(self.infos):
-            rest = info.keys() - self.infos.keys()
-            self.extras[row] = {name: value for name, value in info.items() if name in rest}
 
     def observation(self, row: int) -> Any:
         """Copy the observation of one environment."""
@@ -183,16 +162,18 @@ class Buffers:
         return self.observations[row].copy()
 
 
-def _rows(space: gymnasium.Space[Any], size: int, allocate: Allocate) -> Any:
+def _rows(space: gymnasium.Space[Any], size: int) -> Any:
     if isinstance(space, Dict):
-        return {name: _rows(part, size, allocate) for name, part in space.items()}
-    return allocate((size, *(space.shape or ())), space.dtype)
+        return {name: _rows(part, size) for name, part in space.items()}
+    return np.zeros((size, *(space.shape or ())), space.dtype)
 
 
-def _part(column: Any, where: slice) -> Any:
+def _copy(rows: Any, column: Any, where: slice) -> None:
     if isinstance(column, dict):
-        return {name: _part(one, where) for name, one in column.items()}
-    return column[where]
+        for name, one in column.items():
+            _copy(rows[name], one, where)
+    else:
+        column[where] = rows
 
 
 def gymnasium_infos(columns: Mapping[str, Column], which: NDArray[np.bool_]) -> dict[str, Any]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._types import Integers
 from scm_world.env.batched.buffers import Buffers, Form
-from scm_world.env.batched.executor import check_actions, located
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
-from scm_world.errors import NotReset, ScmWorldError
+from scm_world.errors import ActionError, NotReset, ScmWorldError
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 
@@ -21,9 +21,13 @@ RESET = "the reset"
 SNAPSHOT = "the snapshot"
 
 
-@final
 class LoopExecutor:
-    """Environments that take turns: what every other executor is held against. See ``EnvExecutor``.
+    """Environments that are made alike, each with its own parameters, noise and clock; in turns.
+
+    Each does, bit for bit, what it would do alone. Whatever happens to one of them is in its row
+    of the buffers afterwards. ``reset``, ``do`` and ``restore`` happen in all of those that are
+    named or in none; so does what makes one unlike the others (see ``Form.check``). The message of
+    an error says in which environment it happened. All other executors do the same.
 
     Args:
         make: Makes one of them.
@@ -53,7 +57,13 @@ class LoopExecutor:
         seeds: Sequence[int | None],
         options: Sequence[Mapping[str, Any] | None],
     ) -> None:
-        """Begin an episode in some of them."""
+        """Begin an episode in some of them; rewards and flags of the buffers stay.
+
+        Args:
+            which: Which ones, shape (n,), bool.
+            seeds: One for each environment, as in ``ScmWorldEnv.reset``.
+            options: Also.
+        """
 
         def begin(index: int) -> None:
             given = options[index]
@@ -65,7 +75,15 @@ class LoopExecutor:
         self._all_or_none(np.flatnonzero(which).tolist(), begin)
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
-        """Advance some of them one control step."""
+        """Advance some of them one control step.
+
+        If an action is not finite, none moves. If one fails as it is stepped, all others are one
+        step further, and the first error is raised.
+
+        Args:
+            which: Which ones, shape (n,), bool.
+            actions: Shape (n, n_actions), 64-bit floats; those of the others are not looked at.
+        """
         buffers, rows = self.buffers, np.flatnonzero(which)
         check_actions(rows, actions, self._first)
         failed: ScmWorldError | None = None
@@ -87,7 +105,7 @@ class LoopExecutor:
     def do(
         self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
     ) -> dict[int, Audit]:
-        """Intervene in some of them."""
+        """Intervene in some of them, by index, as ``ScmWorldEnv.do`` does."""
         audits = {}
 
         def intervene(index: int) -> None:
@@ -102,6 +120,7 @@ class LoopExecutor:
     def snapshot(self, indices: Sequence[int]) -> list[EnvSnapshot]:
         """Save some of them."""
         taken, index = [], 0
+        self._bring(indices)
         try:
             for index in indices:
                 taken.append(self.envs[index].snapshot())
@@ -111,7 +130,7 @@ class LoopExecutor:
         return taken
 
     def restore(self, snapshots: Mapping[int, EnvSnapshot]) -> None:
-        """Take some of them to a snapshot."""
+        """Take some of them to a snapshot; it may be that of another one."""
 
         def go(index: int) -> None:
             env = self.envs[index]
@@ -135,6 +154,7 @@ class LoopExecutor:
 
     def attribute(self, indices: Sequence[int], name: str) -> list[Any]:
         """Look an attribute of some of them up."""
+        self._bring(indices)
         return [self.envs[index].get_wrapper_attr(name) for index in indices]
 
     def assign(self, name: str, values: Mapping[int, Any]) -> None:
@@ -143,13 +163,17 @@ class LoopExecutor:
             self.envs[index].set_wrapper_attr(name, value)
 
     def close(self) -> None:
-        """Free their engines."""
+        """Free their engines. The buffers can still be read."""
         for env in self.envs:
             env.close()
+
+    def _bring(self, indices: Iterable[int]) -> None:
+        """Let environments be as they are now, before they are used; here they always are."""
 
     def _all_or_none(self, indices: Iterable[int], act: Callable[[int], None]) -> None:
         """Do something to some of them; if one refuses, all are as they were."""
         index, self._before = 0, {}
+        self._bring(indices)
         try:
             for index in indices:
                 with suppress(NotReset):  # then it has no episode that could be lost
@@ -174,3 +198,32 @@ class LoopExecutor:
 
 def _first_name(request: Mapping[str, Any] | None, otherwise: str) -> str:
     return next(iter(request or ()), otherwise)
+
+
+def check_actions(rows: Integers, actions: NDArray[Any], first: int = 0) -> None:
+    """Refuse actions that are not finite, before anything moves.
+
+    Args:
+        rows: Who is stepped, shape (m,).
+        actions: Shape (n, n_actions).
+        first: The number of the first one in messages.
+
+    Raises:
+        ActionError: With the number of the environment.
+    """
+    bad = rows[~np.isfinite(actions[rows]).all(axis=1)]
+    if len(bad):
+        row = int(bad[0])
+        said = f"an action is finite numbers, got {actions[row]!r}"
+        raise located(ActionError(said, actions[row]), first + row)
+
+
+def located(error: ScmWorldError, index: int) -> ScmWorldError:
+    """Say in an error in which environment it happened.
+
+    Example:
+        >>> print(located(ScmWorldError("the block is in the table"), 3))
+        environment 3: the block is in the table
+    """
+    error.args = (f"environment {index}: {error}",)
+    return error

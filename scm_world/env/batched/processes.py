@@ -1,4 +1,4 @@
-"""Many environments in several processes, which share the memory of what they say."""
+"""Many environments in several processes."""
 
 from __future__ import annotations
 
@@ -12,28 +12,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
-from scm_world.env.batched.buffers import Form
-from scm_world.env.batched.executor import check_actions
-from scm_world.env.batched.memory import Allocator, Signal, meeting_place, share
-from scm_world.env.batched.worker import DONE, RESET, STEP, EnvWorker, SharedBuffers
+from scm_world.env.batched.buffers import Buffers, Form
+from scm_world.env.batched.loop import LoopExecutor, check_actions
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.variables.subsets import AnyRegion
-from scm_world.work.processes import PROCESS, Ended, Worker
-from scm_world.work.threads import cores
+from scm_world.work.processes import PROCESS, Ended, Worker, cores
 from scm_world.world import Audit
 
 ANEW = "make the environments anew"
 
 
 @final
+class EnvWorker:
+    """Environments with adjacent numbers, in a process of their own.
+
+    Args:
+        make: Makes one environment.
+        size: How many are here.
+        first: The index of the first one in the whole executor.
+    """
+
+    def __init__(self, make: Callable[[], ScmWorldEnv], size: int, first: int) -> None:
+        self._executor = LoopExecutor(make, size, first=first)
+
+    def form(self) -> Form:
+        """Return what the environments have in common."""
+        return self._executor.form
+
+    def buffers(self) -> Buffers:
+        """Return what they said last."""
+        return self._executor.buffers
+
+    def tell(
+        self, method: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]
+    ) -> tuple[Any, Buffers]:
+        """Call a method of the executor that is here; return its answer and the buffers."""
+        return getattr(self._executor, method)(*args, **kwargs), self._executor.buffers
+
+
+@final
 class ProcessExecutor:
     """Environments in several processes: how engines without threads use all cores.
 
-    Each process has some neighbors, and writes what they say into memory that all share; so do
-    actions come to it. Only what is no number goes through a pipe. What comes out does not
-    depend on the number of processes.
+    Each process has some neighbors. What comes out does not depend on the number of processes.
+    The methods are those of ``LoopExecutor``.
 
     Args:
         make: Makes one environment; it can be pickled.
@@ -64,28 +88,20 @@ class ProcessExecutor:
             Worker(partial(EnvWorker, make, part.stop - part.start, part.start))
             for part in self._parts
         ]
-        self._signals: list[Signal] = []
         self._lost = ""
-        self._end = weakref.finalize(self, _stop, self._workers, self._signals)
+        self._end = weakref.finalize(self, _stop, self._workers)
         try:
-            self._share()
+            for worker in self._workers:
+                worker.begin("form")
+            for worker in self._workers:
+                self.form: Form = worker.answer()
+        except Ended as error:
+            self._end()
+            raise EngineFailure(str(error), PROCESS) from None
         except BaseException:
             self._end()
             raise
-
-    def _share(self) -> None:
-        """Start the processes, and let all of them write into one memory."""
-        everyone = range(len(self._workers))
-        self.form: Form = self._ask(dict.fromkeys(everyone, ("form",)))[0]
-        needed = Allocator()
-        SharedBuffers(self.form, self.num_envs, needed)
-        with meeting_place() as place:
-            self._shared = SharedBuffers(
-                self.form, self.num_envs, Allocator(share(place, needed.size))
-            )
-            self._signals.extend(Signal(place, str(k)) for k in everyone)
-            self._ask({k: ("attach", place, str(k), self.num_envs) for k in everyone})
-        self.buffers = self._shared.buffers
+        self.buffers = Buffers.empty(self.form, num_envs)
 
     def reset(
         self,
@@ -94,22 +110,16 @@ class ProcessExecutor:
         options: Sequence[Mapping[str, Any] | None],
     ) -> None:
         """Begin an episode in some of them."""
-        busy = self._busy(which)
-        if any(seed is not None for seed in seeds) or any(options):
-            parts = {k: self._parts[k] for k in busy}
-            self._all_or_none(
-                "reset", {k: (which[mine], seeds[mine], options[mine]) for k, mine in parts.items()}
-            )
-        else:
-            self._shared.which[:] = which
-            self._signal_all(RESET, busy)
+        parts = {k: self._parts[k] for k in self._busy(which)}
+        self._all_or_none(
+            "reset", {k: (which[mine], seeds[mine], options[mine]) for k, mine in parts.items()}
+        )
 
     def step(self, which: NDArray[Any], actions: NDArray[Any]) -> None:
         """Advance some of them one control step."""
         check_actions(np.flatnonzero(which), actions)
-        self._shared.which[:] = which
-        self._shared.actions[:] = actions
-        self._signal_all(STEP, self._busy(which))
+        parts = {k: self._parts[k] for k in self._busy(which)}
+        self._ask({k: ("step", which[mine], actions[mine]) for k, mine in parts.items()})
 
     def do(
         self, requests: Mapping[int, Mapping[str, Any]], space: AnyRegion | None = None
@@ -144,19 +154,15 @@ class ProcessExecutor:
     def assign(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute of some of them."""
         parts = self._split(values)
-        self._ask({k: ("tell", "assign", (name, mine), {}) for k, mine in parts.items()})
+        self._ask({k: ("assign", name, mine) for k, mine in parts.items()})
 
     def close(self) -> None:
         """End the processes."""
         self._lost = self._lost or f"the environments are closed; {ANEW}"
         self._end()
 
-    # --- who has what -----------------------------------------------------------------------------
-
     def _busy(self, which: NDArray[Any]) -> list[int]:
         """List the processes that have some of these environments."""
-        if which.all():
-            return list(range(len(self._parts)))
         return [k for k, part in enumerate(self._parts) if which[part].any()]
 
     def _split(self, by_index: Mapping[int, Any]) -> dict[int, dict[int, Any]]:
@@ -170,9 +176,7 @@ class ProcessExecutor:
     def _listed(self, indices: Sequence[int], method: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Ask for something of each of some environments."""
         parts = self._split(dict.fromkeys(indices))
-        answers = self._ask(
-            {k: ("tell", method, ([*mine], *args), kwargs) for k, mine in parts.items()}
-        )
+        answers = self._ask({k: (method, [*mine], *args) for k, mine in parts.items()}, kwargs)
         found = {
             self._parts[k].start + local: one
             for k, mine in parts.items()
@@ -180,52 +184,26 @@ class ProcessExecutor:
         }
         return [found[index] for index in indices]
 
-    # --- asking -----------------------------------------------------------------------------------
-
-    def _signal_all(self, what: bytes, busy: Sequence[int]) -> None:
-        """Let some processes step or reset; resets happen in all of them or in none."""
-        if self._lost:
-            raise EngineFailure(self._lost, PROCESS)
-        try:
-            for k in busy:
-                self._signals[k].send(what)
-            said = {k: self._signals[k].answer() for k in busy}
-        except BaseException as error:
-            self._give_up(f"they were interrupted by {type(error).__name__}")
-            raise
-        rest = [k for k in busy if said[k] != DONE]
-        if rest:
-            _, errors = self._answers(dict.fromkeys(rest, ("more",)))
-            if errors and what == RESET:
-                self._undo(set(busy) - errors.keys())
-            _raise_first(errors)
-
     def _all_or_none(self, method: str, given: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
         """Ask for something that each process does wholly or not at all, and so do all of them."""
-        calls: dict[int, tuple[Any, ...]]
-        calls = {k: ("tell", method, args, {}) for k, args in given.items()}
-        answers, errors = self._answers(calls)
-        if errors:
-            self._undo(answers)
-        _raise_first(errors)
-        return answers
+        return self._ask({k: (method, *args) for k, args in given.items()}, undo=True)
 
-    def _undo(self, where: Iterable[int]) -> None:
-        self._ask(dict.fromkeys(where, ("tell", "undo", (), {})))
-
-    def _ask(self, calls: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
-        """Ask some processes at once, and give what they say."""
-        answers, errors = self._answers(calls)
-        _raise_first(errors)
-        return answers
-
-    def _answers(
-        self, calls: Mapping[int, tuple[Any, ...]]
-    ) -> tuple[dict[int, Any], dict[int, Exception]]:
-        """Ask some processes at once; whatever one of them says, the others are heard too.
+    def _ask(
+        self,
+        calls: Mapping[int, tuple[Any, ...]],
+        kwargs: Mapping[str, Any] | None = None,
+        *,
+        undo: bool = False,
+    ) -> dict[int, Any]:
+        """Ask some processes at once; whatever one of them says, the others are heard, too.
 
         Args:
-            calls: For each process, a method of its station, and the arguments.
+            calls: For each process a method of its executor, and the arguments.
+            kwargs: Further arguments of all of them.
+            undo: Whether it is taken back in all processes where one refuses it.
+
+        Returns:
+            What they say.
         """
         if self._lost:
             raise EngineFailure(self._lost, PROCESS)
@@ -233,48 +211,39 @@ class ProcessExecutor:
         errors: dict[int, Exception] = {}
         k = 0
         try:
-            for k, (method, *given) in calls.items():
+            for k, (method, *args) in calls.items():
                 try:
-                    self._workers[k].begin(method, *given)
+                    self._workers[k].begin("tell", method, tuple(args), kwargs or {})
                 except UnknownOption as error:  # an argument cannot be pickled
                     errors[k] = error
             for k in calls.keys() - errors.keys():
                 try:
-                    answers[k] = self._heard(k)
+                    answers[k], shown = self._workers[k].answer()
                 except Ended:
                     raise
                 except Exception as error:
                     errors[k] = error
+                    shown = self._workers[k].ask("buffers")
+                self.buffers.put(self._parts[k], shown)
         except Ended as error:
-            raise self._give_up(f"{self._who(k)}: {error}") from None
+            part = self._parts[k]
+            self._give_up(f"environments {part.start} to {part.stop - 1} are lost: {error}")
+            raise EngineFailure(self._lost, PROCESS) from None
         except BaseException as error:
             self._give_up(f"they were interrupted by {type(error).__name__}")
             raise
-        return answers, errors
+        if errors:
+            if undo:
+                self._ask(dict.fromkeys(answers, ("undo",)))
+            raise errors[min(errors)]
+        return answers
 
-    def _heard(self, k: int) -> Any:
-        answer, extras = self._workers[k].answer()
-        if extras is not None:
-            self.buffers.extras[self._parts[k]] = extras
-        return answer
-
-    def _who(self, k: int) -> str:
-        return f"environments {self._parts[k].start} to {self._parts[k].stop - 1} are lost"
-
-    def _give_up(self, reason: str) -> EngineFailure:
+    def _give_up(self, reason: str) -> None:
         """End all processes: some may be a step ahead of the others."""
         self._lost = f"{reason}; {ANEW}"
         self._end()
-        return EngineFailure(self._lost, PROCESS)
 
 
-def _raise_first(errors: Mapping[int, Exception]) -> None:
-    if errors:
-        raise errors[min(errors)]
-
-
-def _stop(workers: Sequence[Worker], signals: list[Signal]) -> None:
+def _stop(workers: Iterable[Worker]) -> None:
     for worker in workers:
         worker.stop()
-    while signals:
-        signals.pop().close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world.env.batched.asking import (
     MASK,
     actions_of,
@@ -24,12 +25,15 @@ from scm_world.env.batched.asking import (
     spread,
 )
 from scm_world.env.batched.buffers import gymnasium_infos
-from scm_world.env.batched.executor import EnvExecutor, located, make_executor
+from scm_world.env.batched.loop import LoopExecutor, located
+from scm_world.env.batched.native import NativeExecutor
+from scm_world.env.batched.processes import ProcessExecutor
 from scm_world.env.copies import EnvSnapshot
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
 from scm_world.tasks import Task
 from scm_world.variables.subsets import AnyRegion
+from scm_world.work.processes import cores
 from scm_world.world import Audit
 
 Stepped = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -101,7 +105,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         make = partial(member, **options)
         usual = getattr(options.get("task"), "backend", Task.backend)
         backend = str(options.get("backend") or usual)
-        self.executor: EnvExecutor = make_executor(
+        self.executor = make_executor(
             executor, make, self.num_envs, backend=backend, threads=threads, workers=workers
         )
         form = self.executor.form
@@ -157,9 +161,14 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         """
         buffers, stepping = self.executor.buffers, self._stepping(actions)
         given = actions_of(actions, stepping, self._action_size)
-        if not stepping.all():
-            self._begin_next(~stepping)
+        begun = ~stepping  # the next episode takes the place of a step
+        if begun.any():
+            self.executor.reset(begun, *self._nothing)
+            self._ended &= stepping
         self.executor.step(stepping, given)
+        if begun.any():
+            buffers.rewards[begun] = 0.0
+            buffers.terminations[begun] = buffers.truncations[begun] = False
         ended = buffers.terminations | buffers.truncations
         infos: dict[str, Any] = {}
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
@@ -170,14 +179,6 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         flags = buffers.terminations.copy(), buffers.truncations.copy()
         infos |= self._infos(self._everyone)
         return self._observations(), buffers.rewards.copy(), *flags, infos
-
-    def _begin_next(self, which: NDArray[np.bool_]) -> None:
-        """Begin the next episode of some of them, which takes the place of a step."""
-        buffers = self.executor.buffers
-        self.executor.reset(which, *self._nothing)
-        buffers.rewards[which] = 0.0
-        buffers.terminations[which] = buffers.truncations[which] = False
-        self._ended &= ~which
 
     def _stepping(self, actions: Any) -> NDArray[np.bool_]:
         """Tell which environments take a step."""
@@ -329,12 +330,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _infos(self, which: NDArray[np.bool_]) -> dict[str, Any]:
         """Give the infos of some of them, in Gymnasium's form: each with a mask."""
-        buffers = self.executor.buffers
-        infos = gymnasium_infos(buffers.infos, which)
-        if any(buffers.extras):
-            for index in np.flatnonzero(which).tolist():
-                infos = self._add_info(infos, buffers.extras[index], index)
-        return infos
+        return gymnasium_infos(self.executor.buffers.infos, which)
 
 
 def _mode(given: AutoresetMode | str) -> AutoresetMode:
@@ -343,3 +339,56 @@ def _mode(given: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         modes = [mode.value for mode in AutoresetMode]
         raise UnknownOption("autoreset_mode", given, modes) from None
+
+
+TOGETHER = ("mujoco", "step")
+"""Engines that step many worlds in one call."""
+
+EXECUTORS = ("native", "processes", "loop")
+
+
+def make_executor(
+    executor: str | None,
+    make: Callable[[], ScmWorldEnv],
+    num_envs: int,
+    *,
+    backend: str,
+    threads: int | None = None,
+    workers: int | None = None,
+) -> LoopExecutor | ProcessExecutor:
+    """Make what simulates many environments.
+
+    Args:
+        executor: Its name; the fastest one for the backend if None.
+        make: Makes one environment.
+        num_envs: How many.
+        backend: Name of the engine.
+        threads: Of the native executor.
+        workers: Processes of the executor that has some.
+
+    Raises:
+        UnknownOption: There is no such executor, or an option is not one of it.
+    """
+    kind = executor if executor is not None else fastest(backend, num_envs, workers=workers)
+    one_of("executor", kind, EXECUTORS)
+    for option, value, owner in (("threads", threads, "native"), ("workers", workers, "processes")):
+        if value is not None and kind != owner:
+            raise UnknownOption(
+                option, value, (f"None with executor={kind!r}", f"any with {owner!r}")
+            )
+    if kind == "processes":
+        return ProcessExecutor(make, num_envs, workers=workers)
+    if kind == "native":
+        return NativeExecutor(make, num_envs, threads=threads)
+    return LoopExecutor(make, num_envs)
+
+
+def fastest(backend: str, num_envs: int, *, workers: int | None) -> str:
+    """Name the executor that is fastest, which is the one with processes if their number is asked.
+
+    A process of a pool starts none of its own.
+    """
+    if backend in TOGETHER and workers is None:
+        return "native"
+    several = num_envs > 1 and cores() > 1 and not multiprocessing.current_process().daemon
+    return "processes" if workers is not None or (backend == "bullet" and several) else "loop"

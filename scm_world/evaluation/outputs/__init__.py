@@ -7,7 +7,7 @@ from scm_world.evaluation.outputs.figures import (
     profile_figure,
     radar_figure,
 )
-from scm_world.evaluation.outputs.report import write_report
+from scm_world.evaluation.outputs.report import write_outputs, write_report
 from scm_world.evaluation.outputs.videos import record_videos
 from scm_world.output.canvas import save
 
@@ -19,5 +19,6 @@ __all__ = [
     "radar_figure",
     "record_videos",
     "save",
+    "write_outputs",
     "write_report",
 ]

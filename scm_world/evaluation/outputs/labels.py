@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from scm_world._arguments import one_of
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
@@ -57,8 +58,7 @@ def lines_of(evaluation: Evaluation) -> list[Line]:
 
 def metric_words(metric: str) -> str:
     """Return in words what a metric is, or raise ``UnknownOption``."""
-    if metric not in METRICS:
-        raise UnknownOption("metric", metric, METRICS)
+    one_of("metric", metric, METRICS)
     return WORDS[metric]
 
 

@@ -1,13 +1,15 @@
-"""The report of an evaluation: one HTML file that needs nothing else, and no network."""
+"""The outputs of an evaluation: figures, videos, and a report that needs no network."""
 
 from __future__ import annotations
 
 import posixpath
 from collections.abc import Mapping, Sequence
-from typing import Any
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from scm_world.errors import UnknownOption
+from scm_world.evaluation.checking import shard_runner_of
 from scm_world.evaluation.files import summarized
 from scm_world.evaluation.outputs.figures import (
     ALPHA,
@@ -30,12 +32,17 @@ from scm_world.evaluation.outputs.labels import (
     metric_words,
     protocol_words,
 )
+from scm_world.evaluation.outputs.videos import record_videos
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Causes, Interval
-from scm_world.output.canvas import small_png
-from scm_world.output.durable import write_whole
-from scm_world.output.locations import Location, located
+from scm_world.output.canvas import save, small_png
+from scm_world.output.durable import removed, write_whole
 from scm_world.output.pages import Entry, render
+from scm_world.output.remote import Location, located
+from scm_world.queries.progress import Progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SECTIONS = {
     "summary": "Scores",
@@ -58,7 +65,7 @@ def write_report(
     *,
     videos: Sequence[Location | str] = (),
     metric: str | None = None,
-) -> None:
+) -> dict[str, Figure]:
     """Write the report as one HTML file: scores, figures, differences, causes, how to check them.
 
     What cannot be computed, such as a gap with one engine, is left out or says why. The same
@@ -69,6 +76,9 @@ def write_report(
         path: Of the HTML file.
         videos: Files that the page links to, relative to where it stands.
         metric: That the figures and the first table are about; one of ``METRICS``.
+
+    Returns:
+        The figures of the page, by name.
 
     Raises:
         UnknownOption: There is no such metric, or no episode.
@@ -82,19 +92,20 @@ def write_report(
     compared, gaps = _or_why(comparisons_of, evaluation, metric), None
     if len(evaluation.engines) > 1:
         gaps = _or_why(gaps_of, evaluation, metric)
-    figures = {"bars": bars_figure(evaluation, metric), "radar": None}
-    if len(evaluation.protocols) >= 3:
+    figures = {"bars": bars_figure(evaluation, metric)}
+    if len(evaluation.protocols) >= CORNERS:
         figures["radar"] = radar_figure(evaluation, metric)
     if not isinstance(compared, str):
         figures["profile"] = profile_figure(evaluation, metric, compared)
     if gaps is not None and not isinstance(gaps, str):
         figures["gap"] = gap_figure(evaluation, metric, gaps)
-    missing = {"radar": figures["radar"], "differences": pairs, "gap": gaps, "videos": videos}
+    missing = {"radar": "radar" in figures, "differences": pairs, "gap": gaps, "videos": videos}
     published = [
         (line, protocol, numbers)
         for line in lines
         for protocol, numbers in evaluation.published(agent=line.agent, engine=line.engine).items()
     ]
+    causes = [_causes(evaluation, line, metric) for line in lines]
     page = render(
         "evaluation/outputs/report.html",
         title=f"Evaluation: {evaluation.task}",
@@ -114,7 +125,7 @@ def write_report(
         },
         bold=best(pairs),
         overall=[_overall(evaluation, line, metric) for line in lines],
-        figures={name: one and small_png(one) for name, one in figures.items()},
+        figures={"radar": None} | {name: small_png(one) for name, one in figures.items()},
         compared=compared,
         better=[] if isinstance(compared, str) else [
             [engine, " > ".join(pair), str(one)]
@@ -126,7 +137,7 @@ def write_report(
             ([agent, protocol, f"{a} minus {b}"], one)
             for (a, b, agent, protocol), one in gaps.items()
         ],
-        causes=[_causes(evaluation, line, metric) for line in lines],
+        causes=[(line, shown, small_png(figure)) for line, shown, figure in causes],
         videos=[
             (quote(posixpath.relpath(str(located(one)), str(folder))), located(one).name)
             for one in videos
@@ -161,6 +172,10 @@ def write_report(
         },
     )  # fmt: skip
     write_whole(page, path)
+    for line, _, figure in causes if evaluation.drawn() else ():
+        name = "causes" if len(lines) == 1 else f"causes-{line.agent}-{line.engine}"
+        figures[name.replace("/", "_")] = figure
+    return figures
 
 
 def verdict(found: Causes) -> str:
@@ -204,7 +219,7 @@ def _overall(evaluation: Evaluation, line: Line, metric: str) -> tuple[list[str]
     return names, _or_why(lambda one, metric: one.overall(metric), mine, metric)
 
 
-def _causes(evaluation: Evaluation, line: Line, metric: str) -> tuple[Line, dict[str, Any], bytes]:
+def _causes(evaluation: Evaluation, line: Line, metric: str) -> tuple[Line, dict[str, Any], Figure]:
     found = causes_of(evaluation, line, metric)
     figure = causes_figure(evaluation, line.agent, line.engine, metric, found)
     shown = {
@@ -212,8 +227,62 @@ def _causes(evaluation: Evaluation, line: Line, metric: str) -> tuple[Line, dict
         "effects": [(protocol, one) for protocol, f in found.items() for one in f.ranked()],
         "left_out": [[p, *one] for p, f in found.items() for one in f.left_out.items()],
     }
-    return line, shown, small_png(figure)
+    return line, shown, figure
 
 
 def _policy(policy: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in policy.items())
+
+
+STALE = ("bars.png", "radar.png", "profile.png", "gap.png", "causes*.png", "report.html")
+"""What an earlier evaluation may have left in the folder."""
+
+CORNERS = 3
+"""With fewer protocols a radar has no area."""
+
+
+def write_outputs(
+    evaluation: Evaluation,
+    folder: Location | str,
+    *,
+    metric: str | None = None,
+    videos: bool = False,
+    policy: Any = None,
+    trusted: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> tuple[Location, ...]:
+    """Write figures, the report, and videos if they are wanted.
+
+    Args:
+        evaluation: What is shown.
+        folder: Where to; it is there. It may be a URL.
+        metric: Score that is drawn.
+        videos: Whether the best, the median and the worst episode of each agent are filmed.
+        policy: Who acted, for videos of policies that are no files and have no names.
+        trusted: Packages whose functions may be policies, for videos.
+        progress: Told how many control steps of a video are done.
+
+    Returns:
+        The files.
+
+    Raises:
+        UnknownOption: There is no such metric.
+        UnwritableFolder: There is no room, or no permission.
+        MissingExtra: Videos are wanted, and moviepy is not installed.
+    """
+    metric = evaluation.metric(metric)
+    place = located(folder)
+    for name in STALE:
+        for old in place.glob(name):
+            removed(old)
+    films: list[Location] = []
+    if videos:
+        with closing(shard_runner_of(evaluation, policy=policy, trusted=trusted)) as shard_runner:
+            for line in lines_of(evaluation):
+                who: Any = {"agent": line.agent, "engine": line.engine, "metric": metric}
+                films += record_videos(shard_runner, evaluation, place, **who, progress=progress)
+    report, files = place / "report.html", []
+    for name, figure in write_report(evaluation, report, videos=films, metric=metric).items():
+        files.append(place / f"{name}.png")
+        save(figure, files[-1])
+    return (*files, report, *films)

@@ -3,20 +3,18 @@
 Every draw comes from a seed, so the same numbers give the same intervals.
 """
 
-from scm_world.evaluation.statistics.aggregates import (
-    METRICS,
-    Profile,
-    aggregate,
-    performance_profile,
-    probability_of_improvement,
-)
 from scm_world.evaluation.statistics.causes import Cause, Causes, ColumnEffect, find_causes
 from scm_world.evaluation.statistics.intervals import (
     LEVEL,
+    METRICS,
     Interval,
+    Profile,
+    aggregate,
     difference_interval,
     is_binary,
     mean_interval,
+    performance_profile,
+    probability_of_improvement,
     unpaired_interval,
 )
 

@@ -1,8 +1,13 @@
-"""Means and differences of scores, with intervals.
+"""Estimates of scores with intervals: means, differences, and aggregates over runs and protocols.
 
 Intervals are percentiles of a bootstrap within each stratum (Efron and Tibshirani, *An Introduction
 to the Bootstrap*, 1993). Success rates get intervals of the binomial distribution instead, because
-a bootstrap of two hundred successes in a row has no width.
+a bootstrap of two hundred successes in a row has no width. Aggregates, profiles and improvement are
+those of rliable, which cannot be imported beside pandas 3, and draws from numpy's global generator.
+
+Source:
+    Agarwal et al., *Deep reinforcement learning at the edge of the statistical precipice*,
+    NeurIPS 2021.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import one_of
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import UnknownOption
 
@@ -85,8 +91,8 @@ def mean_interval(
 
     Args:
         values: One number per episode, shape ``(n,)``.
-        strata: To which stratum each belongs, for example its protocol, shape ``(n,)``. Every
-            resample has as many episodes of each stratum.
+        strata: To which stratum each belongs, for example its training run, shape ``(n,)``. Every
+            resample has as many episodes of each stratum; a Wilson interval has no strata.
         level: Confidence.
         resamples: Of the bootstrap, whose draws come from ``seed`` alone.
         seed: Of the bootstrap.
@@ -95,38 +101,40 @@ def mean_interval(
 
     Returns:
         The mean. Its ends are unknown if no stratum has two numbers, unless these are proportions.
-        Strata whose rates differ narrow a Wilson interval: see ``_effective_size``.
 
     Raises:
         UnknownOption: No values; values, strata, level or resamples that are none; or a
             proportion of values that are not 0 or 1.
 
     Source:
-        Wilson, *Probable inference*, Journal of the American Statistical Association 22, 1927;
-        with strata as in Korn and Graubard, *Confidence intervals for proportions*, Survey
-        Methodology 24, 1998.
+        Wilson, *Probable inference*, Journal of the American Statistical Association 22, 1927.
 
     Example:
         >>> print(mean_interval([1.0] * 200))
         1.00 [0.98, 1.00]
     """
     scores = numbers("values", values)
-    members = _parted(scores, strata)
-    z2 = normal_quantile(level) ** 2
+    members = [scores]
+    if strata is not None:
+        labels: Any = np.asarray(strata)
+        if labels.shape != scores.shape:
+            allowed = (f"one for each of the {scores.size} values",)
+            raise UnknownOption("strata", f"an array of shape {labels.shape}", allowed)
+        members = [scores[labels == label] for label in np.unique(labels)]
+    normal_quantile(level)
     if proportion and not is_binary(scores):
         raise UnknownOption("a value of a proportion", "another number", ("0 or 1",))
     if not (is_binary(scores) if proportion is None else proportion):
         return _bootstrapped_mean(scores, members, level, resamples, seed)
-    n, rate = _effective_size(members, z2), float(scores.mean())
-    center = (rate + z2 / (2.0 * n)) / (1.0 + z2 / n)
-    reach = math.sqrt(z2 * (rate * (1.0 - rate) + z2 / (4.0 * n)) / n) / (1.0 + z2 / n)
-    return _around(scores, max(0.0, center - reach), min(1.0, center + reach), level)
+    from scipy.stats import binomtest
+
+    found = binomtest(int(scores.sum()), scores.size).proportion_ci(level, method="wilson")
+    return _around(scores, found.low, found.high, level)
 
 
 def difference_interval(
     a: ArrayLike,
     b: ArrayLike,
-    strata: ArrayLike | None = None,
     *,
     level: float = LEVEL,
     resamples: int = RESAMPLES,
@@ -140,7 +148,7 @@ def difference_interval(
     Returns:
         The mean of ``a - b``, with a bootstrap of the differences. Where every score is 0 or 1 the
         interval is that of Bonett and Price: one episode in which only the first succeeds and one
-        in which only the second does are added, shared among the strata.
+        in which only the second does are added.
 
     Raises:
         UnknownOption: As for ``mean_interval``, or ``a`` and ``b`` differ in length.
@@ -154,17 +162,15 @@ def difference_interval(
     if first.shape != second.shape:
         raise UnknownOption("b", f"{second.size} scores", (f"one for each of the {first.size} a",))
     difference = first - second
-    members, z = _parted(difference, strata), normal_quantile(level)
+    z = normal_quantile(level)
     binary = is_binary(first) and is_binary(second)
     if not (binary if proportion is None else proportion):
-        return _bootstrapped_mean(difference, members, level, resamples, seed)
-    added = 1.0 / len(members)
-    n = np.array([len(part) + 2.0 * added for part in members])
-    wins = np.array([np.count_nonzero(part > 0.0) + added for part in members]) / n
-    losses = np.array([np.count_nonzero(part < 0.0) + added for part in members]) / n
-    weights = np.array([len(part) for part in members]) / len(difference)
-    center = float(weights @ (wins - losses))
-    reach = z * math.sqrt(weights**2 @ ((wins + losses - (wins - losses) ** 2) / n))
+        return _bootstrapped_mean(difference, [difference], level, resamples, seed)
+    n = len(difference) + 2.0
+    wins = (np.count_nonzero(difference > 0.0) + 1.0) / n
+    losses = (np.count_nonzero(difference < 0.0) + 1.0) / n
+    center = wins - losses
+    reach = z * math.sqrt((wins + losses - center**2) / n)
     return _around(difference, max(-1.0, center - reach), min(1.0, center + reach), level)
 
 
@@ -257,31 +263,6 @@ def normal_quantile(level: float) -> float:
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
-def _parted(values: Floats, strata: ArrayLike | None) -> list[Floats]:
-    """Part values by their strata; without strata, they are one."""
-    if strata is None:
-        return [values]
-    labels: Any = np.asarray(strata)
-    if labels.shape != values.shape:
-        allowed = (f"one for each of the {values.size} values",)
-        raise UnknownOption("strata", f"an array of shape {labels.shape}", allowed)
-    places: Any = np.unique(labels, return_inverse=True)[1]
-    return [values[places == k] for k in range(int(places.max()) + 1)]
-
-
-def _effective_size(strata: Sequence[Floats], z2: float) -> float:
-    """Compute how many episodes of one kind are worth as much as these.
-
-    The variances are those of rates drawn toward one half, as the Wilson interval draws its
-    center, so that a stratum in which all succeed is not taken for certain.
-    """
-    n = np.array([len(part) for part in strata], dtype=np.float64)
-    rates = (np.array([part.sum() for part in strata]) + 0.5 * z2) / (n + z2)
-    weights = n / n.sum()
-    pooled = weights @ rates
-    return float(pooled * (1.0 - pooled) / (weights**2 @ (rates * (1.0 - rates) / n)))
-
-
 def _bootstrapped_mean(
     values: Floats, strata: list[Floats], level: float, resamples: int, seed: int
 ) -> Interval:
@@ -300,3 +281,187 @@ def _bootstrapped_mean(
 def _around(values: Floats, low: float, high: float, level: float) -> Interval:
     mean = float(values.mean())
     return Interval(mean, min(low, mean), max(high, mean), level, values.size)
+
+
+METRICS = ("mean", "median", "interquartile_mean", "optimality_gap")
+OVER = ("runs", "episodes")
+
+
+def aggregate(
+    scores: ArrayLike,
+    *,
+    over: str = "runs",
+    gamma: float = 1.0,
+    level: float = LEVEL,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> dict[str, Interval]:
+    """Estimate the four aggregates, with stratified bootstrap intervals.
+
+    Args:
+        scores: Shape ``(runs, protocols)``, or ``(runs, protocols, episodes)``.
+        over: ``"runs"``: a run's score in a protocol is the mean of its episodes, and runs are
+            resampled within each protocol; the interval is about other runs of the same training.
+            ``"episodes"``: episodes are resampled within each run and protocol; the interval is
+            about other episodes of the same runs.
+        gamma: Score that counts as enough, for the optimality gap.
+        level: Confidence.
+        resamples: Of the bootstrap.
+        seed: Of the bootstrap.
+
+    Returns:
+        By the names of ``METRICS``: the mean; the median protocol's mean; the mean of the middle
+        half, of which the number left out at each end is rounded down; and by how much scores miss
+        ``gamma`` on average.
+
+    Raises:
+        UnknownOption: Scores, level, resamples or ``over`` that are none; or less than two runs,
+            or episodes, to resample.
+
+    Example:
+        >>> scores = np.random.default_rng(0).beta(8, 2, size=(5, 12))
+        >>> print(aggregate(scores)["interquartile_mean"])
+        0.79 [0.76, 0.83]
+    """
+    from scipy.stats import trim_mean
+
+    groups = _groups("scores", scores, over)
+    normal_quantile(level)
+    if not np.isfinite(gamma):
+        raise UnknownOption("gamma", gamma, ("a finite number",))
+
+    def metrics(*strata: Floats, axis: int = -1) -> Any:
+        table = _pooled(strata, groups.shape)
+        flat = table.reshape(len(table), -1)
+        gap = gamma - np.minimum(flat, gamma).mean(axis=-1)
+        median = np.median(table.mean(axis=-1), axis=-1)
+        return np.stack([flat.mean(axis=-1), median, trim_mean(flat, 0.25, axis=-1), gap])
+
+    found = metrics(*_strata(groups[None]))[:, 0]
+    low, high = bootstrap(_strata(groups), metrics, level=level, resamples=resamples, seed=seed)
+    return {
+        name: Interval(float(found[k]), float(low[k]), float(high[k]), level, groups.size)
+        for k, name in enumerate(METRICS)
+    }
+
+
+@final
+@dataclass(frozen=True)
+class Profile:
+    """Share of scores above each threshold, with a band; all arrays have shape ``(t,)``.
+
+    Attributes:
+        thresholds: In the unit of the scores.
+        share: Of all runs (or episodes) and protocols whose score is higher.
+        low: Lower edge of the band, point by point.
+        high: Upper edge.
+        level: Confidence at each threshold.
+        n: How many scores there are.
+    """
+
+    thresholds: Floats
+    share: Floats
+    low: Floats
+    high: Floats
+    level: float
+    n: int
+
+
+def performance_profile(
+    scores: ArrayLike,
+    thresholds: ArrayLike | None = None,
+    *,
+    over: str = "runs",
+    level: float = LEVEL,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Profile:
+    """Estimate the share of scores above each threshold, shape ``(t,)``.
+
+    Thresholds are 101 from 0 to 1 by default; the other arguments are those of ``aggregate``.
+
+    Raises:
+        UnknownOption: As for ``aggregate``, or thresholds that are no numbers.
+    """
+    groups = _groups("scores", scores, over)
+    normal_quantile(level)
+    grid = np.linspace(0.0, 1.0, 101) if thresholds is None else numbers("thresholds", thresholds)
+
+    def shares(*strata: Floats, axis: int = -1) -> Any:
+        table = _pooled(strata, groups.shape)
+        return np.stack([(table > threshold).mean(axis=(1, 2)) for threshold in grid])
+
+    share = shares(*_strata(groups[None]))[:, 0]
+    low, high = bootstrap(_strata(groups), shares, level=level, resamples=resamples, seed=seed)
+    return Profile(grid, share, low, high, level, groups.size)
+
+
+def probability_of_improvement(
+    x: ArrayLike,
+    y: ArrayLike,
+    *,
+    over: str = "runs",
+    level: float = LEVEL,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Interval:
+    """Estimate how probable a run of ``x`` scores higher than a run of ``y``.
+
+    Per protocol it is the share of pairs in which x is higher, a tie counting half: the
+    statistic of Mann and Whitney over the number of pairs. The protocols are then averaged.
+    x and y are scores in the same protocols, shaped as for ``aggregate`` like the other arguments;
+    they may have different numbers of runs, and are resampled apart.
+
+    Raises:
+        UnknownOption: As for ``aggregate``, or x and y have different numbers of protocols.
+    """
+    ours, theirs = _groups("x", x, over), _groups("y", y, over)
+    normal_quantile(level)
+    protocols = ours.shape[1]
+    if theirs.shape[1] != protocols:
+        allowed = (f"the {protocols} protocols of x",)
+        raise UnknownOption("y", f"{theirs.shape[1]} protocols", allowed)
+    rng = np.random.default_rng(seed)
+    value, drawn = 0.0, np.zeros(draws("resamples", resamples))
+    for protocol in range(protocols):
+        first, second = ours[:, protocol].ravel(), theirs[:, protocol].ravel()
+        higher = 0.5 + 0.5 * np.sign(first[:, None] - second[None, :])  # (x, y)
+        of_x, of_y = (_counts(groups, resamples, rng) for groups in (ours, theirs))
+        value += float(higher.mean()) / protocols
+        drawn += np.einsum("rj,rj->r", of_x @ higher, of_y) / (higher.size * protocols)
+    low, high = np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+    return Interval(value, float(low), float(high), level, ours.size + theirs.size)
+
+
+def _groups(name: str, scores: ArrayLike, over: str) -> Floats:
+    """Return scores as groups of runs or of episodes, shape ``(groups, protocols, units)``."""
+    one_of("over", over, OVER)
+    array = numbers(name, scores, ndim=(2, 3))
+    if over == "episodes" and array.ndim == 2:
+        given = f"an array of shape {array.shape} over episodes"
+        raise UnknownOption(name, given, ("an array of shape (runs, protocols, episodes)",))
+    if over == "runs":
+        array = (array if array.ndim == 2 else array.mean(axis=2)).T[None]
+    if array.shape[2] < 2:
+        allowed = ("'runs' with two runs or more", "'episodes' with two episodes or more")
+        raise UnknownOption("over", f"{over} of which {name} has one", allowed)
+    return array
+
+
+def _strata(groups: Floats) -> list[Floats]:
+    """Part scores of shape ``(..., groups, protocols, units)`` into what is resampled within."""
+    return list(np.moveaxis(groups.reshape(*groups.shape[:-3], -1, groups.shape[-1]), -2, 0))
+
+
+def _pooled(strata: tuple[Floats, ...], shape: tuple[int, ...]) -> Floats:
+    """Put resampled strata together, shape ``(resamples, protocols, groups * units)``."""
+    groups, protocols, units = shape
+    table = np.stack(strata, axis=1).reshape(-1, groups, protocols, units)
+    return np.moveaxis(table, 1, 2).reshape(-1, protocols, groups * units)
+
+
+def _counts(groups: Floats, resamples: int, rng: np.random.Generator) -> Floats:
+    """Draw how often each unit of a protocol is in a resample: ``(resamples, groups * units)``."""
+    n = groups.shape[2]
+    size = (resamples, len(groups))
+    return rng.multinomial(n, np.full(n, 1.0 / n), size=size).reshape(resamples, -1).astype(float)

@@ -1,8 +1,6 @@
 """Planning: a policy that tries actions out in copies of the world before it acts."""
 
-from scm_world.policies.planning.model import Model
-from scm_world.policies.planning.policy import CrossEntropy
-from scm_world.policies.planning.scores import Score, nearness
-from scm_world.policies.planning.search import Search
+from scm_world.policies.planning.model import Model, Score, nearness
+from scm_world.policies.planning.policy import CrossEntropy, Search
 
 __all__ = ["CrossEntropy", "Model", "Score", "Search", "nearness"]

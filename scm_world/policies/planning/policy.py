@@ -1,22 +1,106 @@
-"""A policy that plans: model-predictive control with the causal model itself."""
+"""A policy that plans: model-predictive control with the causal model itself.
+
+It searches by the cross-entropy method: sampling, keeping the best, sampling around them.
+
+Source:
+    Rubinstein, *The cross-entropy method for combinatorial and continuous optimization*, 1999; with
+    noise that is correlated in time, elites that are kept, and a mean that is shifted, as in
+    Pinneri et al., *Sample-efficient cross-entropy method for real-time planning*, CoRL 2020.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
-from scm_world.policies.planning.model import Model
-from scm_world.policies.planning.scores import Score, as_score, nearness
-from scm_world.policies.planning.search import Found, Search, search
+from scm_world.policies.planning.model import Model, as_score, nearness
 from scm_world.tasks.base import action_range
+from scm_world.variables import Noise, Normal
 from scm_world.world import World
+
+KEPT = 0.3
+"""Share of the elites that take part in the next round again."""
+
+
+@final
+@dataclass(frozen=True)
+class Search:
+    """The numbers of a search.
+
+    Attributes:
+        samples: Sequences of actions in each round.
+        horizon: Their length in control steps.
+        iterations: Rounds.
+        elites: How many of the best ones the next round is drawn around; a sixth of the samples if
+            None.
+        spread: Standard deviation of the first round, as a share of half the range of an action.
+        color: How much noise is correlated in time: its power falls with this power of the
+            frequency. 0 is white noise, 2 that of a random walk.
+        momentum: Share of the old mean and standard deviation in the new ones.
+
+    Raises:
+        UnknownOption: A number is none, or out of its range.
+    """
+
+    samples: int = 48
+    horizon: int = 12
+    iterations: int = 2
+    elites: int | None = None
+    spread: float = 0.1
+    color: float = 3.0
+    momentum: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, least in (("samples", 2), ("horizon", 1), ("iterations", 1)):
+            whole_number(name, getattr(self, name), least=least)
+        if self.elites is not None and whole_number("elites", self.elites, least=1) > self.samples:
+            raise UnknownOption("elites", self.elites, (f"1 to {self.samples}, the samples",))
+        for name, high in (("spread", 10.0), ("color", 10.0), ("momentum", 1.0)):
+            value: Any = getattr(self, name)
+            is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if not is_number or not np.isfinite(value) or not 0.0 <= value <= high:
+                raise UnknownOption(name, value, (f"a number from 0 to {high:g}",))
+
+    @property
+    def n_elites(self) -> int:
+        """How many samples are elites."""
+        return self.elites or max(1, self.samples // 6)
+
+    def noise(self, noise: Noise, stream: str, n: int, *, episode: int, step: int) -> Floats:
+        """Draw noise of variance one that is correlated in time.
+
+        Args:
+            noise: Where to draw.
+            stream: Of the noise.
+            n: How many numbers an action has.
+            episode: Number of the episode.
+            step: The control step.
+
+        Returns:
+            Shape (samples, horizon, n).
+        """
+        length = self.horizon
+        frequencies = np.fft.rfftfreq(length)
+        frequencies[0] = 1.0 / length
+        size = frequencies ** (-0.5 * self.color)
+        counts = np.full(len(size), 4.0)  # a frequency stands for its negative one, too
+        counts[0] = 1.0
+        if length % 2 == 0:
+            counts[-1] = 1.0
+        size *= length / math.sqrt(float((counts * size**2).sum()))
+        shape = (self.samples, n, 2, len(size))
+        drawn = noise.draw(Normal(), stream, shape, {}, episode=episode, step=step)[0]
+        waves = (drawn[:, :, 0] + 1j * drawn[:, :, 1]) * size
+        return np.asarray(np.fft.irfft(waves, length, axis=-1)).swapaxes(1, 2)
 
 
 @final
@@ -68,7 +152,10 @@ class CrossEntropy:
         threads: int | None = None,
         **numbers: Any,
     ) -> None:
-        self.search = _search(numbers)
+        known = tuple(Search.__dataclass_fields__)
+        for name in numbers:
+            one_of("option of a planner", name, known)
+        self.search = Search(**numbers)
         self.objective = None if objective is None else as_score(objective)
         self.terminal = None if terminal is None else as_score(terminal)
         self.every = whole_number("every", every, least=1)
@@ -79,10 +166,7 @@ class CrossEntropy:
         self.do, self.backend, self.foresees = flatten(do or {}), backend, foresees
         self.seed = whole_number("seed", seed, least=0)
         self.threads = None if threads is None else whole_number("threads", threads, least=1)
-        self._forget()
-
-    def _forget(self) -> None:
-        self._programs: WeakKeyDictionary[World, _Program] = WeakKeyDictionary()
+        self._programs: WeakKeyDictionary[World, _WorldPlans] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without what is going on."""
@@ -90,8 +174,7 @@ class CrossEntropy:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Begin anew."""
-        self.__dict__.update(state)
-        self._forget()
+        self.__dict__.update(state, _programs=WeakKeyDictionary())
 
     def __call__(self, world: World) -> Floats:
         """Give the action of the present step.
@@ -102,22 +185,23 @@ class CrossEntropy:
             ModelError: The objective gives no finite number for each step of each rollout.
         """
         program = self._programs.get(world)
-        if program is None or not program.fits(world):
-            program = self._programs[world] = _Program(self, world)
+        if program is None or program.plan != world.compiled.plan:  # other bodies are there
+            program = self._programs[world] = _WorldPlans(self, world)
         return program.action(world)
-
-    def score(self, world: World) -> tuple[Score, Score | None]:
-        """Give what a plan in a world is worth: along the way, and at its end."""
-        return self.objective or nearness(world.task), self.terminal
 
 
 @final
-class _Program:
-    """The plans for one world, episode after episode."""
+class _WorldPlans:
+    """The plans for one world, episode after episode.
+
+    Attributes:
+        plan: Of the structure of the world.
+    """
 
     def __init__(self, policy: CrossEntropy, world: World) -> None:
-        self._policy, self._plan = policy, world.compiled.plan
-        self._objective, self._terminal = policy.score(world)
+        self._policy, self.plan = policy, world.compiled.plan
+        self._objective = policy.objective or nearness(world.task)
+        self._terminal = policy.terminal
         names = (*self._objective.names, *(self._terminal.names if self._terminal else ()))
         self._model = Model(
             world,
@@ -131,64 +215,65 @@ class _Program:
         self._at: tuple[int, int, int] | None = None
         self._version = -1
         self._ahead: list[Floats] = []
-
-    def fits(self, world: World) -> bool:
-        """Tell whether the same bodies are there."""
-        return bool(world.compiled.plan == self._plan)
+        self._mean = self._kept = np.empty(0)
 
     def action(self, world: World) -> Floats:
-        """Give the action of the present step."""
-        goes_on = self._at == _place(world)
+        """Give the action of the present step; search where no plan is followed any more."""
+        seed, episode, index = world.noise.seed, world.episode, world.index
+        goes_on = self._at == (seed, episode, index)
         if not (goes_on and self._ahead and self._version == world.version):
-            self._found = self._searched(world, self._left() if goes_on else self._rest(world))
-            self._ahead = [*self._found.actions[: self._policy.every]]
-        seed, episode, index = _place(world)
+            if goes_on:  # begin with what is left of the last plan; its last action is kept
+                passed = self._policy.every - len(self._ahead)
+                rows = np.minimum(np.arange(len(self._mean)) + passed, len(self._mean) - 1)
+                found = self._searched(world, self._mean[rows], self._kept[:, rows])
+            else:
+                still = np.tile(world.task.idle(world), (self._policy.search.horizon, 1))
+                found = self._searched(world, still, still[None][:0])
+            self._ahead = [*found[: self._policy.every]]
         self._at, self._version = (seed, episode, index + 1), world.version
         return self._ahead.pop(0).copy()
 
-    def _rest(self, world: World) -> Found:
-        """Begin with staying where it is."""
-        actions = np.tile(world.task.idle(world), (self._policy.search.horizon, 1))
-        return Found(actions, -np.inf, actions, actions[None][:0])
+    def _searched(self, world: World, mean: Floats, kept: Floats) -> Floats:
+        """Return the best sequence that was tried, shape (horizon, n_actions).
 
-    def _left(self) -> Found:
-        """Begin with what is left of the last plan."""
-        return self._found.later(self._policy.every - len(self._ahead))
+        The last mean is tried, too; it and the elites are where a search that goes on begins.
 
-    def _searched(self, world: World, start: Found) -> Found:
-        setting, seed = self._policy.search, self._policy.seed
-        present = self._model.present(world)
+        Args:
+            world: At present.
+            mean: Around which the first round is drawn, shape (horizon, n_actions).
+            kept: What is tried again, the best first, shape (k, horizon, n_actions).
+        """
+        setting, present = self._policy.search, self._model.present(world)
+        low, high = action_range(world)
+        std = np.broadcast_to(0.5 * setting.spread * (high - low), mean.shape)
+        best, highest = mean, -np.inf
+        for number in range(setting.iterations):
+            stream, n = f"planning {self._policy.seed}, round {number}", world.compiled.n_actions
+            where = {"episode": world.episode, "step": world.index}
+            tried = mean + std * setting.noise(world.noise, stream, n, **where)
+            tried[0] = mean
+            again = kept[: min(math.ceil(KEPT * setting.n_elites), setting.samples - 1)]
+            tried[1 : 1 + len(again)] = again
+            tried = np.clip(tried, low, high)
+            scores = self._scores(present, tried)
+            order = np.argsort(-scores, kind="stable")[: setting.n_elites]
+            kept = tried[order]
+            if number == 0 or scores[order[0]] > highest:
+                best, highest = kept[0], float(scores[order[0]])
+            old = setting.momentum
+            mean = old * mean + (1.0 - old) * kept.mean(axis=0)
+            std = old * std + (1.0 - old) * kept.std(axis=0)
+        middle = np.clip(mean, low, high)
+        self._mean, self._kept = mean, kept
+        if float(self._scores(present, middle[None])[0]) > highest:
+            best = middle
+        return best
 
-        def drawn(round_: int) -> Floats:
-            stream = f"planning {seed}, round {round_}"
-            n, noise = world.compiled.n_actions, world.noise
-            return setting.noise(noise, stream, n, episode=world.episode, step=world.index)
-
-        def evaluated(actions: Floats) -> Floats:
-            values = self._model.rollouts(present, actions)
-            shape = actions.shape[:2]
-            total: Floats = self._objective.of(values, shape).sum(axis=1)
-            if self._terminal is not None:
-                last = {name: value[:, -1] for name, value in values.items()}
-                total = total + self._terminal.of(last, shape[:1])
-            return total
-
-        return search(setting, evaluated, drawn, action_range(world), start)
-
-
-def _place(world: World) -> tuple[int, int, int]:
-    """Say which control step of which episode this is."""
-    return world.noise.seed, world.episode, world.index
-
-
-def _search(numbers: dict[str, Any]) -> Search:
-    """Read the numbers of a search.
-
-    Raises:
-        UnknownOption: One of them does not exist.
-    """
-    known = tuple(Search.__dataclass_fields__)
-    for name in numbers:
-        if name not in known:
-            raise UnknownOption("option of a planner", name, known)
-    return Search(**numbers)
+    def _scores(self, present: Any, actions: Floats) -> Floats:
+        values = self._model.rollouts(present, actions)
+        shape = actions.shape[:2]
+        total: Floats = self._objective.of(values, shape).sum(axis=1)
+        if self._terminal is not None:
+            last = {name: value[:, -1] for name, value in values.items()}
+            total = total + self._terminal.of(last, shape[:1])
+        return total

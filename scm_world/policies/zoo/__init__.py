@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world._arguments import one_of
+from scm_world.errors import UnreadableFile
 from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import load_policy
 
@@ -50,8 +51,7 @@ def file_of(policy: Path | str) -> Path:
     """
     text = str(policy)
     if text.startswith(PREFIX):
-        if text not in _names():
-            raise UnknownOption("policy of the zoo", text, _names())
+        one_of("policy of the zoo", text, _names())
         return FOLDER / f"{text.removeprefix(PREFIX)}.safetensors"
     if not Path(text).is_dir():
         return Path(text)

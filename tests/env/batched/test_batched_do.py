@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from env_executors import REACHING, SIZE, actions, check_alike, check_same, engine, kept, make
 
-from scm_world.env.batched.executor import EXECUTORS
+from scm_world.env.batched.vector_env import EXECUTORS
 from scm_world.errors import (
     InterventionError,
     NotReset,

@@ -34,7 +34,6 @@ OPTIONS: list[dict[str, Any]] = [
     {"observation_mode": "full"},
     {"keypoints": True},
     {"observation_mode": "pixel", "image_size": 12, "cameras": ["60"]},
-    {"info_contacts": True, "info_state": True},
     {"conventions": "causal_world"},
     {"normalize_actions": False, "normalize_observations": False},
     {"task": "stacking2"},
@@ -65,7 +64,6 @@ def compare(loop: LoopExecutor, native: NativeExecutor, where: str) -> None:
         "terminations",
         "truncations",
         "infos",
-        "extras",
     ):
         check_same(
             getattr(loop.buffers, field), getattr(native.buffers, field), f"{where}: {field}"

@@ -5,29 +5,21 @@ from __future__ import annotations
 import os
 import signal
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from env_executors import LENGTH, actions, check_alike, check_same, kept, make
 
-from scm_world.env.batched.executor import fastest
-from scm_world.env.batched.memory import IN_MEMORY, Signal, meeting_place, share
-from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption, UnwritableFolder
-from scm_world.work.processes import Worker
-from scm_world.work.threads import cores
-
-
-def left_behind() -> list[str]:
-    """List what this kind leaves in the folder of shared memory."""
-    return [path.name for path in Path(IN_MEMORY).glob("scm_world_*")]
+from scm_world.env.batched.vector_env import fastest
+from scm_world.errors import EngineFailure, OutOfBounds, UnknownOption
+from scm_world.work.processes import Worker, cores
 
 
 def test_how_many_processes_there_are_changes_nothing() -> None:
     """One, two or three: bit for bit what one environment after another says."""
     pytest.importorskip("pybullet")
-    options: dict[str, Any] = {"backend": "bullet", "max_episode_length": 3, "info_contacts": True}
+    options: dict[str, Any] = {"backend": "bullet", "max_episode_length": 3}
     there = [{"workers": workers} for workers in (1, 2, 3)]
     executors = [("loop", {}), *(("processes", how) for how in there)]
     said = []
@@ -80,14 +72,14 @@ def test_a_process_that_is_killed_between_calls_is_an_error() -> None:
 def test_an_interrupted_step_ends_the_executor(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some environments may have stepped: it cannot go on, and no process stays."""
 
-    def interrupted(*_: Any) -> bytes:
+    def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
     envs = make("processes", 1, workers=1)
     envs.reset(seed=0)
     pid = envs.executor._workers[0]._process.pid
     with monkeypatch.context() as patched:
-        patched.setattr(Signal, "answer", interrupted)
+        patched.setattr(Worker, "answer", interrupted)
         with pytest.raises(KeyboardInterrupt):
             envs.step(actions(1, 1)[0])
     with pytest.raises(ProcessLookupError):
@@ -103,9 +95,8 @@ def test_in_a_process_of_a_pool_no_process_is_started() -> None:
 
 
 def test_nothing_is_left_behind() -> None:
-    """Memory has no name once all have it, and what was seen can be seen after the end."""
+    """No process stays, and what was seen can be seen after the end."""
     envs = make("processes", 3, workers=2, copy=False)
-    assert left_behind() == []
     observations, _ = envs.reset(seed=0)
     kept = observations.copy()
     pids = [worker._process.pid for worker in envs.executor._workers]
@@ -116,12 +107,6 @@ def test_nothing_is_left_behind() -> None:
             os.kill(pid, 0)
     with pytest.raises(EngineFailure, match="closed; make the environments anew"):
         envs.step(actions(1, 3)[0])
-
-
-def test_too_little_memory_is_an_error() -> None:
-    """And not a process that is killed when it writes."""
-    with meeting_place() as place, pytest.raises(UnwritableFolder, match=str(place.parent)):
-        share(place, 2**50)
 
 
 def test_processes_end_with_the_executor_that_nobody_uses() -> None:

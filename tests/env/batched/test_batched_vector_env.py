@@ -23,7 +23,7 @@ from env_executors import (
 from gymnasium.vector import AutoresetMode
 
 from scm_world.env.batched import ScmWorldVectorEnv
-from scm_world.env.batched.executor import EXECUTORS
+from scm_world.env.batched.vector_env import EXECUTORS
 from scm_world.errors import ActionError, NotReset, UnknownOption
 
 HERE = [executor for executor in EXECUTORS if executor != "processes"]
@@ -33,7 +33,6 @@ VIEWS: dict[str, dict[str, Any]] = {
     "goals": {"goal_env": True, "task_options": {"weights": "sparse"}},
     "context": {"context": "privileged", "start": {"sensor_noise": 0.01}},
     "pictures": {"observation_mode": "pixel", "image_size": 8, "cameras": ["60"]},
-    "rich": {"info_state": True, "info_contacts": True},
     "no terms": {"task_options": {"weights": "none"}, "normalize_actions": False},
     "relative": {"action_mode": "delta_joint_positions", "random_goal": "A"},
 }
