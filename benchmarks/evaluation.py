@@ -37,7 +37,6 @@ from typing import Any
 
 from evaluation_policy import Mlp
 from evaluation_steps import shares
-from scm_world.evaluation.shards import FOLDER
 
 from scm_world.evaluation.pipeline import evaluate, played
 from scm_world.evaluation.protocols import protocols_of
@@ -191,7 +190,7 @@ def interrupted(n: int) -> tuple[Any, int]:
 
 
 def _parts(folder: str) -> int:
-    return len(list(Path(folder, FOLDER).glob("*.json")))
+    return len(list(Path(folder, "parts").glob("*.json")))
 
 
 # --- all of it ------------------------------------------------------------------------------------
