@@ -15,7 +15,7 @@ from scm_world.cli import console
 from scm_world.cli.datasets import collect, sweep
 from scm_world.cli.discovery import discover, verify
 from scm_world.cli.evaluation import evaluate, explain
-from scm_world.cli.inspection import graph, list_
+from scm_world.cli.inspection import graph, list_, variables
 from scm_world.cli.options import documented
 from scm_world.cli.queries import counterfactual, do, effect
 from scm_world.cli.training import clone, train
@@ -72,7 +72,7 @@ def root(
 
 
 COMMANDS: tuple[Callable[..., None], ...] = (
-    *(discover, verify, graph, do, effect, counterfactual),
+    *(discover, verify, graph, variables, do, effect, counterfactual),
     *(collect, sweep, evaluate, explain, train, clone, list_),
 )
 for _command in COMMANDS:

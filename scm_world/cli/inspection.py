@@ -1,4 +1,4 @@
-"""The commands that show what there is: ``graph`` and ``list``."""
+"""The commands that show what there is: ``graph``, ``variables`` and ``list``."""
 
 from __future__ import annotations
 
@@ -143,6 +143,33 @@ def _parents_table(model: SCM, file: IO[str] | None) -> None:
         whole=(0,),
         width=console.PAGE,
         file=file,
+    )
+
+
+def variables(task: options.System, option: options.Option = None) -> None:
+    """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
+
+    A is the training space, B the held-out one. "Possible" is what physics allows.
+    Example: scm-world variables pushing
+    """
+    from scm_world.graph.exchange import space_lines
+
+    model, rows = _model(task, option), list[tuple[object, ...]]()
+    for variable in model.variables:
+        given: Any = variable
+        default = getattr(given, "value" if given.kind == "fixed" else "default", None)
+        spaces = (variable.bounds, variable.a, variable.b)
+        cells = (variable.unit, "x".join(map(str, variable.shape)) or "-")
+        cells += ("" if default is None else console.show(default),)
+        cells += tuple("\n".join(space_lines(space)) for space in spaces)
+        style = KIND_STYLE.get(variable.kind, "")
+        rows.append((Text(variable.name, "bold"), Text(variable.role, style), *cells))
+    console.table(
+        ("variable", "role", "unit", "shape", "default", "possible", "A", "B"),
+        rows,
+        title=f"{len(model)} variables",
+        whole=(0,),
+        width=console.PAGE,
     )
 
 

@@ -173,6 +173,15 @@ def test_the_ending_of_a_file_says_how_a_graph_is_written() -> None:
     assert not Path("graph.svg").exists()
 
 
+def test_variables_are_shown_with_their_spaces() -> None:
+    """A row for each variable of a task, and of a causal model without an engine."""
+    shown = call("variables", "pushing").stdout
+    row = next(line for line in shown.splitlines() if line.strip().startswith("tool_block.mass"))
+    assert row.split()[1:5] == ["parameter", "kg", "-", "0.02"]
+    Path("chain.py").write_text(CHAIN)
+    assert "2 variables" in call("variables", "chain.py:chain").stdout
+
+
 def test_graph_as_picture_has_a_default_name() -> None:
     """The picture of the declared graph is a PNG 1600 pixels wide."""
     Path("chain.py").write_text(CHAIN)
