@@ -159,11 +159,16 @@ def variables(task: options.System, option: options.Option = None) -> None:
         given: Any = variable
         default = getattr(given, "value" if given.kind == "fixed" else "default", None)
         spaces = (variable.bounds, variable.a, variable.b)
-        cells = (variable.unit, "x".join(map(str, variable.shape)) or "-")
-        cells += ("" if default is None else console.show(default),)
-        cells += tuple("\n".join(space_lines(space)) for space in spaces)
-        style = KIND_STYLE.get(variable.kind, "")
-        rows.append((Text(variable.name, "bold"), Text(variable.role, style), *cells))
+        rows.append(
+            (
+                Text(variable.name, "bold"),
+                Text(variable.role, KIND_STYLE.get(given.kind, "")),
+                variable.unit,
+                "x".join(map(str, variable.shape)) or "-",
+                "" if default is None else console.show(default),
+                *("\n".join(space_lines(space)) for space in spaces),
+            )
+        )
     console.table(
         ("variable", "role", "unit", "shape", "default", "possible", "A", "B"),
         rows,
