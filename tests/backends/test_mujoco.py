@@ -56,7 +56,7 @@ def test_unknown_backends_are_named() -> None:
     """The error lists the backends and suggests one."""
     with pytest.raises(UnknownOption, match=r"did you mean 'mujoco'\?") as caught:
         make_backend("mujcoo")
-    assert caught.value.choices == BACKENDS
+    assert {*BACKENDS} <= {*caught.value.choices}  # tests of other files add their own
 
 
 @pytest.mark.parametrize(
