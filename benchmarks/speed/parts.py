@@ -96,7 +96,7 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
         *(("observation", reader, "write") for reader in readers),
         ("observation", inner, "_observations"),
         ("info", inner, "_infos"),
-        ("command", executor._commands, "read"),
+        ("command", executor, "_commanded"),
         (REST, inner, "step"),
     ]
     for part, owner, name in places:

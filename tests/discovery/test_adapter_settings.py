@@ -66,7 +66,7 @@ def test_settings_are_used_and_noted() -> None:
 @pytest.mark.parametrize("each", OTHERS, ids=lambda each: each.name)
 def test_what_is_missing_is_named(each: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the library, the message says how to install it."""
-    monkeypatch.setattr(registry, "_version", lambda package: None)
+    monkeypatch.setattr(registry.Learner, "version", None)
     with pytest.raises(MissingExtra, match=rf"pip install 'scm-world\[{each.extra}\]'"):
         learn(each.name, DATA)
 

@@ -257,7 +257,7 @@ def test_a_changed_model_or_library_is_another_benchmark(
     with pytest.raises(UnreadableFile, match="marks differ"):
         benchmark(["gies"], [str(file)], **asked, out=out)
     file.write_text(to_json(random_model("er2:5", 0)))
-    monkeypatch.setattr("scm_world.discovery.learners.registry._version", lambda _: "99")
+    monkeypatch.setattr("scm_world.discovery.learners.registry.Learner.version", "99")
     with pytest.raises(UnreadableFile, match="marks differ"):
         benchmark(["gies"], [str(file)], **asked, out=out)
     fake = TaskView(options=FAKE)
@@ -367,11 +367,7 @@ def test_a_wrong_view_is_told_before_anything_is_written(
 
 def test_what_is_not_installed_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The message says how to install it."""
-
-    def nothing(package: str) -> None:
-        """Pretend that no package is there."""
-
-    monkeypatch.setattr("scm_world.discovery.learners.registry._version", nothing)
+    monkeypatch.setattr("scm_world.discovery.learners.registry.Learner.version", None)
     with pytest.raises(MissingExtra, match=r"scm-world\[.+\]"):
         benchmark(["gies"], ["er2:5"])
 

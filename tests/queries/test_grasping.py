@@ -16,7 +16,7 @@ from scm_world.tasks import Picking
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Grasp, Pace
 from scm_world.tasks.trifinger.grasping.bodies import Cuboid, body_of, smallest, turns
-from scm_world.tasks.trifinger.grasping.hand import Hand
+from scm_world.tasks.trifinger.grasping.hand import Hand, carrying, pressing
 from scm_world.tasks.trifinger.grasping.ways import grips
 
 MODE = "end_effector_positions"
@@ -168,7 +168,7 @@ def test_strength_ends_where_a_joint_does_all_it_can() -> None:
     hand = Hand(world_of("picking", "fake").evaluate(()), 0.04)
     joints, forces = np.array(hardware.REST), np.eye(3)
     strength = hand.strength(joints, forces)
-    torques = hand.carrying(joints) + strength * hand.pressing(joints, forces)
+    torques = carrying(joints, hand.weights) + strength * pressing(joints, hand.height, forces)
     assert np.abs(torques).max() == pytest.approx(0.97 * 0.36)
 
 

@@ -167,7 +167,7 @@ class Hand:
         self.height = float(values["robot_height"])
         self._gains = np.tile(np.maximum(values["position_gains"], LEAST_GAIN), N_FINGERS)
         self._limit = STRENGTH * float(values["torque_limit"])
-        self._weights = -float(values["gravity"][2]) * np.array(
+        self.weights = -float(values["gravity"][2]) * np.array(
             [
                 [float(values[f"{hardware.link_name(finger, link)}.mass"]) for link in (2, 3)]
                 + [hardware.TIP_MASS]
@@ -209,7 +209,7 @@ class Hand:
             Shape (9,) [rad], within the bounds of a command.
         """
         joints, _ = self.solve(tips, near)
-        torques = carrying(joints, self._weights) + pressing(joints, self.height, forces)
+        torques = carrying(joints, self.weights) + pressing(joints, self.height, forces)
         wanted = joints + np.minimum(np.maximum(torques, -self._limit), self._limit) / self._gains
         if self._last is not None:
             stride = np.minimum(np.maximum(joints - self._last, -STRIDE), STRIDE)
@@ -220,7 +220,7 @@ class Hand:
 
     def strength(self, joints: Floats, forces: Floats) -> float:
         """Tell how many times some forces, shape (3, 3), the fingers can exert."""
-        own, unit = carrying(joints, self._weights), pressing(joints, self.height, forces)
+        own, unit = carrying(joints, self.weights), pressing(joints, self.height, forces)
         room = self._limit - own * np.sign(unit)
         asked = np.abs(unit) > 1e-9
         return max(float((room[asked] / np.abs(unit[asked])).min(initial=np.inf)), 0.0)
