@@ -99,7 +99,6 @@ def graph(
 def _parents_table(model: SCM, file: IO[str] | None) -> None:
     """Print one row per variable; rows that differ in a number of the name only become one."""
     from scm_world.discovery.names import braces, by_entity
-    from scm_world.graph.exchange import space_lines
 
     alike: dict[tuple[str, ...], list[str]] = {}
     for variable in model.variables:
@@ -110,18 +109,9 @@ def _parents_table(model: SCM, file: IO[str] | None) -> None:
             if here:
                 short = by_entity(name for name in model if name in here)
                 parents.append(f"lag {lag}: {', '.join(short)}")
-        default = getattr(given, "value" if given.kind == "fixed" else "default", None)
-        if given.kind == "measured" and given.start is not None:
-            text = "follows lag 0"
-        else:
-            text = "" if default is None else console.show(default)
         cells = (
             given.kind if given.kind == variable.role else f"{given.kind}\n{variable.role}",
-            variable.unit,
-            "x".join(map(str, variable.shape)) or "-",
-            text,
-            "\n".join(space_lines(variable.a)),
-            "\n".join(space_lines(variable.b)),
+            *_described(given, variable.a, variable.b),
             "\n".join(parents),
         )
         alike.setdefault(cells, []).append(variable.name)
@@ -146,27 +136,32 @@ def _parents_table(model: SCM, file: IO[str] | None) -> None:
     )
 
 
+def _described(variable: Any, *spaces: Any) -> tuple[str, ...]:
+    """Return a variable's unit, shape and default, and the lines of its spaces."""
+    from scm_world.graph.exchange import space_lines
+
+    default = getattr(variable, "value" if variable.kind == "fixed" else "default", None)
+    text = "" if default is None else console.show(default)
+    if variable.kind == "measured" and variable.start is not None:
+        text = "follows lag 0"
+    shape = "x".join(map(str, variable.shape)) or "-"
+    return variable.unit, shape, text, *("\n".join(space_lines(space)) for space in spaces)
+
+
 def variables(task: options.System, option: options.Option = None) -> None:
     """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
 
     A is the training space, B the held-out one. "Possible" is what physics allows.
     Example: scm-world variables pushing
     """
-    from scm_world.graph.exchange import space_lines
-
     model, rows = _model(task, option), list[tuple[object, ...]]()
     for variable in model.variables:
         given: Any = variable
-        default = getattr(given, "value" if given.kind == "fixed" else "default", None)
-        spaces = (variable.bounds, variable.a, variable.b)
         rows.append(
             (
                 Text(variable.name, "bold"),
                 Text(variable.role, KIND_STYLE.get(given.kind, "")),
-                variable.unit,
-                "x".join(map(str, variable.shape)) or "-",
-                "" if default is None else console.show(default),
-                *("\n".join(space_lines(space)) for space in spaces),
+                *_described(given, variable.bounds, variable.a, variable.b),
             )
         )
     console.table(

@@ -51,7 +51,7 @@ class Questions(ABC):
         steps: int | None = None,
         record: Iterable[str] = (),
     ) -> Episode:
-        """Let an episode happen, and remember it whole.
+        """Run an episode and record it whole.
 
         Args:
             policy: A function of the world that gives an action, shape (n_actions,); actions of
@@ -61,7 +61,7 @@ class Questions(ABC):
             episode: Number of the episode within that noise.
             do: Interventions, with or without a time.
             steps: How many control steps; as many as the task has if None.
-            record: Variables to write down on the way; others are found by going through again.
+            record: Variables to record during the run; others are computed by replaying it.
 
         Raises:
             InterventionError: An intervention was refused.
@@ -91,7 +91,7 @@ class Questions(ABC):
         steps: int | None = None,
         record: Iterable[str] = (),
     ) -> Episode:
-        """Run an episode, go back, intervene, and let the same noise happen again.
+        """Run an episode and return its counterfactual: an intervention, with the same noise.
 
         Args:
             do: What is done; without a time it is done at the instant ``at``.
@@ -117,7 +117,7 @@ class Questions(ABC):
         progress: Progress | None = None,
         **setting: Any,
     ) -> Samples:
-        """Watch episodes without doing anything; see ``sample``."""
+        """Sample observational episodes; see ``sample``."""
         return self.sample(n, outcomes=outcomes, progress=progress, **setting)
 
     def sample(

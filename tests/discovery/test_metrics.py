@@ -19,6 +19,7 @@ from scm_world.graph.equivalence import (
     cpdag,
     extension,
     random_dag,
+    topological_order,
 )
 from scm_world.queries.plans import Plan
 
@@ -55,6 +56,18 @@ def test_distances_agree_with_gadjid() -> None:
         _, expected = gadjid.sid(*as_int, edge_direction=ROWS)
         assert sid_bounds(found, true) == (expected, expected)
         assert shd(found, true) == gadjid.shd(*as_int)[1]
+
+
+def test_sid_forgives_what_is_adjusted_for_in_vain() -> None:
+    """A complete graph in the right order gets every effect right, and not the other way round."""
+    pytest.importorskip("gadjid")
+    true = random_dag(8, 0.2, np.random.default_rng(1))
+    place = np.argsort(topological_order(true))
+    complete = place[:, None] < place[None, :]
+    assert sid_bounds(complete, true) == (0, 0)
+    wrong = sid_bounds(true, complete)
+    assert wrong is not None
+    assert wrong[0] > 0
 
 
 def test_what_has_too_many_members_or_none_has_no_sid() -> None:
