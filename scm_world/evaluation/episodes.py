@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from hashlib import blake2b
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import Floats
 from scm_world.curricula import CurriculumRunner, Memory
 from scm_world.curricula.combinations import Stages
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ScmWorldError, UnknownOption, UnknownVariable
-from scm_world.evaluation.players import Actions, Player
+from scm_world.evaluation.players import Player
 from scm_world.evaluation.protocols import Protocol
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Null, Subset
@@ -82,13 +79,8 @@ class Fingerprint:
         self._version = -1
         self.look()
 
-    def look(self, state: Floats | None = None) -> None:
-        """Take in the state, and the parameters if somebody has intervened.
-
-        Args:
-            state: Where everything is, in the form of ``PhysicalState.vector``; what the world
-                says if None.
-        """
+    def look(self) -> None:
+        """Take in the state, and the parameters if somebody has intervened."""
         world = self._world
         now, present = world.current()
         if world.version != self._version:
@@ -96,7 +88,7 @@ class Fingerprint:
             for name in world.static_names:
                 self._sum.update(name.encode())
                 self._sum.update(np.asarray(now[name]).tobytes())
-        self._sum.update((present.vector if state is None else state).tobytes())
+        self._sum.update(present.vector.tobytes())
 
     def act(self, action: Any) -> None:
         """Take in an action."""
@@ -104,137 +96,6 @@ class Fingerprint:
 
     def __str__(self) -> str:
         return self._sum.hexdigest()
-
-
-class Stepped(NamedTuple):
-    """What a control step gave: fraction and success are None where the task has no such thing."""
-
-    reward: float
-    fraction: float | None
-    success: bool | None
-    over: bool
-
-
-@final
-class RunningEpisode:
-    """An episode under way, and what is kept of it.
-
-    Args:
-        env: At the beginning of the episode, with what the protocol does at its reset.
-        player: The policy.
-        turn: What acts within the episode.
-        place: Agent, run, engine, protocol, seed and episode.
-
-    Attributes:
-        mark: Sums it up.
-    """
-
-    def __init__(
-        self,
-        env: ScmWorldEnv,
-        player: Player,
-        turn: CurriculumRunner,
-        place: tuple[str, int, str, str, int, int],
-    ) -> None:
-        self._drawn = _drawn(env, 0)
-        player.begin(env)
-        self.mark = Fingerprint(env)
-        self._player, self._turn, self._place = player, turn, place
-        self._fractions: list[float] = []
-        self._success: bool | None = None
-        self._total, self._steps = 0.0, 0
-
-    def act(self, observation: Any) -> Actions:
-        """Let the player choose an action, shape (n,)."""
-        action = self._player.act(observation)
-        self.mark.act(action)
-        return action
-
-    def stepped(self, found: Stepped) -> None:
-        """Note what a control step gave."""
-        self._total += found.reward
-        self._steps += 1
-        self._success = found.success
-        if found.fraction is not None:
-            self._fractions.append(found.fraction)
-
-    @property
-    def is_due(self) -> bool:
-        """Whether the protocol may act now."""
-        return self._turn.may_act(self._steps)
-
-    def intervene(self, env: ScmWorldEnv) -> bool:
-        """Let the protocol act, if anything is due; tell whether it did."""
-        if not self._turn.step(env):
-            return False
-        self._drawn |= _drawn(env, env.world.index)
-        return True
-
-    @property
-    def row(self) -> EpisodeRow:
-        """What is kept in the end."""
-        scores = scored(self._fractions, success=self._success, total=float(self._total))
-        return EpisodeRow(*self._place, self._steps, scores, self._drawn, str(self.mark))
-
-
-class Envs(typing.Protocol):
-    """Environments in which episodes are under way: one, or those of a native batch."""
-
-    def observation(self, row: int) -> Any:
-        """Return what the player of an episode observes now."""
-
-    def step(self, actions: Mapping[int, Actions]) -> Mapping[int, Stepped]:
-        """Take a control step in each of these episodes."""
-
-    def arrive(self, row: int, episode_run: RunningEpisode, *, over: bool) -> None:
-        """Let the protocol act if the episode is not over, and its mark look at the instant."""
-
-
-def play(
-    envs: Envs, running: Sequence[RunningEpisode], watch: Callable[[], Any] = lambda: None
-) -> None:
-    """Play episodes that have begun to their ends: the only loop of evaluation.
-
-    Args:
-        envs: Where they happen.
-        running: One for each row.
-        watch: Called at every instant.
-    """
-    going = dict(enumerate(running))
-    while going:
-        watch()
-        # Copies: a policy may return one array again and again.
-        actions = {
-            row: episode_run.act(envs.observation(row)).copy() for row, episode_run in going.items()
-        }
-        for row, found in envs.step(actions).items():
-            going[row].stepped(found)
-            envs.arrive(row, going[row], over=found.over)
-            if found.over:
-                del going[row]
-    watch()
-
-
-@final
-class _Single:
-    """One environment; see ``Envs``."""
-
-    def __init__(self, env: ScmWorldEnv, observation: Any) -> None:
-        self._env, self._observation = env, observation
-
-    def observation(self, row: int) -> Any:
-        return self._observation
-
-    def step(self, actions: Mapping[int, Actions]) -> Mapping[int, Stepped]:
-        found = self._env.step(actions[0])
-        self._observation, reward, terminated, truncated, info = found
-        over = terminated or truncated
-        return {0: Stepped(reward, info.get(FRACTION), info.get(SUCCESS), over)}
-
-    def arrive(self, row: int, episode_run: RunningEpisode, *, over: bool) -> None:
-        if not over and episode_run.intervene(self._env):
-            self._observation = self._env.observe()
-        episode_run.mark.look()
 
 
 def turn_of(protocol: Protocol, env: ScmWorldEnv) -> CurriculumRunner:
@@ -303,12 +164,32 @@ class EpisodeRunner:
         place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
         with _placed(place, env):
             turn, observation = self.begin(protocol, seed=seed, episode=episode)
-            episode_run = RunningEpisode(
-                env, player, turn, (*who, engine, protocol.name, seed, episode)
-            )
-            looks = (lambda: None) if watch is None else partial(watch, env)
-            play(_Single(env, observation), [episode_run], looks)
-        return episode_run.row
+            drawn = _drawn(env, 0)
+            player.begin(env)
+            mark = Fingerprint(env)
+            fractions: list[float] = []
+            total, steps, over = 0.0, 0, False
+            while not over:
+                if watch is not None:
+                    watch(env)
+                action = player.act(observation).copy()  # a policy may return one array again
+                mark.act(action)
+                observation, reward, terminated, truncated, info = env.step(action)
+                over = terminated or truncated
+                total += reward
+                steps += 1
+                if info.get(FRACTION) is not None:
+                    fractions.append(info[FRACTION])
+                if not over and turn.step(env):
+                    drawn |= _drawn(env, env.world.index)
+                    observation = env.observe()
+                mark.look()
+            if watch is not None:
+                watch(env)
+        scores = scored(fractions, success=info.get(SUCCESS), total=float(total))
+        return EpisodeRow(
+            *who, engine, protocol.name, seed, episode, steps, scores, drawn, str(mark)
+        )
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
         """Check that a protocol fits: begin the first episode with it.

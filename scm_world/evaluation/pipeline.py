@@ -12,16 +12,14 @@ from typing import Any, final
 
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner
-from scm_world.evaluation.lockstep import Lockstep
 from scm_world.evaluation.results import Evaluation, columns_of
-from scm_world.evaluation.setups import SHARD, Setup, Shard, prepare
+from scm_world.evaluation.setups import Setup, Shard, prepare
 from scm_world.output.durable import locked, made, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.work.executors import Executor, Serial, opened
-from scm_world.work.processes import cores
 
 PART = "scm_world/evaluation-part/1"
 """Format of the file of a finished shard."""
@@ -34,28 +32,14 @@ class ShardRunner:
 
     Attributes:
         setup: Of the evaluation.
-        threads: Of an engine that steps many worlds in one call; results do not depend on it.
     """
 
     setup: Setup
-    threads: int = 1
     runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
-    locksteps: dict[str, Lockstep] = field(default_factory=dict)
 
     def __call__(self, shard: Shard) -> list[EpisodeRow]:
-        """Play all episodes of a shard, side by side where that is faster."""
-        agent_run, numbers = self.setup.agents[shard.agent], range(shard.first, shard.stop)
-        key, env = self.setup.where(shard), self.runner(shard).env
-        if key not in self.locksteps:
-            self.locksteps[key] = Lockstep(env, min(SHARD, self.setup.n), self.threads)
-        rows = self.locksteps[key].play(
-            agent_run.player,
-            self.setup.protocols[shard.protocol],
-            seed=shard.seed,
-            episodes=numbers,
-            who=(agent_run.agent, agent_run.run),
-        )
-        return rows or [self.play(shard, episode) for episode in numbers]
+        """Play all episodes of a shard."""
+        return [self.play(shard, episode) for episode in range(shard.first, shard.stop)]
 
     def play(self, shard: Shard, episode: int, watch: Any = None) -> EpisodeRow:
         """Play one episode of it."""
@@ -78,11 +62,8 @@ class ShardRunner:
 
     def close(self) -> None:
         """Free the engines."""
-        for lockstep in self.locksteps.values():
-            lockstep.close()
         for runner in self.runners.values():
             runner.close()
-        self.locksteps.clear()
         self.runners.clear()
 
 
@@ -211,8 +192,7 @@ def played(
                 raise UnknownOption("task with several workers", given, allowed) from error
         for one in setup.agents:
             player.check(f"policy {one.agent!r} with several workers", one.player.policy)
-        threads = cores() if isinstance(player, Serial) else 1  # workers share the cores
-        make = partial(ShardRunner, setup, threads)
+        make = partial(ShardRunner, setup)
         for index, rows in player.run(make, [shards[place] for place in missing]):
             place = missing[index]
             found[place] = rows

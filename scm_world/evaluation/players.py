@@ -111,7 +111,6 @@ class Player:
         about: Description of the policy.
         start: Gives what acts in the episode that an environment has begun.
         made_for: What the policy was trained for, if known.
-        is_plain: Whether its actions are known to follow from its observations of the episode.
 
     Attributes:
         policy: What ``as_player`` was given.
@@ -123,11 +122,10 @@ class Player:
         start: Callable[[ScmWorldEnv], Actor],
         *,
         made_for: PolicyAbout | None = None,
-        is_plain: bool = False,
     ) -> None:
         self._about, self._start = dict(about), start
         self.policy: Any = None
-        self.made_for, self.is_plain = made_for, is_plain
+        self.made_for = made_for
         self._env: ScmWorldEnv | None = None
         self._act: Actor | None = None
 
@@ -441,12 +439,12 @@ def _of_actions(actions: Any, about: About, given: Mapping[str, Any] | None = No
         checked(row, None, about["name"])
     about = {"sha256": hashlib.sha256(rows.tobytes()).hexdigest(), **about}
     start = partial(_open_loop, rows, about["name"], given)
-    return Player(about, start, is_plain=True)
+    return Player(about, start)
 
 
 def _of_network(policy: MlpPolicy | OnnxPolicy, about: About) -> Player:
     start = partial(_network, policy, about["name"])
-    return Player(about, start, made_for=policy.made_for, is_plain=True)
+    return Player(about, start, made_for=policy.made_for)
 
 
 def _of_object(policy: Any, about: About) -> Player:
@@ -460,9 +458,7 @@ def _of_object(policy: Any, about: About) -> Player:
     if isinstance(policy, MlpPolicy):
         return _of_network(policy, {**about, "sha256": policy.sha256})
     if hasattr(policy, "predict"):
-        library = type(policy).__module__.partition(".")[0]
-        is_plain = library in ("stable_baselines3", "sb3_contrib")  # they keep no state themselves
-        return Player(about, partial(_model, policy), is_plain=is_plain)
+        return Player(about, partial(_model, policy))
     return Player(about, partial(_function, policy))
 
 

@@ -21,12 +21,10 @@ from scm_world.evaluation import (
     WorldPolicy,
     check,
     evaluate,
-    pipeline,
     protocols_of,
     record,
     why,
 )
-from scm_world.evaluation.lockstep import Lockstep
 from scm_world.evaluation.outputs.report import write_outputs
 from scm_world.tasks.factories import load_factory
 
@@ -108,26 +106,6 @@ def test_episodes_end_where_the_task_says_so() -> None:
     found = evaluate("still", "P0", task=Scored(), n=2)
     assert found.metrics[0] == found.metric() == "last_fractional_success"
     assert (found.columns["steps"] == 30).all()
-
-
-def test_side_by_side_is_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the engine steps many worlds, rows are the same, bit for bit."""
-    played: list[int] = []
-    original = Lockstep.play
-
-    def play(self: Lockstep, *given: Any, **how: Any) -> Any:
-        rows = original(self, *given, **how)
-        played.append(len(rows or ()))
-        return rows
-
-    monkeypatch.setattr(Lockstep, "play", play)
-    for kind in (Balance, Falling):
-        together = evaluate([0.3], "A", task=kind(), n=5)
-        with monkeypatch.context() as alone:
-            alone.setattr(pipeline, "cores", lambda: 1)
-            other = evaluate([0.3], "A", task=kind(), n=5)
-        assert together == other
-    assert played[0] in (0, 5)  # one core plays one after another
 
 
 def test_workers_need_a_task_that_can_be_sent() -> None:

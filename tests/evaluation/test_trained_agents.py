@@ -104,30 +104,6 @@ def test_a_file_that_a_training_replaces_is_read_once(tmp_path: Path) -> None:
     assert ShardRunner(other)(shard) != before
 
 
-def test_policies_play_side_by_side_as_they_do_one_by_one() -> None:
-    """On the engine that steps many worlds at once; the rows are the same bits."""
-    setup = prepare(
-        {"a": policy(env=RELATIVE)},
-        "P0,P7",
-        task=None,
-        n=3,
-        seeds=2,
-        backend="mujoco",
-        env={"max_episode_length": 5},
-        trusted=None,
-    )
-    rows, executors = [], []
-    for threads in (1, 3):
-        shard_runner = ShardRunner(setup, threads)
-        rows.append([row for shard in setup.shards() for row in shard_runner(shard)])
-        executors.append(
-            [lockstep._executor is not None for lockstep in shard_runner.locksteps.values()]
-        )
-        shard_runner.close()
-    assert rows[0] == rows[1]
-    assert executors == [[False], [True]]
-
-
 # --- what counts ------------------------------------------------------------------------------
 
 

@@ -149,15 +149,6 @@ class NativeExecutor(LoopExecutor):
         self._accept(index, "what was done")
         self.buffers.write(index, *shown)
 
-    def state(self, index: int) -> Floats:
-        """Give where everything is in one that was just stepped, as ``PhysicalState.vector``.
-
-        It holds until the next step.
-        """
-        size = self.envs[index].world.current()[1].vector.size
-        found: Floats = self._batch.table(index).matrix[index, :size]
-        return found
-
     def close(self) -> None:
         """Free their engines."""
         self._bring(range(self.num_envs))  # no row counts any more
@@ -196,24 +187,6 @@ class NativeExecutor(LoopExecutor):
             raise located(error, row) from error.__cause__
 
 
-def plain_vectors(env: ScmWorldEnv) -> tuple[dict[str | None, Vector], bool]:
-    """Return what of an environment can be read from a table, and whether that is not all.
-
-    Returns:
-        Observations that are vectors of variables, by name; None is the whole. And whether
-        something else is observed.
-    """
-    seen: Any = env._observer
-    together = isinstance(seen, DictObserver)
-    parts: dict[str | None, Any] = dict(seen._parts) if together else {None: seen}
-    plain = {
-        name: part
-        for name, part in parts.items()
-        if isinstance(part, Vector) and KEYPOINTS not in part._slices
-    }
-    return plain, len(plain) < len(parts)
-
-
 @final
 class ObservationReader:
     """Reads observations, rewards and infos of one structure.
@@ -228,8 +201,16 @@ class ObservationReader:
     """
 
     def __init__(self, env: ScmWorldEnv, table: Table) -> None:
-        self._vectors, self.is_partial = plain_vectors(env)
-        seen, goals = env._observer, env._goals
+        seen: Any = env._observer
+        goals = env._goals
+        together = isinstance(seen, DictObserver)
+        parts: dict[str | None, Any] = dict(seen._parts) if together else {None: seen}
+        self._vectors: dict[str | None, Vector] = {
+            name: part
+            for name, part in parts.items()
+            if isinstance(part, Vector) and KEYPOINTS not in part._slices
+        }
+        self.is_partial = len(self._vectors) < len(parts)
         self._shows_goals = isinstance(seen, DictObserver) and seen._goals is not None
         sides = env.world.task.goal_names() if goals is not None else ()
         self._goals = {
