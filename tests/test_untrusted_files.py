@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world import World
+from scm_world import SCM, Exogenous, World
 from scm_world.curricula import Curriculum
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError
@@ -23,7 +23,7 @@ from scm_world.evaluation.recording import Recording, record
 from scm_world.evaluation.setups import task_of
 from scm_world.graph.files import from_json
 from scm_world.policies import MlpPolicy, save_policy
-from scm_world.queries import Plan, load_episode, save_episode
+from scm_world.queries import Episode, Plan, load_episode, save_episode
 from scm_world.training.recipe import Recipe, recipe
 
 BAIT = "bait_module"
@@ -75,9 +75,9 @@ def _read_curriculum(reference: str) -> None:
     Curriculum.from_json(json.dumps(data))
 
 
-def _read_model(reference: str) -> None:
+def _model(reference: str) -> dict[str, Any]:
     function = {"kind": "function", "reference": reference}
-    data = {
+    return {
         "format": "scm_world/model/1",
         "variables": [
             {"kind": "exogenous", "name": "size", "default": 1.0},
@@ -89,7 +89,10 @@ def _read_model(reference: str) -> None:
             },
         ],
     }
-    from_json(json.dumps(data))
+
+
+def _read_model(reference: str) -> None:
+    from_json(json.dumps(_model(reference)))
 
 
 def _read_recipe(reference: str) -> None:
@@ -157,13 +160,23 @@ def _to_minari(reference: str) -> None:
     _recording(reference).to_minari("it-v0")
 
 
-def _read_episode(reference: str) -> None:
-    save_episode(World("reaching", backend="fake").rollout("random", seed=0, steps=1), "it.npz")
+def _load_changed(episode: Episode, **changes: Any) -> None:
+    save_episode(episode, "it.npz")
     with np.load("it.npz") as arrays:
         found = dict(arrays)
-    about = {**json.loads(str(found["about"])), "layers": [[0, _plan(reference)]]}
+    about = {**json.loads(str(found["about"])), **changes}
     np.savez("it.npz", **{**found, "about": np.array(json.dumps(about))})
     load_episode("it.npz")
+
+
+def _read_episode(reference: str) -> None:
+    episode = World("reaching", backend="fake").rollout("random", seed=0, steps=1)
+    _load_changed(episode, layers=[[0, _plan(reference)]])
+
+
+def _read_episode_of_equations(reference: str) -> None:
+    model = SCM([Exogenous(name="size", default=1.0)])
+    _load_changed(model.rollout(), equations=_model(reference))
 
 
 ATTACKS = (
@@ -179,6 +192,7 @@ ATTACKS = (
     _replay,
     _to_minari,
     _read_episode,
+    _read_episode_of_equations,
 )
 
 

@@ -291,13 +291,13 @@ def counterfactual(
 ) -> None:
     """Run an episode, and again with an intervention and the same noise; compare them.
 
-    Both episodes are saved, except those of equations, which have no file format.
+    Both episodes are saved.
     Example: scm-world counterfactual pushing tool_block.mass=0.1 --at 5
 
     Args:
         at: Control step of the intervention.
     """
-    from scm_world.queries import SCM, compare, save_episode
+    from scm_world.queries import compare, save_episode
 
     request = parse_assignments(assignments)
     with open_system(task, option, backend=backend, preset=preset) as system:
@@ -349,7 +349,6 @@ def counterfactual(
         ],
     }
     with console.staged(folder) as draft:
-        if not isinstance(system, SCM):
-            save_episode(episode, draft / "episode.npz")
-            save_episode(other, draft / "counterfactual.npz")
+        save_episode(episode, draft / "episode.npz")
+        save_episode(other, draft / "counterfactual.npz")
         console.write_json(draft / "difference.json", result)

@@ -26,6 +26,7 @@ from scm_world.policies.scripted import NAMED, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries.episode_files import load_episode
 from scm_world.queries.episodes import Episode
+from scm_world.queries.twins import Twins
 from scm_world.tasks.base import Blind
 from scm_world.variables import Function
 from scm_world.world import World
@@ -419,8 +420,14 @@ def _recorded(path: Path, number: str, trusted: Sequence[str]) -> Recorded:
 
 
 def _of_episode(episode: Episode | Recorded, about: About) -> Player:
-    """Play the actions of an episode of ``World.rollout``, or of a recording."""
+    """Play the actions of an episode of ``World.rollout``, or of a recording.
+
+    Raises:
+        UnknownOption: It is an episode of equations, whose actions are not those of a robot.
+    """
     if isinstance(episode, Episode):
+        if not isinstance(episode.twins, Twins):
+            raise UnknownOption("policy", episode, ("an episode of a world, not of equations",))
         mode = episode.twins.options["action_mode"]
         return _of_actions(
             episode.actions, about, {"action_mode": mode, "normalize_actions": False}

@@ -1,4 +1,4 @@
-"""Episodes in files: everything that it takes to live through them again, bit for bit."""
+"""Episodes in files: everything that it takes to run them again bit-identically."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
+from scm_world.graph import SCM, from_dict, to_dict
 from scm_world.output.durable import write_durably
 from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
@@ -27,7 +28,7 @@ from scm_world.queries.episodes import Episode
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.queries.rollouts import Trace, Unit
-from scm_world.queries.twins import Twins, twins_of
+from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, twins_of
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import World
@@ -50,24 +51,20 @@ KEYS = {
 def save_episode(episode: Episode, path: Path | str) -> Path:
     """Write an episode to one file: a zip archive of numpy arrays and a JSON text.
 
-    It holds task, options, engine, seed, plans, actions, versions, and all states, which the
-    reader compares with. Nothing in it is a pickle.
+    It holds task and options, or a causal model without a backend as JSON; seed, plans, actions,
+    versions; and all states, with which a rerun is compared on reading. Nothing in it is a pickle.
 
     Args:
         episode: What happened.
         path: Of the file; it gets the ending ``.npz`` if it has another one.
 
     Raises:
-        UnknownOption: It is an episode of a causal model without a backend.
         ModelError: A plan has a function without a name, or a registered task arguments that are
-            no numbers and texts. Other tasks and models are given again as a world on reading.
+            no numbers and texts. Other tasks, and models with functions without a name, are passed
+            to ``load_episode``.
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
-    trace = episode.trace
-    if not isinstance(episode.twins, Twins):
-        allowed = ("an episode of a World; of equations keep the model (to_json), seed and plan",)
-        raise UnknownOption("episode", episode, allowed)
-    target = Path(path)
+    trace, target = episode.trace, Path(path)
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
     made = io.BytesIO()
@@ -83,24 +80,48 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
 
 
 def _about(episode: Episode) -> dict[str, Any]:
-    task, options = episode.twins.task, dict(episode.twins.options)
-    if isinstance(options.get("variables_space"), Subset):
-        options["variables_space"] = options["variables_space"].model_dump(mode="json")
-    with episode.twins.twin() as world:
-        engine = world.engine
     return {
         "format": FORMAT,
-        "task": task.name,
-        "arguments": _arguments(task),
-        "model": task.system.digest if isinstance(task, ModelTask) else None,
-        "options": options,
+        **(_equations if isinstance(episode.twins, EquationTwins) else _world)(episode.twins),
         "seed": episode.seed,
         "number": episode.number,
         "steps": episode.steps,
         "layers": [[start, plan.as_dict()] for start, plan in episode.layers],
         "parameters": _digest(episode.trace),
+    }
+
+
+def _world(twins: Twins) -> dict[str, Any]:
+    task, options = twins.task, dict(twins.options)
+    if isinstance(options.get("variables_space"), Subset):
+        options["variables_space"] = options["variables_space"].model_dump(mode="json")
+    with twins.twin() as world:
+        engine = world.engine
+    return {
+        "task": task.name,
+        "arguments": _arguments(task),
+        "model": task.system.digest if isinstance(task, ModelTask) else None,
+        "options": options,
         "versions": versions(engine),
     }
+
+
+def _equations(twins: EquationTwins) -> dict[str, Any]:
+    return {
+        "task": None,
+        "arguments": None,
+        "equations": _written(twins.layout.model),
+        "options": {},
+        "versions": versions(),
+    }
+
+
+def _written(model: SCM) -> dict[str, Any] | None:
+    """Return a model as plain data; None if it has a function without a name."""
+    try:
+        return to_dict(model)
+    except ModelError:
+        return None
 
 
 def _arguments(task: Task) -> dict[str, Any] | None:
@@ -145,33 +166,32 @@ def _plain(value: Any) -> Any:
 
 
 def load_episode(
-    path: Path | str, *, world: World | None = None, trusted: Sequence[str] = ()
+    path: Path | str, *, world: World | SCM | None = None, trusted: Sequence[str] = ()
 ) -> Episode:
-    """Read an episode and live through it again.
+    """Read an episode and run it again.
 
     Args:
         path: Of the file.
-        world: Where it happens, for a task that is not registered, or a model that was given as
-            an object, or with spaces or functions; made from the file if None.
-        trusted: Packages whose functions may be mechanisms of its plans.
+        world: The world or causal model of the episode, for a task that is not registered, a
+            physics model that was passed as an object, or spaces or functions without a name; made
+            from the file if None.
+        trusted: Packages whose functions may be mechanisms of its model and its plans.
 
     Raises:
         UnreadableFile: It is no episode.
         UnknownOption: Its task is not registered, and no world is given.
-        SnapshotMismatch: It did not happen again bit for bit: another version or model, say.
+        ModelError: Its causal model has functions without a name, and none is given; or a
+            mechanism is a function of no trusted package.
+        SnapshotMismatch: The rerun is not bit-identical: another version or model, say.
     """
     file = Path(path)
     about, actions, states, lengths = _read(file)
     try:
-        twins = twins_of(world) if world is not None else _twins(about)
-        model = twins.task.system.digest if isinstance(twins.task, ModelTask) else None
-        if about.get("model") != model:
-            problem = "happened in another model, or one that was changed since"
-            raise SnapshotMismatch(f"{file} {problem}")
+        twins = _twins(about, world, file, trusted)
         layers = tuple(
             (int(start), Plan.from_dict(plan, trusted=trusted)) for start, plan in about["layers"]
         )
-        unit = Unit(about["seed"], about["number"], layers, Given(actions), about["steps"])
+        unit = Unit(about["seed"], about["number"], layers, Given(list(actions)), about["steps"])
         with twins.twin() as twin:
             trace = unit.run(twin)
     except DAMAGED as error:
@@ -205,7 +225,34 @@ def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
     return about, *found
 
 
-def _twins(about: dict[str, Any]) -> Twins:
+def _twins(
+    about: dict[str, Any], world: World | SCM | None, file: Path, trusted: Sequence[str]
+) -> AnyTwins:
+    """Return where the episode is run again.
+
+    Raises:
+        SnapshotMismatch: The world or model that is given is another one.
+    """
+    other = SnapshotMismatch(f"{file} happened in another model, or one that was changed since")
+    if "equations" in about:
+        written = about["equations"]
+        if world is None and written is None:
+            problem = f"{file} holds no model, since a function of it has no name"
+            raise ModelError([f"{problem}; pass it: load_episode(path, world=model)"])
+        model = from_dict(written, trusted=trusted) if world is None else world
+        if not isinstance(model, SCM) or (world is not None and _written(model) != written):
+            raise other
+        return EquationTwins(model)
+    if isinstance(world, SCM):
+        raise other
+    twins = twins_of(world) if world is not None else Twins(_made(about))
+    digest = twins.task.system.digest if isinstance(twins.task, ModelTask) else None
+    if about.get("model") != digest:
+        raise other
+    return twins
+
+
+def _made(about: dict[str, Any]) -> World:
     given = about["arguments"] or {}
     if about["task"] in tasks():
         task = make_task(about["task"], **given)
@@ -213,7 +260,7 @@ def _twins(about: dict[str, Any]) -> Twins:
         task = ModelTask(**given)
     else:
         raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))
-    return Twins(World(task, **about["options"]))
+    return World(task, **about["options"])
 
 
 def _compare(trace: Trace, states: list[Any], file: Path, made: dict[str, str]) -> None:

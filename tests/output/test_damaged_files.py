@@ -175,6 +175,18 @@ def test_an_episode_that_says_something_else_is_refused(
         load_episode(tmp_path / "other.npz")
 
 
+@pytest.mark.parametrize("written", [3, [], {}, {"format": "scm_world/model/1"}, "x"])
+def test_an_episode_of_other_equations_is_refused(tmp_path: Path, written: Any) -> None:
+    """The error says that there is no model."""
+    episode = SCM([Exogenous(name="size", default=1.0)]).rollout()
+    with np.load(save_episode(episode, tmp_path / "one.npz")) as arrays:
+        found = dict(arrays)
+    about = {**json.loads(str(found["about"])), "equations": written}
+    np.savez(tmp_path / "other.npz", **{**found, "about": np.array(json.dumps(about))})
+    with pytest.raises(ModelError, match="not a model"):
+        load_episode(tmp_path / "other.npz")
+
+
 @pytest.mark.parametrize(
     "changed", [{"agents": [3]}, {"env": {"start": {"kind": "x"}}}, {"seeds": 3}]
 )

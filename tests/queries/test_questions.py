@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +31,16 @@ from scm_world import (
     graph,
     verify,
 )
-from scm_world.errors import InterventionError, ModelError, ScmWorldError, UnknownOption
+from scm_world.errors import (
+    InterventionError,
+    ModelError,
+    ScmWorldError,
+    SnapshotMismatch,
+    UnknownOption,
+)
+from scm_world.evaluation import as_player
 from scm_world.graph import from_json, to_json
-from scm_world.queries import Effect, Episode, Samples, Verification, save_episode
+from scm_world.queries import Effect, Episode, Samples, Verification, load_episode, save_episode
 from scm_world.tasks import StepTask
 from scm_world.variables import Measured, Normal
 
@@ -370,10 +378,71 @@ def test_a_parent_that_a_mechanism_ignores_never_fires() -> None:
     assert not found.passed
 
 
-def test_an_episode_of_equations_goes_to_no_file(tmp_path: Any) -> None:
-    """The error says what to keep instead."""
-    with pytest.raises(UnknownOption, match="to_json"):
-        save_episode(chain().rollout(), tmp_path / "episode.npz")
+@pytest.mark.parametrize("plan", PLANS, ids=repr)
+def test_an_episode_of_equations_is_saved(plan: Any, tmp_path: Path) -> None:
+    """Its table and its counterfactuals have the same bits after reading."""
+    episode = equations().rollout("random", seed=3, episode=2, steps=8, do=plan)
+    saved = save_episode(episode, tmp_path / "episode")
+    trusted = (__name__, "numpy")
+    for found in (
+        load_episode(saved, trusted=trusted),
+        load_episode(saved, world=equations(), trusted=trusted),
+    ):
+        assert found == episode
+        assert alike(found, episode)
+        wish = {"rate": 0.9}
+        assert alike(found.counterfactual(wish, at=4), episode.counterfactual(wish, at=4))
+
+
+def test_an_episode_without_lags_is_saved(tmp_path: Path) -> None:
+    """With the interventions that its model holds; a function needs trust."""
+    model = chain().do({"x": Shift(1.0)})
+    episode = model.rollout(seed=5).counterfactual({"y": 2.0})
+    saved = save_episode(episode, tmp_path / "episode")
+    with pytest.raises(ModelError, match="trusted"):
+        load_episode(saved)
+    found = load_episode(saved, trusted=("numpy",))
+    assert found == episode
+    assert found.final("z").tobytes() == episode.final("z").tobytes()
+    assert found.counterfactual({"x": 0.0}) == episode.counterfactual({"x": 0.0})
+
+
+def test_a_file_of_equations_refuses_another_model(tmp_path: Path) -> None:
+    """Also a world, and the file of a world refuses equations."""
+    saved = save_episode(chain().rollout(seed=5), tmp_path / "equations")
+    for other in (chain().do({"y": 1.0}), equations(), world()):
+        with pytest.raises(SnapshotMismatch, match="another model"):
+            load_episode(saved, world=other)
+    saved = save_episode(world().rollout(steps=2), tmp_path / "world")
+    with pytest.raises(SnapshotMismatch, match="another model"):
+        load_episode(saved, world=equations())
+
+
+def test_equations_without_a_name_are_given_on_reading(tmp_path: Path) -> None:
+    """The error says how; a model with other functions computes other values."""
+
+    def model(factor: float) -> SCM:
+        double = Derived(name="y", parents=("x",), mechanism=lambda x: factor * x)
+        return SCM([Exogenous(name="x", distribution=Normal()), double])
+
+    episode = model(2.0).rollout(seed=1)
+    saved = save_episode(episode, tmp_path / "episode")
+    with pytest.raises(ModelError, match="world=model"):
+        load_episode(saved)
+    found = load_episode(saved, world=model(2.0))
+    assert found == episode
+    assert found.counterfactual({"x": 1.0}).final("y") == 2.0
+    with pytest.raises(SnapshotMismatch, match="control step 0"):
+        load_episode(saved, world=model(3.0))
+
+
+def test_an_episode_of_equations_is_no_policy(tmp_path: Path) -> None:
+    """Its actions are not those of an environment."""
+    episode = equations().rollout("random", steps=2)
+    saved = save_episode(SCM([RATE]).rollout(), tmp_path / "episode")
+    for policy in (episode, saved):
+        with pytest.raises(UnknownOption, match="an episode of a world"):
+            as_player(policy)
 
 
 def test_the_world_is_one_of_a_step_function() -> None:
