@@ -21,7 +21,7 @@ BLOCK = np.isin(np.arange(72), [*range(18, 31), *range(58, 71)])  # (state, acti
 
 def transition(world: World, action: np.ndarray) -> np.ndarray:
     """Take a control step; the local graph says whether robot and block are apart in it."""
-    apart = not any("tool_block" in edge for edge in local_graph(world, action).edges)
+    apart = set(local_graph(world, action).predecessors("tool_block")) <= {"floor", "stage"}
     before = [world[name] for name in NAMES]
     world.step(action)
     return np.concatenate([*before, action, *(world[name] for name in NAMES), [apart]])

@@ -337,8 +337,6 @@ def _kinds(chosen: Learner, problems: Sequence[str], wanted: Sequence[str]) -> l
     refused = ""
     if chosen.claims:
         refused = "a learner that is not given the graph; 'coloring' checks one"
-    elif chosen.on == "worlds":
-        refused = "a learner of variables; this one is of bodies: scm_world.discovery.learn(…)"
     elif chosen.on == "models" and any(n in TASKS or n.endswith(FILES) for n in problems):
         refused = "'paired' for a world; this one needs families of models or files of SCMs"
     if refused:

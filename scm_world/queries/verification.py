@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scm_world.errors import UnreadableFile
 from scm_world.queries.experiments.effects import EdgeKey
-from scm_world.queries.local import RuleScore
 
 SHOWN = 10  # edges that are written out in a table
 Row = tuple[str, str, bool | None]
@@ -20,7 +19,7 @@ Row = tuple[str, str, bool | None]
 class Report(BaseModel):
     """Data that can be written as JSON and read back without loss."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
 
     def to_json(self) -> str:
         """Write the report as JSON."""
@@ -102,31 +101,6 @@ class Undeclared(Report):
 
 
 @final
-class LocalShare(Report):
-    """How well contacts with force tell who acts on whom within a control step.
-
-    Attributes:
-        steps: Control steps that were held against paired experiments.
-        right: Edges that were predicted and are true.
-        extra: Predicted but not true.
-        missed: True but not predicted.
-    """
-
-    steps: int
-    right: int
-    extra: int
-    missed: int
-
-    @property
-    def f1(self) -> float:
-        """Harmonic mean of precision and recall; 1 if there was nothing to predict."""
-        return RuleScore(self.right, self.extra, self.missed).f1
-
-    def __str__(self) -> str:
-        return f"{self.f1:.3f} ({self.right + self.missed} edges in {self.steps} control steps)"
-
-
-@final
 class Verification(Report):
     """A declared graph, held against the physics that is said to have it.
 
@@ -153,8 +127,6 @@ class Verification(Report):
         never_fired: Declared edges that were not.
         undeclared: Effects without an edge.
         colors: Edges from a color to something that moves, declared or seen.
-        local: Local graphs from contacts, held against paired experiments in one episode; None
-            without physics, or if it was stopped before.
         seconds: Wall time.
         versions: Of everything that decides the result.
     """
@@ -179,7 +151,6 @@ class Verification(Report):
     never_fired: tuple[EdgeKey, ...]
     undeclared: tuple[Undeclared, ...]
     colors: tuple[EdgeKey, ...]
-    local: LocalShare | None = None
     seconds: float
     versions: dict[str, str]
 
@@ -237,7 +208,6 @@ class Verification(Report):
             ("never seen", listed(map(arrow, self.never_fired)), unseen),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
             ("colors that move something", listed(map(arrow, self.colors)), not self.colors),
-            ("local graphs, F1", "-" if self.local is None else str(self.local), None),
             ("seconds", f"{self.seconds:.1f}", None),
             ("passed", "yes" if self.passed else "no", self.passed),
         )

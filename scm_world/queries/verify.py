@@ -10,18 +10,15 @@ from typing import Any, final
 from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.policies.scripted import Random
 from scm_world.queries.agreement import Agreement, Sign, compare_signs
 from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.local import local_report
 from scm_world.queries.progress import Progress
 from scm_world.queries.verification import (
     Fired,
-    LocalShare,
     Undeclared,
     Verification,
     named,
@@ -29,12 +26,6 @@ from scm_world.queries.verification import (
 from scm_world.tasks import Task
 from scm_world.variables import Measured
 from scm_world.world import World
-
-LOCAL_STEPS, LOCAL_EVERY = 50, 4
-"""How long the episode is in which local graphs are tried, and one of how many steps is."""
-
-PRESSING = "pressing"
-"""The rule of local graphs: contacts with force."""
 
 MOST, LEAST = 200, 16
 """How many probe states there are at most, and how many even if every edge was seen before."""
@@ -264,21 +255,6 @@ def _verified(
                 if edge[0].endswith("color") and edge[1] in measured
             )
         ),
-        local=_local(world, seed) if world and not interrupted else None,
         seconds=time.perf_counter() - started,
         versions=versions(world.engine if world else ""),
     )
-
-
-def _local(world: World, seed: int) -> LocalShare | None:
-    """Hold local graphs against paired experiments while the robot moves at random."""
-    if not world.composition.movers() or not world.backend.capabilities.physics:
-        return None
-    with contextlib.suppress(KeyboardInterrupt):
-        world.reset(seed=seed)
-        report = local_report(world, Random(every=5), LOCAL_STEPS, every=LOCAL_EVERY)
-        score = report.scores[PRESSING]
-        return LocalShare(
-            steps=report.steps, right=score.right, extra=score.extra, missed=score.missed
-        )
-    return None

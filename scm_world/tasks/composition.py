@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, final
@@ -197,30 +197,6 @@ class Commands(ABC):
         """
 
 
-@final
-@dataclass(frozen=True)
-class Mover:
-    """A body of local graphs.
-
-    Attributes:
-        name: Of the body.
-        positions: Where its position stands in the state vector.
-        velocities: Where its velocity stands.
-        rotation: Where its quaternion stands, which is a part of the position; None without one.
-        parameters: Its physical parameters, those that are changed together.
-        removable: Whether it can be taken away.
-        place: Its place, shape (3,) [m], a function of the state vector.
-    """
-
-    name: str
-    positions: slice
-    velocities: slice
-    rotation: slice | None
-    parameters: tuple[tuple[ParameterKey, ...], ...]
-    removable: bool
-    place: Callable[[Floats], Floats]
-
-
 class Composition(ABC):
     """What the variables of a world mean to an engine: where causal and physical column meet.
 
@@ -286,8 +262,8 @@ class Composition(ABC):
         """List goals, of some, that lie in something that never moves: nothing can fill them."""
         return ()
 
-    def movers(self) -> tuple[Mover, ...]:
-        """List the bodies between which local graphs are; none if it has no such bodies."""
+    def movers(self) -> tuple[str, ...]:
+        """Name the bodies between which local graphs are; none if it has no such bodies."""
         return ()
 
     def goals(self, values: Values) -> tuple[Goal, ...]:

@@ -307,7 +307,6 @@ def test_learners_that_fail_do_not_end_the_benchmark(tmp_path: Path) -> None:
         {"learners": ("nobody",)},
         {"learners": ("user_learners:nobody",)},
         {"learners": ("coloring",)},
-        {"learners": ("local",)},
         {"learners": "paired"},
         {"learners": ()},
         {"learners": ("paired", "paired")},

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 
 from scm_world.discovery.learners import libraries
-from scm_world.discovery.learners.bodies import learn_local, learn_null
 from scm_world.discovery.learners.do_order import do_order
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
 from scm_world.discovery.learners.registry import Learner, register
@@ -26,8 +25,6 @@ OURS = (
         "do_order_ranks", partial(do_order, features=2, ranks=True, spread=True),
         ("interventional",), doc="do_order for curves, outliers, and causes of spread",
     ),
-    Learner("local", learn_local, ("paired",), "worlds", doc="bodies: who acted on whom, and when"),
-    Learner("null", learn_null, ("paired",), "worlds", doc="bodies: one is taken away at a time"),
 )  # fmt: skip
 _causal_learn = partial(
     Learner, takes=("observational",), extra="causal-learn", package="causal-learn"

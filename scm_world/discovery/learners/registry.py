@@ -34,8 +34,8 @@ class Learner:
         takes: The kinds of data it can use: ``"observational"``, ``"interventional"`` (known
             targets), ``"paired"`` (it does its own experiments, with the same noise).
         claims: Whether it is given the true graph, to check it; it cannot be benchmarked.
-        on: What its own experiments are done on: ``"any"`` simulator, ``"models"`` whose variables
-            are numbers, or ``"worlds"`` for a graph of their bodies.
+        on: What its own experiments are done on: ``"any"`` simulator, or ``"models"`` whose
+            variables are numbers.
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
             steps as further columns.
         extra: The optional dependency it needs; empty if none.
@@ -46,7 +46,7 @@ class Learner:
     name: str
     learn: Callable[..., Any]
     takes: tuple[Source, ...] = ("observational", "interventional")
-    on: Literal["any", "models", "worlds"] = "any"
+    on: Literal["any", "models"] = "any"
     claims: bool = False
     temporal: bool = False
     extra: str = ""

@@ -4,41 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
 from scm_world.models import ControlMode, Goal, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
-from scm_world.tasks.composition import Commands, Composition, Entity, Mover
+from scm_world.tasks.composition import Commands, Composition, Entity
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
 from scm_world.tasks.trifinger.feasibility import buried_goals, overlaps, thin
 from scm_world.tasks.trifinger.hardware import (
     FINGERS,
     LINK_NAMES,
-    N_JOINTS,
-    NOMINAL_HEIGHT,
     PRESET_NAMES,
-    link_name,
     preset,
 )
-from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
 from scm_world.tasks.trifinger.structure import Structure
 from scm_world.variables import Variable
 from scm_world.variables.kinds import parent_of
 from scm_world.variables.reserved import PRESET
-
-
-def _tip(index: int, vector: Floats) -> Floats:
-    """Return the tip of a finger at the nominal height of the robot, shape (3,) [m]."""
-    return forward(vector[:N_JOINTS], NOMINAL_HEIGHT)[3 * index : 3 * index + 3]
-
-
-def _center(at: int, vector: Floats) -> Floats:
-    """Return the center of a block, shape (3,) [m]."""
-    return vector[at : at + 3]
 
 
 def block_slice(block: int, start: int, stop: int) -> slice:
@@ -150,36 +135,9 @@ class BlockWorld(Composition):
         """List goals that lie in an obstacle."""
         return buried_goals(scene, names)
 
-    def movers(self) -> tuple[Mover, ...]:
-        """List the fingers, then the blocks. The bases of fingers are fixed."""
-        found = []
-        for index, finger in enumerate(FINGERS):
-            own = slice(3 * index, 3 * index + 3)
-            found.append(
-                Mover(
-                    f"robot_finger_{finger}",
-                    own,
-                    slice(N_JOINTS + own.start, N_JOINTS + own.stop),
-                    None,
-                    (tuple((link_name(finger, link), "mass") for link in (1, 2, 3)),),
-                    False,
-                    partial(_tip, index),
-                )
-            )
-        for index, block in enumerate(self.blocks):
-            at = ROBOT_SIZE + BLOCK_SIZE * index
-            found.append(
-                Mover(
-                    block,
-                    slice(at, at + 7),
-                    slice(at + 7, at + BLOCK_SIZE),
-                    slice(at + 3, at + 7),
-                    (((block, "mass"),), ((block, "friction"),)),
-                    True,
-                    partial(_center, at),
-                )
-            )
-        return tuple(found)
+    def movers(self) -> tuple[str, ...]:
+        """Name the fingers, then the blocks. The bases of fingers are fixed."""
+        return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
 
     def goals(self, values: Values) -> tuple[Goal, ...]:
         """Describe all goals."""
