@@ -40,7 +40,7 @@ from scm_world.curricula.parts import (
     poses,
     resample,
 )
-from scm_world.curricula.published import ACTORS, active, published_actor, published_curriculum
+from scm_world.curricula.published import ACTORS, published_actor
 from scm_world.curricula.vector import CurriculumVectorEnv, make_vec
 from scm_world.curricula.wrapper import CurriculumEnv, CurriculumRunner
 from scm_world.variables import AB, A, B, Subset
@@ -64,7 +64,6 @@ __all__ = [
     "Resample",
     "Situation",
     "Subset",
-    "active",
     "as_curriculum",
     "at_reset",
     "at_step",
@@ -81,7 +80,6 @@ __all__ = [
     "physics",
     "poses",
     "published_actor",
-    "published_curriculum",
     "resample",
     "stages",
     "together",

@@ -32,7 +32,7 @@ from scm_world.curricula import (
     goals,
     in_turn,
     interpolate,
-    published_curriculum,
+    published_actor,
     resample,
     stages,
     together,
@@ -56,7 +56,7 @@ LEAVES: list[Any] = [
     interpolate({"block.size": [0.09] * 3, "gravity": [0, 0, 1]}, episodes=9, first=3),
     interpolate({"floor_friction": 0.9}, start={"floor_friction": 0.1}, episodes=2),
     follow("scm_world.tasks.rewards:above"),
-    published_curriculum(["goal_actor", "random_actor"], [(0, 1e9, 1, 0), (3, 9, 2, 5)]),
+    together(published_actor("goal_actor"), published_actor("random_actor")),
 ]
 
 

@@ -1,23 +1,21 @@
-"""The predecessor's actors and their 4-tuples."""
+"""The predecessor's actors."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
-from curriculum_envs import STILL, series, under, value
+from curriculum_envs import STILL, under, value
 
 from scm_world.curricula import (
     ACTORS,
-    CurriculumEnv,
-    active,
     as_curriculum,
+    at_step,
+    during,
     joints,
     published_actor,
-    published_curriculum,
-    resample,
+    together,
 )
-from scm_world.curricula.published import ALWAYS
 from scm_world.env import IDS
 from scm_world.errors import UnknownOption
 from scm_world.models.scene import TOLERANCE
@@ -133,7 +131,7 @@ def test_d51_the_joints_actor_draws_from_the_space() -> None:
 
 def test_d10_an_actor_within_the_episode_acts_in_every_episode() -> None:
     """With a control step that is not 0, it acts at that step of each episode."""
-    env = under(published_curriculum(["physical_properties_actor"], [(0, 1e9, 1, 3)], space="B"))
+    env = under(at_step(3, published_actor("physical_properties_actor", space="B")))
     for _ in range(3):
         env.reset()
         light = value(env, MASS)
@@ -147,67 +145,22 @@ def test_d10_an_actor_within_the_episode_acts_in_every_episode() -> None:
 
 def test_d43_every_actor_of_a_kind_is_written_down() -> None:
     """Two actors of one kind, with their times, come back from a file."""
-    part = published_curriculum(
-        [published_actor("physical_properties_actor", group=g) for g in ("tool", "floor")],
-        [(0, 5, 1, 0), (6, 9, 2, 4)],
-    )
+    tool, floor = (published_actor("physical_properties_actor", group=g) for g in ("tool", "floor"))
+    part = together(at_step(0, during(range(6), tool)), at_step(4, during(range(6, 10, 2), floor)))
     again: Any = as_curriculum(as_curriculum(part).as_dict()).part
     assert again == part
     assert [p.part.part.what for p in again.of] == [("tool_*.mass",), ("floor_friction",)]
-
-
-def test_a_4_tuple_says_when() -> None:
-    """First and last episode count both; the period counts from the first; the step is exact."""
-    env = under(active({MASS: 0.05}, (2, 6, 2, 0)))
-    found = [mass == 0.05 for mass in series(env, MASS, 10)]
-    assert [episode for episode, acted in enumerate(found) if acted] == [2, 4, 6]
-    later = under(active({MASS: 0.05}, (1, 1, 1, 2)))
-    acted = []
-    for _ in range(3):
-        later.reset()
-        for step in range(1, 4):
-            later.step(STILL)
-            if value(later, MASS) == 0.05:
-                acted.append((later.memory.episode, step))
-    assert acted == [(1, 2), (1, 3)]
-
-
-def test_later_actors_count_more() -> None:
-    """Of two that set one quantity at one time the later one is done."""
-    actors = [resample(MASS, "A"), {MASS: 0.09}]
-    for order, heavy in ((actors, True), (actors[::-1], False)):
-        env = under(published_curriculum(order, [ALWAYS, ALWAYS]))
-        env.reset(seed=0)
-        assert (value(env, MASS) == 0.09) is heavy
-
-
-def test_the_published_curricula() -> None:
-    """Nothing, a new goal at each reset, everything at each reset."""
-    for actors, moved in (([], 0), (["goal_actor"], 2), (["random_actor"], 30)):
-        part = published_curriculum(actors, [ALWAYS] * len(actors)) if actors else {}
-        env: CurriculumEnv = under(part, conventions="causal_world")
-        env.reset(seed=0)
-        done: Any = env.unwrapped
-        assert sum(len(acts) for _, acts in done.interventions) >= moved
 
 
 WRONG: list[Any] = [
     lambda: published_actor("sad_actor"),
     lambda: published_actor("goal_actor", space="C"),  # type: ignore[arg-type]
     lambda: published_actor("physical_properties_actor", group="hands"),
-    lambda: active({}, (0, 1, 1)),
-    lambda: active({}, (5, 1, 1, 0)),
-    lambda: active({}, (0, 1, 0, 0)),
-    lambda: active({}, (0, 1.5, 1, 0)),
-    lambda: active({}, (0, float("inf"), 1, 0)),
-    lambda: active({}, ("0", 1, 1, 0)),  # type: ignore[arg-type]
-    lambda: active({}, (-1, 1, 1, 0)),
-    lambda: published_curriculum(["goal_actor"], []),
 ]
 
 
 @pytest.mark.parametrize("make", WRONG)
-def test_wrong_actors_and_times_are_refused(make: Any) -> None:
+def test_wrong_actors_are_refused(make: Any) -> None:
     """With what is allowed."""
     with pytest.raises(UnknownOption):
         make()
