@@ -13,7 +13,7 @@ import gymnasium
 
 if TYPE_CHECKING:
     from scm_world.discovery import discover
-    from scm_world.env import DeltaAction, MovingAverageAction, ObjectSelector, ScmWorldEnv
+    from scm_world.env import MovingAverageAction, ScmWorldEnv
     from scm_world.errors import ScmWorldError
     from scm_world.geometry import load_hull
     from scm_world.queries import (
@@ -51,9 +51,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "DeltaAction": "env",
     "MovingAverageAction": "env",
-    "ObjectSelector": "env",
     "ScmWorldEnv": "env",
     "ScmWorldError": "errors",
     "ModelTask": "tasks",
@@ -108,7 +106,6 @@ __all__ = [
     "Box",
     "Clamp",
     "Contact",
-    "DeltaAction",
     "Derived",
     "Draw",
     "Exogenous",
@@ -121,7 +118,6 @@ __all__ = [
     "MovingAverageAction",
     "Natural",
     "Null",
-    "ObjectSelector",
     "On",
     "Outcome",
     "Parent",

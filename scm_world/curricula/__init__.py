@@ -12,7 +12,6 @@ A curriculum is a sentence::
     env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0"), curriculum)
 """
 
-from scm_world.curricula.agents import InterveningAgent
 from scm_world.curricula.base import Do, Memory, Part, Situation
 from scm_world.curricula.combinations import (
     at_reset,
@@ -58,7 +57,6 @@ __all__ = [
     "Follow",
     "Goal",
     "Interpolate",
-    "InterveningAgent",
     "Memory",
     "Part",
     "Resample",

@@ -6,7 +6,7 @@ from scm_world.env.batched import ScmWorldVectorEnv
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.env.models import MODEL_ID, model_env, model_vector_env
 from scm_world.env.observer import CONTEXTS, MODES, Observation
-from scm_world.env.wrappers import DeltaAction, MovingAverageAction, ObjectSelector
+from scm_world.env.wrappers import MovingAverageAction
 
 IDS = {
     name: str(spec.kwargs["task"])
@@ -20,9 +20,7 @@ __all__ = [
     "IDS",
     "MODEL_ID",
     "MODES",
-    "DeltaAction",
     "MovingAverageAction",
-    "ObjectSelector",
     "Observation",
     "ScmWorldEnv",
     "ScmWorldVectorEnv",

@@ -81,7 +81,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             its physics steps; the task's own if None.
         action_mode: One of the task's ``action_modes`` (of the robot's tasks
             ``"joint_positions"``, ``"joint_torques"``, ``"end_effector_positions"``), or one of
-            them after ``"delta_"``: see ``DeltaAction``; the first one if None.
+            them after ``"delta_"``: they are relative, see ``delta.Delta``; the first one if None.
         resolution: One of the task's ``resolutions``: how finely its variables are cut, see
             ``World``; observations and actions do not depend on it. The first one if None.
         delta_scale: Share of half of the range that the largest relative action stands for.
@@ -237,10 +237,6 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._arrange(beginning_structure(self.world, self._start))
         if goal_env:
             self.compute_reward = goal_reward(self.world)
-
-    def relative(self) -> Delta:
-        """Give what makes relative actions absolute."""
-        return Delta(self.world, self._middle, self._half)
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
         """Give the (absolute) action that stands for a command in SI units, shape (n,)."""

@@ -12,7 +12,6 @@ import pytest
 import scm_world  # noqa: F401 # registers the environments
 from scm_world.curricula import (
     CurriculumEnv,
-    InterveningAgent,
     at_step,
     everything,
     make_vec,
@@ -78,15 +77,6 @@ def test_stages_need_a_task_that_knows_success() -> None:
     assert env.unwrapped.world["pole.mass"] == 0.3
     with pytest.raises(UnknownOption, match="success"):
         under(ladder, Falling()).reset(seed=0)
-
-
-def test_an_agent_intervenes() -> None:
-    """Its actions have a part for each parameter that has the space."""
-    agent = InterveningAgent(under({}).env, ["pole.mass"], space="A", flat=True)
-    agent.reset(seed=0)
-    assert agent.action_space.shape == (3,)
-    agent.step(np.array([0.0, 1.0, 1.0], np.float32))
-    assert agent.unwrapped.world["pole.mass"] == pytest.approx(0.2)
 
 
 def test_names_that_are_not_there_are_refused() -> None:

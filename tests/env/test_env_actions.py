@@ -8,26 +8,13 @@ import numpy as np
 import pytest
 from envs import ABSOLUTE, PUSHING, make, roll
 
-from scm_world.env import DeltaAction, MovingAverageAction
+from scm_world.env import MovingAverageAction
 from scm_world.errors import UnknownOption
 
 
 def commands(env: Any) -> Any:
     """Give the last command of the world [SI units]."""
     return env.unwrapped.world["action"]
-
-
-@pytest.mark.parametrize("normalize", [True, False])
-@pytest.mark.parametrize("mode", ABSOLUTE)
-def test_wrapper_and_option_are_the_same(mode: str, normalize: bool) -> None:
-    """The wrapper and the action mode agree bit for bit, in both units."""
-    options = {"backend": "mujoco", "normalize_actions": normalize}
-    option = make(action_mode=f"delta_{mode}", **options)
-    wrapper = DeltaAction(make(action_mode=mode, **options))
-    assert option.action_space == wrapper.action_space
-    for one, two in zip(roll(option, 10), roll(wrapper, 10), strict=True):
-        np.testing.assert_array_equal(one[0], two[0])
-        assert one[1] == two[1]
 
 
 def test_joint_targets_add_up() -> None:
@@ -115,12 +102,6 @@ def test_spaces_of_relative_actions_are_symmetric(mode: str) -> None:
     np.testing.assert_array_equal(raw.action_space.low, -raw.action_space.high)
     scaled = make(action_mode=f"delta_{mode}").action_space
     np.testing.assert_allclose(scaled.high, np.ones(9))
-
-
-def test_relative_actions_are_not_made_relative_again() -> None:
-    """The wrapper refuses an environment whose actions are relative."""
-    with pytest.raises(UnknownOption, match="delta_joint_positions"):
-        DeltaAction(make(action_mode="delta_joint_positions"))
 
 
 def test_as_action_is_the_inverse_of_a_command() -> None:
