@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from scm_world.errors import ModelError
 
@@ -33,23 +32,6 @@ def as_graph(matrix: NDArray[np.generic]) -> Bools:
     if len(loops):
         raise ModelError([f"node {loops[0]} acts on itself; clear the diagonal"])
     return graph
-
-
-def random_dag(n: int, density: float, rng: np.random.Generator) -> Bools:
-    """Draw an acyclic graph, its nodes in random order.
-
-    Args:
-        n: Number of nodes.
-        density: Probability of each edge; ``2 * k / (n - 1)`` for k edges per node.
-        rng: Draws edges, then the order.
-
-    Source:
-        Erdős and Rényi, *On random graphs I*, Publicationes Mathematicae 1959, for the skeleton.
-    """
-    upper = np.triu(rng.random((n, n)) < density, 1)
-    order = rng.permutation(n)
-    dag: Bools = upper[np.ix_(order, order)]
-    return dag
 
 
 def is_acyclic(graph: Bools) -> bool:
@@ -99,34 +81,6 @@ def meets(left: Bools, right: Bools) -> Bools:
     """Multiply boolean matrices: [i, j] if left[i, k] and right[k, j] for some k."""
     result: Bools = (left.astype(np.float32) @ right.astype(np.float32)) > 0
     return result
-
-
-def v_structures(graph: Bools) -> frozenset[tuple[int, int, int]]:
-    """Return all ``(i, k, j)`` with i -> k <- j, i < j, and no edge between i and j."""
-    directed, apart = graph & ~graph.T, _apart(graph)
-    found = []
-    for k in range(len(graph)):
-        parents = np.flatnonzero(directed[:, k])
-        pairs = np.argwhere(np.triu(apart[np.ix_(parents, parents)]))
-        found += [(int(parents[a]), k, int(parents[b])) for a, b in pairs]
-    return frozenset(found)
-
-
-def covered_edges(dag: Bools) -> Bools:
-    """Return the edges i -> j for which the other parents of j are the parents of i.
-
-    Turning one of them around gives an equivalent graph.
-
-    Source:
-        Chickering, *A transformational characterization of equivalent Bayesian network
-        structures*, UAI 1995, definition 2.
-    """
-    dag = as_graph(dag)
-    i, j = np.nonzero(dag)
-    differ = dag[:, i] != dag[:, j]  # (p, edges); the cause itself is such a difference
-    covered = np.zeros_like(dag)
-    covered[i, j] = differ.sum(axis=0) == 1
-    return covered
 
 
 # --- essential graphs -------------------------------------------------------------------------
@@ -273,10 +227,3 @@ def _members(graph: Bools) -> Iterator[Bools]:
         directed = graph.copy()
         directed[effect, cause] = False
         yield from _members(meek(directed))
-
-
-def chain_components(graph: Bools) -> tuple[tuple[int, ...], ...]:
-    """Return the sets of nodes that undirected edges connect."""
-    count, label = connected_components(graph & graph.T, directed=False)
-    parts = (tuple(np.flatnonzero(label == number).tolist()) for number in range(count))
-    return tuple(sorted(parts))

@@ -15,12 +15,7 @@ from scm_world.discovery.distances import aid, shd, shd_of_classes, sid_bounds
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.metrics import auprc, auroc, effect_rmse, evaluate
 from scm_world.errors import MissingExtra, ModelError, UnknownVariable
-from scm_world.graph.equivalence import (
-    cpdag,
-    extension,
-    random_dag,
-    topological_order,
-)
+from scm_world.graph.equivalence import Bools, cpdag, extension, topological_order
 from scm_world.queries.plans import Plan
 
 NAMES = ("x1", "x2", "y1", "y2", "y3")
@@ -28,6 +23,14 @@ PAPER = [("x1", "x2", 0), *[(x, y, 0) for x in NAMES[:2] for y in NAMES[2:]]]
 
 KINDS: tuple[distances.Adjustment, ...] = ("parent", "ancestor", "oset")
 ROWS = "from row to column"
+
+
+def random_dag(n: int, density: float, rng: np.random.Generator) -> Bools:
+    """Draw an acyclic graph, its nodes in random order."""
+    upper = np.triu(rng.random((n, n)) < density, 1)
+    order = rng.permutation(n)
+    dag: Bools = upper[np.ix_(order, order)]
+    return dag
 
 
 # --- distances --------------------------------------------------------------------------------

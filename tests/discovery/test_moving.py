@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import pytest
 
 from scm_world._types import Floats
 from scm_world.discovery.learners import EstimatedGraph, learn
-from scm_world.discovery.learners.moving import sparse_pooled
+from scm_world.discovery.learners.moving import colored, culprits, sparse_pooled
 from scm_world.discovery.learners.simulators import SCMSimulator
 from scm_world.discovery.problems import random_model
 from scm_world.errors import ModelError, UnknownOption
@@ -120,6 +120,32 @@ def test_the_weights_are_found() -> None:
     found = learn("pooled", SCMSimulator(scm), budget=20)
     expected = [[0.0, 2.0, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     np.testing.assert_allclose(found.edge_scores[0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_colors_keep_the_causes_of_an_effect_apart(seed: int) -> None:
+    """Each cause has one color, and no effect has two causes of one color."""
+    rng = np.random.default_rng(seed)
+    parents = rng.random((40, 30)) < rng.uniform(0.02, 0.2)
+    classes = colored(parents)
+    assert sorted(cause for members in classes for cause in members) == list(range(40))
+    for members in classes:
+        assert parents[list(members)].sum(axis=0).max() <= 1
+    assert parents.sum(axis=0).max() <= len(classes) < 40
+
+
+def test_culprits_are_found_by_halves() -> None:
+    """All of them are found, by few questions, and none where there is none."""
+    names, guilty = [str(i) for i in range(64)], {"3", "17", "18", "63"}
+    questions = []
+
+    def moves(asked: Sequence[str]) -> bool:
+        questions.append(asked)
+        return bool(guilty & set(asked))
+
+    assert set(culprits(names, moves)) == guilty
+    assert len(questions) <= 4 * 7 + 1
+    assert culprits(names, lambda _: False) == []
 
 
 # --- a declared graph -----------------------------------------------------------------------------

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
+import networkx as nx
 import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.discovery.design import coloring, culprits, pooled
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.simulators import SMALL, PairedSimulator, SCMSimulator
 from scm_world.errors import ModelError
+from scm_world.graph.equivalence import Bools
 from scm_world.queries.experiments.effects import EdgeKey
 
 TOLERANCE = 1e-4  # of the answers: what a linear account may leave, since moves are small
@@ -82,7 +83,7 @@ def sparse_pooled(
     most = min(budget - 1, 4 * n)
     if most < 1:
         raise ModelError([f"pooled experiments need a budget of 2 or more, got {budget}"])
-    signs = pooled(n, max(most, n.bit_length() + 1), np.random.default_rng(seed))[:most]
+    signs = _signs(n, max(most, n.bit_length() + 1), np.random.default_rng(seed))[:most]
     simulator.prepare(unit)
     answers = np.empty((0, q))
     weights = np.zeros((n, q))
@@ -119,6 +120,21 @@ def sparse_pooled(
     )
 
 
+def _signs(n: int, experiments: int, rng: np.random.Generator) -> Floats:
+    """Draw experiments that move all n variables up or down, shape (experiments, n), each -1 or 1.
+
+    No two variables always move together or always against each other, for no answer could tell
+    them apart. This takes at least ``n.bit_length() + 1`` experiments.
+    """
+    signs = np.empty((experiments, 0))
+    while signs.shape[1] < n:
+        drawn = rng.choice([-1.0, 1.0], size=(experiments, n - signs.shape[1]))
+        signs = np.hstack([signs, drawn])
+        _, first = np.unique(signs * signs[0], axis=1, return_index=True)
+        signs = signs[:, np.sort(first)]
+    return signs
+
+
 def _pursued(signs: Floats, answer: Floats) -> Floats | None:
     """Explain an answer by few causes; None if that takes nearly as many as experiments."""
     scale = float(np.abs(answer).max())
@@ -141,6 +157,55 @@ def _pursued(signs: Floats, answer: Floats) -> Floats | None:
 
 
 # --- verification -------------------------------------------------------------------------------
+
+STRATEGIES = ("largest_first", "smallest_last", "saturation_largest_first", "independent_set")
+"""Greedy colorings of networkx that are tried; the best one is kept."""
+
+
+def colored(parents: Bools) -> list[tuple[int, ...]]:
+    """Part causes into colors: no effect has two of its declared causes of one color.
+
+    Args:
+        parents: Declared causes by effects, shape (p, q).
+
+    Source:
+        Coleman and Moré, *Estimation of sparse Jacobian matrices and graph coloring problems*,
+        SIAM Journal on Numerical Analysis 1983: columns that share a row must differ in color.
+
+    Example:
+        >>> colored(np.array([[1, 0], [1, 1], [0, 1]], bool))
+        [(0, 2), (1,)]
+    """
+    count = parents.astype(np.int64)
+    network = nx.from_numpy_array(np.where(np.eye(len(count), dtype=bool), 0, count @ count.T))
+    colorings = (nx.greedy_color(network, strategy) for strategy in STRATEGIES)
+    best = min(colorings, key=lambda colors: len(set(colors.values())))
+    classes: dict[int, list[int]] = {}
+    for cause in range(len(parents)):
+        classes.setdefault(best[cause], []).append(cause)
+    return sorted(tuple(members) for members in classes.values())
+
+
+def culprits(candidates: Sequence[str], moves: Callable[[Sequence[str]], bool]) -> list[str]:
+    """Find all candidates that move an effect, by halves: ⌈log2 n⌉ + 1 questions for each.
+
+    Args:
+        candidates: Of which some, or none, move the effect.
+        moves: Moves some of them together, and tells whether the effect moved.
+
+    Source:
+        Hwang, *A method for detecting all defective members in a population by group testing*,
+        JASA 1972, without the split into groups.
+    """
+    rest, found = list(candidates), []
+    while rest and moves(rest):
+        left = rest
+        while len(left) > 1:
+            half = left[: len(left) // 2]
+            left = half if moves(half) else left[len(half) :]
+        found.append(left[0])
+        rest.remove(left[0])
+    return found
 
 
 def verified(
@@ -184,10 +249,10 @@ def verified(
         simulator.prepare(unit)
         order = [simulator.causes[i] for i in rng.permutation(len(simulator.causes))]
         parents = np.array([[(c, e) in account.known for e in simulator.watched] for c in order])
-        classes = coloring(parents).named(order)
+        classes = colored(parents)
         colors.append(len(classes))
         for together in classes:
-            account.check(_moves(together, rng))
+            account.check(_moves([order[cause] for cause in together], rng))
     while thorough and simulator.used < budget and (others := account.revealing()):
         account.check(_moves(others, rng))
     showed = sorted(account.seen | account.intruders)
@@ -244,10 +309,10 @@ class _Account:
                 self.seen |= known & self._wanted
                 continue
 
-            def does(asked: tuple[str, ...], place: int = j) -> bool:
+            def does(asked: Sequence[str], place: int = j) -> bool:
                 return bool(abs(simulator.answers({c: moves[c] for c in asked})[place]) > ROUNDING)
 
-            for cause in culprits(tuple(moves), does):
+            for cause in culprits(list(moves), does):
                 self.intruders.add((cause, simulator.watched[j]))
                 self._parents[simulator.causes.index(cause), j] = True
 
