@@ -197,11 +197,20 @@ def open_system(
     made = load_system(name, option)
     if not isinstance(made, SCM):
         return World(made, **settings)  # type: ignore[arg-type] # names are checked by the world
+    refuse_settings(**settings)
+    return made
+
+
+def refuse_settings(**settings: str | None) -> None:
+    """Refuse what a causal model without a backend does not have.
+
+    Raises:
+        UnknownOption: One is given.
+    """
     for setting, value in settings.items():
         if value is not None:
             allowed = ("left out: a causal model without a backend has none",)
             raise UnknownOption(f"--{setting}", value, allowed)
-    return made
 
 
 def backend_of(system: World | SCM) -> str:

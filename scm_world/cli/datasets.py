@@ -13,7 +13,6 @@ from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
-    load_task,
     open_system,
     parse_assignments,
     parse_outcome,
@@ -182,31 +181,29 @@ def sweep(
     """
     from scm_world.discovery.data import sweep as swept
     from scm_world.discovery.data.sweeps import ENDS, SUMMARY, TABLE, points_of
-    from scm_world.queries import World
 
     check_parquet(format_)
     grid, held = read_over(over), parse_assignments(do, "'--do'")
     measured = [parse_outcome(text) for text in outcome or ()] or None
     with (
-        World(load_task(task, option), backend=backend, preset=preset) as plain,
-        plain.given(held) as world,
+        open_system(task, option, backend=backend, preset=preset) as plain,
+        plain.given(held) as system,
     ):
+        used = backend_of(system)
         words = "-".join(("sweep", *grid)).replace(".", "_")
-        folder = console.results_folder(
-            out, words, tag(task), backend_of(world), f"seed{seed}", option=option
-        )
-        whole = -(-n * len(points_of(grid, world.model)) // shard)
+        folder = console.results_folder(out, words, tag(task), used, f"seed{seed}", option=option)
+        whole = -(-n * len(points_of(grid, system.graph)) // shard)
         with (
             console.resumable(folder, "shard-*.*", f"of {whole} files"),
             options.open_executor(executor, workers, address, "episodes") as (pool, tell),
         ):
             found = swept(
-                world,
+                system,
                 grid,
                 measured,
                 n=n,
-                steps=steps,
-                policy=policy_of(policy, world),
+                steps=steps if system.graph.is_temporal else 0,
+                policy=policy_of(policy, system),
                 nature=parse_assignments(nature, "'--nature'"),
                 seed=seed,
                 out=folder,
@@ -234,8 +231,7 @@ def sweep(
             )
             for row in rows[:POINTS]
         ],
-        title=f"Sweep of {tag(task)} on {found.data.about['engine']}, seed {seed}, "
-        "with 95 % intervals",
+        title=f"Sweep of {tag(task)} on {used}, seed {seed}, with 95 % intervals",
         caption=f"and {len(rows) - POINTS} more points, see {TABLE}" if len(rows) > POINTS else "",
     )
     console.written(folder / TABLE, folder / SUMMARY)

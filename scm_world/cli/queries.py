@@ -13,11 +13,11 @@ from rich.text import Text
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
-    load_task,
     open_system,
     parse_assignments,
     parse_outcome,
     policy_of,
+    refuse_settings,
     tag,
 )
 from scm_world.errors import UnknownOption
@@ -39,9 +39,10 @@ def do(
     out: options.Out = None,
     option: options.Option = None,
 ) -> None:
-    """Intervene on a world, and compare it with the same world without the intervention.
+    """Intervene on a system, and compare it with the same system without the intervention.
 
-    Exits 1 if a variable moves that is no descendant of a target.
+    Of a world, pictures before and after are written, too. Exits 1 if a variable moves that is no
+    descendant of a target.
     Example: scm-world do pushing tool_block.mass=0.05 --steps 50
 
     Args:
@@ -49,33 +50,40 @@ def do(
         space: Refuse values outside this space: A (training support), B (held out) or 'A|B'.
         show_all: Show descendants that did not move, too.
     """
+    from scm_world.policies.scripted import as_policy
     from scm_world.queries import World
     from scm_world.queries.experiments.effects import gap
     from scm_world.queries.experiments.versions import versions
+    from scm_world.queries.twins import asked
     from scm_world.variables import Draw, Scale, Shift
     from scm_world.variables.kinds import SPACES
 
     if space not in (None, *SPACES):
         raise UnknownOption("space", space, SPACES)
     request = parse_assignments(assignments)
-    with World(load_task(task, option), backend=backend, preset=preset) as world:
-        used = backend_of(world)
+    with open_system(task, option, backend=backend, preset=preset) as system:
+        used, is_world = backend_of(system), isinstance(system, World)
+        steps = steps if system.graph.is_temporal else 0
+        if not is_world:
+            refuse_settings(space=space)
         folder = console.results_folder(out, "do", tag(task), used, f"seed{seed}", option=option)
-        world.reset(seed=seed)
-        start, before, scenes = world.snapshot(), world.values(), [world.scene()]
-        action = world.task.idle(world)
-        audit = world.do(request, space=space)
-        at_once, models = world.values(), [world.model]
+        stepped: Any = asked(system)[1]
+        stepped.reset(seed=seed)
+        start, before = stepped.snapshot(), stepped.values()
+        scenes = [stepped.scene()] if is_world else []
+        action = as_policy(None, stepped)(stepped)
+        audit = stepped.do(request, space=space) if is_world else stepped.do(request)
+        right_after, models = stepped.values(), [stepped.model]
         for _ in range(steps):
-            world.step(action)
-        after = world.values()
-        scenes.append(world.scene())
-        world.restore(start)
+            stepped.step(action)
+        after = stepped.values()
+        scenes += [stepped.scene()] if is_world else []
+        stepped.restore(start)
         for _ in range(steps):
-            world.step(action)
-        without = world.values()
-        models.append(world.model)
-        engine = f"{world.backend.name} {world.backend.version}"
+            stepped.step(action)
+        without = stepped.values()
+        models.append(stepped.model)
+        engine = stepped.engine if is_world else ""
 
     targets = {models[0].target(name) for name in audit.targets}
     follow = {
@@ -86,15 +94,15 @@ def do(
     }
     rows: dict[str, dict[str, Any]] = {}
     for name in models[1]:
-        values = [found.get(name) for found in (before, at_once, after, without)]
+        values = [found.get(name) for found in (before, right_after, after, without)]
         if any(value is None for value in values) or (name in targets and name not in follow):
             continue
         difference = gap(after[name], without[name])
         rows[name] = {
             "unit": models[1].declared(name).unit,
             "descendant": name in follow,
-            "moved": difference > 0.0 or gap(at_once[name], before[name]) > 0.0,
-            **dict(zip(("before", "at_once", "after", "without"), values, strict=True)),
+            "moved": difference > 0.0 or gap(right_after[name], before[name]) > 0.0,
+            **dict(zip(("before", "right_after", "after", "without"), values, strict=True)),
             "difference": difference,
         }
     astray = [name for name, row in rows.items() if row["moved"] and not row["descendant"]]
@@ -135,11 +143,13 @@ def do(
         applied = "at every step" if entry.applied is None else console.show(entry.applied)
         back = "-" if entry.read_back is None else console.show(entry.read_back)
         targeted.append((Text(name, style="bold"), words, applied, back))
-    title = f"do() in {tag(task)} on {engine}, seed {seed}"
+    title = f"do() in {tag(task)} on {engine or used}, seed {seed}"
     heads = ("target", "requested", "applied", "backend reports")
-    console.table(heads, targeted, title=title, width=console.PAGE)
+    columns = 4 if is_world else 3
+    rows_shown = [row[:columns] for row in targeted]
+    console.table(heads[:columns], rows_shown, title=title, width=console.PAGE)
     for label, pairs in (
-        ("followed at once", audit.followed),
+        ("followed at lag 0", audit.followed),
         ("backend, inertia [kg m²]", audit.engine),
     ):
         for name, (old, new) in pairs.items():
@@ -159,7 +169,7 @@ def do(
                 Text(name, style="bold"),
                 row["unit"],
                 console.show(row["before"]),
-                _or_same(row["at_once"], row["before"]),
+                _or_same(row["right_after"], row["before"]),
                 console.show(row["after"]),
                 _or_same(row["without"], row["after"]),
                 Text(f"{row['difference']:.3g}", style="bold" if row["difference"] else "dim"),
@@ -193,12 +203,12 @@ def _or_same(value: Any, other: Any) -> str:
 
 
 def _pictures(scenes: Sequence[Any]) -> list[Any]:
-    """Return a picture of each scene; none of a step function, which has no bodies."""
+    """Return a picture of each scene; none of systems without bodies."""
     from scm_world.backends.renderer import automatic_camera, picture
     from scm_world.backends.step import StepModel
     from scm_world.models import Model
 
-    if isinstance(scenes[0].structure, StepModel):
+    if not scenes or isinstance(scenes[0].structure, StepModel):
         return []
     camera = automatic_camera(*scenes) if isinstance(scenes[0].structure, Model) else None
     return [picture(scene, camera, samples=2) for scene in scenes]

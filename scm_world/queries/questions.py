@@ -19,7 +19,7 @@ from scm_world.queries.outcomes import usual_outcomes
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.rollouts import Unit, as_names, length
-from scm_world.queries.samples import STEPS, Samples, Setting
+from scm_world.queries.samples import Samples, Setting
 from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.variables import Variable
 
@@ -31,15 +31,11 @@ class Questions(ABC):
 
     @abstractmethod
     def _asked(self) -> tuple[AnyTwins, System]:
-        """Give where episodes are run, and a system that says what is declared."""
+        """Return where episodes are run, and a system that knows what is declared."""
 
     @abstractmethod
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given in every episode."""
-
-    @abstractmethod
-    def _setting(self, given: Mapping[str, Any]) -> Setting:
-        """Complete the circumstances of episodes."""
 
     def rollout(
         self,
@@ -152,7 +148,7 @@ class Questions(ABC):
             self._with(do),
             n,
             outcomes=usual_outcomes(system) if outcomes is None else outcomes,
-            setting=self._setting(setting),
+            setting=Setting.of(system, setting),
             first=first,
             progress=progress,
         )
@@ -341,6 +337,3 @@ class SCM(Questions, graph.SCM):
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         return Plan(do)
-
-    def _setting(self, given: Mapping[str, Any]) -> Setting:
-        return Setting(**{"steps": STEPS if self.is_temporal else 0, "policy": None, **given})

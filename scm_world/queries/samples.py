@@ -15,7 +15,7 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import System
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read, watched
 from scm_world.queries.parallel import Result, paths, run_units
 from scm_world.queries.plans import Plan
@@ -52,6 +52,20 @@ class Setting:
     steps: int | None = STEPS
     seed: int = 0
     workers: int | None = None
+
+    @classmethod
+    def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
+        """Complete what is given: a world acts at random by default, equations with zeros.
+
+        Raises:
+            UnknownOption: The number of steps is none.
+        """
+        defaults: dict[str, Any] = {}
+        if isinstance(system, Equations):
+            defaults = {"steps": STEPS if system.model.is_temporal else 0, "policy": None}
+        found = cls(**{**defaults, **given})
+        length(system, found.steps)
+        return found
 
     def plan(self, world: System, do: Mapping[str, Any] | None) -> Plan:
         """Say what happens to a unit: what is done to it, and what varies by itself.

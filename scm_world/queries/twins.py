@@ -148,6 +148,15 @@ class EquationTwins:
 
 AnyTwins = Twins | EquationTwins
 
+
+def asked(system: World | SCM) -> tuple[AnyTwins, World | Equations]:
+    """Return where episodes of a system are run, and a system that knows what is declared."""
+    if isinstance(system, World):
+        return twins_of(system), system
+    twins = EquationTwins(system)
+    return twins, Equations(twins.layout)
+
+
 _TWINS: WeakKeyDictionary[World, Twins] = WeakKeyDictionary()
 
 

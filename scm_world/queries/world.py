@@ -13,7 +13,6 @@ from scm_world.backends import Backend
 from scm_world.queries.equations import System
 from scm_world.queries.plans import Key, Plan, Schedule
 from scm_world.queries.questions import Questions
-from scm_world.queries.samples import Setting
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
@@ -237,6 +236,3 @@ class World(Simulated, Questions):
 
     def _asked(self) -> tuple[AnyTwins, System]:
         return twins_of(self), self
-
-    def _setting(self, given: Mapping[str, Any]) -> Setting:
-        return Setting(**given)

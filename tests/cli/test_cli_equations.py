@@ -139,8 +139,50 @@ def test_a_counterfactual_keeps_the_noise(
     assert factual.final(effect) - other.final(effect) == pytest.approx(found[effect]["final"])
 
 
-def test_other_commands_say_what_they_take(file: str) -> None:
-    """Stepping needs a world."""
-    found = call("do", f"{file}:chain", "x=1")
-    assert found.exit_code != 0
-    assert "without a backend" in found.output
+def test_do_compares_with_and_without(file: str) -> None:
+    """The report has the values of the equations; there are no pictures."""
+    done = call("do", f"{file}:growth", "rate=3", "--steps", "2", "--out", "out")
+    assert done.exit_code == 0, done.output
+    assert "backend reports" not in done.output
+    assert [path.name for path in Path("out").iterdir()] == ["result.json"]
+    found = json.loads(Path("out/result.json").read_text())
+    assert found["backend"] == "equations"
+    size = found["variables"]["size"]
+    assert (size["before"], size["right_after"], size["after"], size["without"]) == (1, 1, 7, 3)
+    assert found["audit"]["rate"]["applied"] == 3.0
+    done = call("do", f"{file}:chain", "x=1", "--out", "static")
+    assert done.exit_code == 0, done.output
+    found = json.loads(Path("static/result.json").read_text())
+    assert found["steps"] == 0
+    assert found["followed"]["y"]["after"] == found["variables"]["y"]["after"]
+
+
+@pytest.mark.parametrize("setting", ["space", "preset", "backend"])
+def test_do_refuses_settings_of_a_world(file: str, setting: str) -> None:
+    """By the name of the option."""
+    done = call("do", f"{file}:chain", "x=1", f"--{setting}", "A", "--out", "out")
+    assert done.exit_code == 2, done.output
+    assert f"--{setting} cannot be 'A'" in " ".join(done.output.split())
+    assert not Path("out").exists()
+
+
+def test_a_sweep_has_the_same_units_at_every_point(file: str) -> None:
+    """The means are those of samples of the model, and what is done besides holds everywhere."""
+    given = ("--over", "x=0,1", "-n", "5", "--format", "csv")
+    done = call("sweep", f"{file}:chain", *given, "--out", "static")
+    assert done.exit_code == 0, done.output
+    assert "on equations" in done.output
+    rows = json.loads(Path("static/sweep.json").read_text())["rows"]
+    assert [row["y.change"] for row in rows] == [0.0, pytest.approx(2.0)]
+    given = ("--over", "rate=0.5,1", "-n", "2", "--format", "csv", "--steps", "4")
+    done = call("sweep", f"{file}:growth", *given, "--do", "size=2", "--out", "lagged")
+    assert done.exit_code == 0, done.output
+    rows = json.loads(Path("lagged/sweep.json").read_text())["rows"]
+    assert [row["size"] for row in rows] == [2.0, 2.0]
+    done = call("sweep", f"{file}:growth", *given, "--outcome", "sum:size", "--out", "summed")
+    assert done.exit_code == 0, done.output
+    rows = json.loads(Path("summed/sweep.json").read_text())["rows"]
+    assert [row["sum size"] for row in rows] == [9.0, 14.0]
+    done = call("sweep", f"{file}:chain", "--over", "x=0", "--preset", "fast", "--out", "no")
+    assert done.exit_code == 2, done.output
+    assert "--preset cannot be 'fast'" in " ".join(done.output.split())

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import scm_world
 from scm_world.cli.app import app
 from scm_world.cli.datasets import read_over
 from scm_world.discovery.data import Dataset, Design, Levels, Swept, collect, load, sweep
@@ -19,7 +20,17 @@ from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, 
 from scm_world.graph import SCM
 from scm_world.queries import Outcome, World
 from scm_world.queries.estimates import difference
-from scm_world.variables import Box, Categories, Exogenous, Integers
+from scm_world.variables import (
+    Action,
+    Box,
+    Categories,
+    Derived,
+    Exogenous,
+    Integers,
+    Linear,
+    Normal,
+    Parent,
+)
 
 MASS, FRICTION = "tool_block.mass", "floor_friction"
 OVER = {MASS: [0.02, 0.05, 0.08], FRICTION: Levels("A", 2)}
@@ -93,7 +104,7 @@ def test_grids_without_values_are_refused(over: Any, said: str, world: World) ->
 
 def test_what_is_no_world_is_refused() -> None:
     """Its name is none: an evaluation takes that, a sweep does not."""
-    with pytest.raises(UnknownOption, match="world cannot be 'pushing'"):
+    with pytest.raises(UnknownOption, match="system cannot be 'pushing'"):
         sweep("pushing", OVER, n=1)  # type: ignore[arg-type] # it is none
 
 
@@ -125,6 +136,32 @@ def test_every_point_has_the_same_units(world: World) -> None:
         falls = [found.values(at, "gravity[2]").tolist() for at in (place, 0)]
         assert falls[0] == falls[1]
     assert len(set(found.values(0, "gravity[2]"))) == 3
+
+
+def test_a_causal_model_is_swept() -> None:
+    """Its units are those of ``sample``; an action has its value after the first step."""
+    model = scm_world.SCM(
+        [
+            Exogenous(name="x", distribution=Normal(), a=Box(0.0, 1.0)),
+            Action(name="push", bounds=Box(-1.0, 1.0)),
+            Derived(
+                name="y",
+                parents=("x", Parent("push", 1), Parent("y", 1)),
+                mechanism=Linear(weights=(2.0, 1.0, 0.5)),
+                noise=Normal(),
+            ),
+        ]
+    )
+    how: dict[str, Any] = {"steps": 3, "seed": 2, "policy": "random", "nature": {"x": "A"}}
+    over = {"push": [-0.5, 0.5]}
+    found = sweep(model, over, n=4, **how)
+    for place, point in enumerate(found.points):
+        told = model.sample(4, point, **how)
+        assert {c.name for c in found.measured} == {"x", "y"}
+        for column in found.measured:
+            assert found.values(place, column.name).tolist() == told[column.name].tolist()
+    assert [row["push"] for row in found.rows()] == over["push"]
+    assert set(found.data["push"].tolist()) == {-0.5, 0.5}
 
 
 def test_the_table_has_means_and_intervals(world: World) -> None:

@@ -21,6 +21,7 @@ from scm_world.output.remote import Location
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
+from scm_world.queries.twins import asked
 from scm_world.work.executors import Executor, Serial, opened
 from scm_world.world import World
 
@@ -155,7 +156,7 @@ def source_of(
                 seed=seed,
             )
             return WorldSource(
-                source,
+                *asked(source),
                 design,
                 causes=given.get("causes"),
                 outcomes=given.get("outcomes"),

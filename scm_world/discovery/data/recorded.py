@@ -9,7 +9,8 @@ from fnmatch import fnmatchcase
 from scm_world.discovery.data.dataset import Column, columns_of
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph import SCM
-from scm_world.queries.outcomes import Outcome, column
+from scm_world.queries.equations import Equations, System
+from scm_world.queries.outcomes import Outcome, column, usual_outcomes
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Exogenous, Variable
@@ -20,7 +21,7 @@ NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRES
 """What looks, or disturbs the measurement, but moves nothing; patterns of names."""
 
 
-def default_causes(world: World | SCM) -> tuple[str, ...]:
+def default_causes(world: System | SCM) -> tuple[str, ...]:
     """List the parameters that an experiment varies, if nothing else is asked for.
 
     They are exogenous and real, can be set, have a space A, and are physical: no cameras, lights,
@@ -33,7 +34,7 @@ def default_causes(world: World | SCM) -> tuple[str, ...]:
         >>> "tool_block.mass" in found, "tool_block.color" in found, "floor_color" in found
         (True, True, False)
     """
-    model = world.model if isinstance(world, World) else world
+    model = world if isinstance(world, SCM) else world.model
     colors, structure = set[str](), set[str]()
     if isinstance(world, World):
         colors = {f"{block}.color" for block in world.compiled.task.tools()}
@@ -50,17 +51,19 @@ def default_causes(world: World | SCM) -> tuple[str, ...]:
     )
 
 
-def default_outcomes(world: World, *, every_step: bool = False) -> tuple[Outcome, ...]:
+def default_outcomes(world: System, *, every_step: bool = False) -> tuple[Outcome, ...]:
     """List what is measured, if nothing else is asked for.
 
-    Of the robot's tasks these are the blocks that move, and success; of any other system all
-    states, and what counts in it.
+    Of the robot's tasks these are the blocks that move, and success; of any other world all
+    states, and what counts in it; of equations all variables but actions.
 
     Args:
         world: That is measured.
         every_step: Whether it is measured at every instant; then the joints are listed, too, since
             the robot is what moves the blocks.
     """
+    if isinstance(world, Equations):
+        return tuple(map(Outcome, usual_outcomes(world)))
     names = world.compiled.task.measured(every_step=every_step)
     if names is None:
         names = (*world.compiled.slices, REWARD, SUCCESS)
@@ -71,13 +74,13 @@ def _is_like(name: str, patterns: Iterable[str]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def settable(world: World | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
+def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
     """List the variables that can be set and are named like one of the patterns.
 
     Raises:
         UnknownVariable: A pattern names nothing that can be set.
     """
-    model = world.model if isinstance(world, World) else world
+    model = world if isinstance(world, SCM) else world.model
     actions = world.compiled.commanded if isinstance(world, World) else ()
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     given = (patterns,) if isinstance(patterns, str) else tuple(patterns)

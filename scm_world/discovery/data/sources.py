@@ -63,6 +63,14 @@ class DataSource(Protocol):
         """Let some episodes happen."""
 
 
+def digest_of(model: SCM) -> str | None:
+    """Return the SHA-256 of a model as JSON; None if it has a function without a name."""
+    try:
+        return hashlib.sha256(to_json(model).encode()).hexdigest()
+    except ModelError:
+        return None
+
+
 # --- models ---------------------------------------------------------------------------------------
 
 
@@ -95,14 +103,10 @@ class ModelSource:
             model.do({name: act})
         self.columns: tuple[Column, ...] = tuple(c for v in model.variables for c in columns_of(v))
         self.edges: tuple[Edge, ...] | None = model.edges
-        try:
-            digest = hashlib.sha256(to_json(model).encode()).hexdigest()
-        except ModelError:  # a function has no name
-            digest = None
         self.about: dict[str, Any] = {
             "format": FORMAT,
             "system": "model",
-            "model": digest,
+            "model": digest_of(model),
             "seed": seed,
             "steps": 1 if steps is None else steps,
             "design": design.as_dict(),

@@ -27,10 +27,12 @@ from scm_world.graph import SCM
 from scm_world.graph.structure import Edge
 from scm_world.output.durable import made, write_whole
 from scm_world.output.remote import Location, located
+from scm_world.queries.equations import System
 from scm_world.queries.estimates import CONFIDENCE, difference
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
-from scm_world.queries.samples import STEPS, Setting
+from scm_world.queries.samples import Setting
+from scm_world.queries.twins import AnyTwins, asked
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
 from scm_world.work.executors import Executor
@@ -268,15 +270,11 @@ def _mean(name: str, values: Floats, base: Floats) -> dict[str, float | None]:
 
 
 def sweep(
-    world: World,
+    system: World | SCM,
     over: Mapping[str, Any],
     outcomes: Iterable[Any] | None = None,
     *,
     n: int = 50,
-    steps: int = STEPS,
-    policy: Any = "random",
-    nature: Mapping[str, Any] | None = None,
-    seed: int = 0,
     out: Location | str | None = None,
     shard: int = SHARD,
     format: str = "parquet",  # noqa: A002 # as other libraries call it
@@ -284,29 +282,29 @@ def sweep(
     engine: Executor | str | None = None,
     address: str | None = None,
     progress: Progress | None = None,
+    **setting: Any,
 ) -> Swept:
-    """Find out how outcomes depend on interventions, over a grid of them.
+    """Estimate outcomes over a grid of interventions.
 
-    The same ``n`` units live through every point, with the same noise, so that points can be
-    compared one by one. Interrupted, the same call goes on where it was; a larger ``n`` does, too.
+    The same ``n`` units, with the same noise, are run at every point, so that points can be
+    compared one by one. An interrupted call resumes when it is repeated; a larger ``n`` adds units.
 
     Args:
-        world: Is not touched; what is given to it holds at every point.
+        system: A world or a causal model. It is not changed; what is given to it holds at every
+            point.
         over: What is set to which values: lists, ``Levels("A", 7)``, or a space for five levels of
             it. All combinations are tried.
         outcomes: Names of variables or ``Outcome``; those of a collection if None.
         n: Episodes at each point.
-        steps: Control steps of an episode.
-        policy: Who acts; see ``Setting``.
-        nature: What varies from unit to unit; likewise.
-        seed: Of the noise.
         out: A folder, or a URL, for the episodes and the table.
-        shard: How many episodes are in one of its files, and made by a worker at once.
+        shard: How many episodes are in one of its files, and run by a worker in one piece.
         format: Of these files: ``"parquet"`` or ``"csv"``.
         workers: See ``collect``.
         engine: Likewise.
         address: Likewise.
-        progress: Told how many episodes are done, and how many there will be.
+        progress: Called with how many episodes are done, and how many there will be.
+        setting: ``policy``, ``nature``, ``steps`` and ``seed``; see ``Setting``. By default the
+            actions of a world are random, those of a causal model zero.
 
     Returns:
         Means and intervals at each point, and all episodes. In a folder they are ``sweep.csv`` and
@@ -324,18 +322,19 @@ def sweep(
         >>> [(row["tool_block.mass"], row["n"]) for row in found.rows()]
         [(0.02, 3), (0.08, 3)]
     """
-    if not isinstance(world, World):
-        raise UnknownOption("world", world, ("a World: World('pushing')",))
+    if not isinstance(system, World | SCM):
+        raise UnknownOption("system", system, ("a World: World('pushing')", "an SCM"))
     count = whole_number("n", n, least=1)
+    twins, world = asked(system)
     points = points_of(over, world.model)
-    setting = Setting(policy, nature, whole_number("steps", steps, least=1), seed)
-    source = Grid(world, points, outcomes, setting)
+    circumstances = Setting.of(world, setting)
+    source = Grid(twins, world, points, outcomes, circumstances)
     try:
         data = collect(
             source,
             Design(),
             count * len(points),
-            seed=seed,
+            seed=circumstances.seed,
             out=out,
             shard=shard,
             format=format,
@@ -358,6 +357,7 @@ class Grid:
     """Episodes at the points of a grid, units in turn: episode k is unit k // p at point k % p.
 
     Args:
+        twins: Where the episodes are run; see ``asked``.
         world: Is not touched.
         points: What is done at each of the p points.
         outcomes: What is measured.
@@ -369,7 +369,8 @@ class Grid:
 
     def __init__(
         self,
-        world: World,
+        twins: AnyTwins,
+        world: System,
         points: Sequence[Point],
         outcomes: Iterable[Any] | None,
         setting: Setting,
@@ -377,6 +378,7 @@ class Grid:
         measured = None if outcomes is None else tuple(outcomes)
         self._points = [
             WorldSource(
+                twins,
                 world,
                 Design("all", tuple(point), point, observational_fraction=0.0),
                 causes=tuple(point),

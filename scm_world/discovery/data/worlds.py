@@ -1,4 +1,4 @@
-"""Rows from a world: an engine moves it, and sensors measure it. Also through a laboratory."""
+"""Rows read off the episodes of a world, of equations, or through a laboratory."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from scm_world.discovery.data.recorded import (
     reached,
     settable,
 )
-from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell
+from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell, digest_of
 from scm_world.env.observer import published
 from scm_world.env.vector import WIDE, bounds, spread
 from scm_world.errors import BudgetExhausted, InterventionError, UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode
+from scm_world.queries.equations import Equations, Layout, System
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.outcomes import Outcome, as_outcome
@@ -37,7 +38,7 @@ from scm_world.queries.parallel import Result, run_units
 from scm_world.queries.plans import Plan
 from scm_world.queries.rollouts import Unit
 from scm_world.queries.samples import Setting
-from scm_world.queries.twins import twins_of
+from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import World
@@ -51,7 +52,7 @@ NORMAL = Normal()
 
 @final
 class WorldSource:
-    """Episodes of a world, under a design.
+    """Episodes of a world or of equations, under a design.
 
     A row is an episode: causes as they are at its beginning, and outcomes. With ``every_step`` it
     is a control step: everything as it is when the action is chosen, and the action. Sensors have
@@ -60,6 +61,7 @@ class WorldSource:
     bounds: no parameters, no actions, no counts.
 
     Args:
+        twins: Where the episodes are run; see ``asked``.
         world: Is not touched; what is given to it holds in every episode.
         design: What is done at the beginning.
         causes: Patterns of the parameters to write down; ``default_causes`` if None. The targets
@@ -80,7 +82,8 @@ class WorldSource:
 
     def __init__(
         self,
-        world: World,
+        twins: AnyTwins,
+        world: System,
         design: Design,
         *,
         causes: Iterable[str] | None,
@@ -88,18 +91,24 @@ class WorldSource:
         every_step: bool,
         setting: Setting,
     ) -> None:
-        self._world, self._twins, self._design = world, twins_of(world), design
+        self._world, self._twins, self._design = world, twins, design
         self._setting, self._given = setting, getattr(world, "plan", Plan())
         self._every_step, model = every_step, world.model
         for name, act in (*design.acts.items(), *Plan(setting.nature).acts()):
             model.accept(name, act)
         chosen = default_causes(world) if causes is None else settable(world, causes)
         varied = tuple(dict.fromkeys((*chosen, *design.targets)))
-        wanted = default_outcomes(world, every_step=every_step) if outcomes is None else outcomes
-        measured = _outcomes(wanted, every_step=every_step)
+        if outcomes is None:
+            usual = default_outcomes(world, every_step=every_step)
+            outcomes = [o for o in usual if first_label(model, o.name) or o.name not in varied]
+        measured = _outcomes(outcomes, every_step=every_step)
+        layout = world.compiled
+        self._actions = {*(layout.actions if isinstance(layout, Layout) else layout.commanded)}
         actions = tuple(world.compiled.actions) if every_step else ()
         self._watched = tuple(dict.fromkeys((*varied, *(o.name for o in measured), *actions)))
-        self._read = (*(Outcome(name, "first") for name in varied), *measured)
+        # At an instant a system still has the action of the step before.
+        starts = (Outcome(n, "final" if n in self._actions else "first") for n in varied)
+        self._read = (*starts, *measured)
         if every_step:
             parts = [columns_of(model.declared(name)) for name in self._watched]
         else:
@@ -114,22 +123,21 @@ class WorldSource:
         if twice:  # before episodes happen for them
             allowed = ("what is no cause: those have a column already",)
             raise UnknownOption("outcomes", ", ".join(twice), allowed)
-        sensed = self._watched if SENSOR_NOISE in model else ()
-        self._half = {name: half_range(world, name) for name in sensed}
+        self._half: dict[str, Floats] = {}
+        if isinstance(world, World) and SENSOR_NOISE in model:
+            self._half = {name: half_range(world, name) for name in self._watched}
         self.edges: tuple[Edge, ...] | None = model.edges
         self.about: dict[str, Any] = {
             "format": FORMAT,
-            "system": world.task.name,
-            "arguments": {n: str(v) for n, v in sorted(world.task.given.items())},
-            "options": plain_options(self._twins.options),
+            **_system(world, twins),
             "given": self._given.as_dict()["do"],
             "seed": setting.seed,
             "steps": setting.steps,
             "policy": policy_name(setting.policy),
             "nature": Plan(setting.nature).as_dict()["do"],
             "design": design.as_dict(),
-            "engine": world.backend.name,
-            "versions": versions(world.engine),
+            "engine": "equations" if isinstance(world, Equations) else world.backend.name,
+            "versions": versions("" if isinstance(world, Equations) else world.engine),
         }
 
     def __getstate__(self) -> dict[str, Any]:
@@ -197,9 +205,8 @@ class WorldSource:
         last = episode.steps
         if self._every_step:
             parts = [
-                # At an instant the world still has the action of the step before.
                 np.asarray(episode[name], float)[1:]
-                if name in self._world.compiled.commanded
+                if name in self._actions
                 else self._sensed(episode, name, range(last + 1))[:-1]
                 for name in self._watched
             ]
@@ -225,6 +232,16 @@ class WorldSource:
             drawn = noise.draw(NORMAL, stream, shape, {}, episode=episode.number, step=step)
             values[step] += float(strength[step]) * half.reshape(shape) * drawn[0]
         return values
+
+
+def _system(world: System, twins: AnyTwins) -> dict[str, Any]:
+    if isinstance(twins, EquationTwins):
+        return {"system": "model", "model": digest_of(world.model)}
+    return {
+        "system": twins.task.name,
+        "arguments": {n: str(v) for n, v in sorted(twins.task.given.items())},
+        "options": plain_options(twins.options),
+    }
 
 
 def half_range(world: World, name: str) -> Floats:
