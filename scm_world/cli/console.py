@@ -21,7 +21,7 @@ from rich.text import Text
 
 from scm_world.cli.arguments import suffix
 from scm_world.output.durable import made, removed, write_durably
-from scm_world.output.remote import Location, Remote
+from scm_world.output.remote import Location
 
 WIDTH, PAGE = 160, 200  # [characters] where there is no terminal to ask; for the widest tables
 RESULTS = Path("scm-world-results")
@@ -175,14 +175,14 @@ def check_writable(path: Location, *, folder: bool) -> None:
         BadParameter: Something else lies there, or it is read-only.
         UnwritableFolder: A store does not answer, or does not allow it.
     """
-    if isinstance(path, Remote):  # writing something is the only way to know
+    if not isinstance(path, Path):  # writing something is the only way to know
         trial = (path if folder else path.parent) / f".trial-{uuid4().hex}"
         write_durably(trial, b"")
         removed(trial)
     if path.exists() and path.is_dir() != folder:
         kind = "a file" if folder else "a folder"
         raise typer.BadParameter(f"{str(path)!r} is {kind}", param_hint="'--out'")
-    if isinstance(path, Remote):
+    if not isinstance(path, Path):
         return
     there = path
     while not there.exists() and there != there.parent:

@@ -37,9 +37,9 @@ from scm_world.evaluation.recording_files import (
     to_minari,
     to_parquet,
 )
-from scm_world.output.durable import write_durably
+from scm_world.output.durable import said, write_durably
 from scm_world.output.reading import LARGEST_TABLE, read_bytes
-from scm_world.output.remote import Location, located, said
+from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task

@@ -7,9 +7,23 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from uuid import uuid4
 
 from scm_world.errors import UnreadableFile, UnwritableFolder
-from scm_world.output.remote import PARTIAL, Location, Remote, draft_name, located, said
+from scm_world.output.remote import Location, located
+
+PARTIAL = ".part"
+"""How the names of files end that are not whole yet."""
+
+
+def draft_name(name: str) -> str:
+    """Return a hidden name for a file until it is whole; another one each time.
+
+    Example:
+        >>> draft_name("study.json") == draft_name("study.json")
+        False
+    """
+    return f".{name}.{uuid4().hex[:16]}{PARTIAL}"
 
 
 def is_draft(name: str, of: str = "") -> bool:
@@ -27,28 +41,21 @@ def is_draft(name: str, of: str = "") -> bool:
 
 
 def write_durably(path: Location | str, data: bytes) -> None:
-    """Write a file, whole or not at all; it is on the disk, or in the store, when this ends.
+    """Write a file, whole or not at all; it is on the disk when this ends.
 
-    Of several writers at once the last one decides; a reader always finds a whole file.
+    Of several writers at once the last one decides; a reader always finds a whole file. Behind a
+    URL all of this is as fsspec and the store have it.
 
     Raises:
         UnwritableFolder: There is no room, or no permission; what was there is still there.
     """
     target = located(path)
-    if isinstance(target, Remote):
-        _put(target, data)
-    else:
-        _write(target, data)
-
-
-def _put(target: Remote, data: bytes) -> None:
-    try:
-        target.put(data)
-    except OSError as error:
-        raise UnwritableFolder(str(target.parent), f"{target.name}: {said(error)}") from error
-
-
-def _write(target: Path, data: bytes) -> None:
+    if not isinstance(target, Path):
+        try:
+            target.write_bytes(data)
+        except OSError as error:
+            raise UnwritableFolder(str(target.parent), f"{target.name}: {said(error)}") from error
+        return
     draft = target.with_name(draft_name(target.name))
     try:
         handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
@@ -73,6 +80,18 @@ def write_whole(text: str, path: Location | str) -> None:
         UnwritableFolder: There is no room, or no permission.
     """
     write_durably(path, text.encode("utf-8", errors="backslashreplace"))
+
+
+def said(error: OSError) -> str:
+    """Say what went wrong; some errors of stores are but a path, and need their name.
+
+    Example:
+        >>> said(FileExistsError("/run")), said(OSError(28, "No space left"))
+        ('FileExistsError: /run', 'No space left')
+    """
+    if error.strerror:
+        return error.strerror
+    return str(error) if type(error) is OSError else f"{type(error).__name__}: {error}"
 
 
 def removed(path: Location) -> None:
@@ -114,15 +133,15 @@ def locked(folder: Location | str) -> Iterator[None]:
     """Be the only one who writes to a folder, which is made if need be.
 
     It ends with the process, however that ends. In one process, too, a second one is refused.
-    Object stores know no locks: there two writers may write, each file as a whole. What they
-    write in the folders of this package is the same, whoever writes it.
+    Behind a URL there are no locks: two writers may write there. What they write in the folders
+    of this package is the same, whoever writes it.
 
     Raises:
         UnreadableFile: Somebody else is writing to it.
         UnwritableFolder: There is no permission, or a file in its place.
     """
     path = located(folder)
-    if isinstance(path, Remote):
+    if not isinstance(path, Path):
         made(path)
         yield
         return

@@ -8,13 +8,14 @@ import os
 import stat
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import load
-from scm_world.output.remote import Location, Remote, located
+from scm_world.output.remote import Location, located
 
 LARGEST = 2**28
 """Bytes of a text, a model or a policy: more is none."""
@@ -33,16 +34,12 @@ def regular(path: Location | str, largest: int = LARGEST) -> Location:
         OSError: It is not there; it is a folder, a device or a pipe; or it is too large.
     """
     where = located(path)
-    if isinstance(where, Remote):
-        size = where.size()
-    else:
-        status = where.stat()
-        if stat.S_ISDIR(status.st_mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(where))
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError("it is no regular file, but a device, a pipe or a socket")
-        size = status.st_size
-    refuse_large("it", size, largest)
+    status = where.stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(where))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError("it is no regular file, but a device, a pipe or a socket")
+    refuse_large("it", status.st_size, largest)
     return where
 
 
@@ -55,7 +52,7 @@ def refuse_large(what: str, size: int, largest: int = LARGEST) -> None:
 def read_bytes(path: Location | str, largest: int = LARGEST) -> bytes:
     """Read a file; arguments and errors as in ``regular``."""
     where = regular(path, largest)
-    if isinstance(where, Remote):
+    if not isinstance(where, Path):
         return where.read_bytes()
     with where.open("rb") as stream:
         return stream.read(where.stat().st_size)  # some files of the system have no end

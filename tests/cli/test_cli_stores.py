@@ -13,7 +13,7 @@ from scm_world.discovery.data import load
 from scm_world.evaluation import Evaluation
 from scm_world.output.remote import located
 
-pytest.importorskip("fsspec")
+pytest.importorskip("upath")
 
 QUICK = ("--backend", "fake", "--env", "max_episode_length=3", "--workers", "1")
 
@@ -59,7 +59,7 @@ def test_urls_that_cannot_be_are_refused_at_once() -> None:
     done = call("evaluate", "still", *QUICK, "--out", "s4://bucket/run")
     assert done.exit_code == 2
     assert "protocol of a URL cannot be 's4'" in done.output
-    located("memory://cli/file").put(b"")  # type: ignore[union-attr]
+    located("memory://cli/file").write_bytes(b"")
     done = call("evaluate", "still", *QUICK, "--out", "memory://cli/file")
     assert done.exit_code != 0
     assert "memory://cli/file" in done.output

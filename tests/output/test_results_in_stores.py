@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stores import everything, fresh
+from stores import MemoryFileSystem, everything, fresh, refuse
 
 from scm_world.discovery import discover
 from scm_world.discovery.benchmarks import BenchmarkResult, benchmark
@@ -16,15 +16,13 @@ from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation.outputs.report import write_outputs
 from scm_world.evaluation.recording import Recording
-from scm_world.output.remote import Remote
+from scm_world.output.remote import Location
 from scm_world.queries import World
 
 HOW: dict[str, Any] = {"n": 60, "backend": "fake", "env": {"max_episode_length": 3}}
 DESIGN = Design(
     "half", ("tool_block.mass", "floor_friction", "gravity"), observational_fraction=0.3
 )
-WHERE = ("memory", "shelf")
-"""A store of objects, and one in which files are moved to their place."""
 
 
 def below(folder: Path) -> dict[str, bytes]:
@@ -62,25 +60,22 @@ def collected(out: Path | str, n: int = 10, **more: Any) -> Dataset:
 # --- the same bytes -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("protocol", WHERE)
-def test_an_evaluation_is_the_same_in_a_store(protocol: str, tmp_path: Path) -> None:
+def test_an_evaluation_is_the_same_in_a_store(tmp_path: Path) -> None:
     """Interrupted, gone on with, and saved: every file is that of a folder, and is read back."""
-    drawn = protocol == WHERE[0]
-    local, folder = evaluated(tmp_path, drawn=drawn), fresh(protocol)
+    local, folder = evaluated(tmp_path, drawn=True), fresh()
     with pytest.raises(KeyboardInterrupt):
         evaluated(str(folder), progress=stop_at(100))
     safe = everything(folder)
     assert 0 < len(safe) < len(below(tmp_path / "parts"))
-    assert evaluated(str(folder), drawn=drawn) == local
+    assert evaluated(str(folder), drawn=True) == local
     assert everything(folder) == below(tmp_path)
     assert Evaluation.load(str(folder)) == Evaluation.load(f"{folder}/results.json") == local
     assert Evaluation.load(f"file://{tmp_path}") == local
 
 
-@pytest.mark.parametrize("protocol", WHERE)
-def test_a_dataset_is_the_same_in_a_store(protocol: str, tmp_path: Path) -> None:
+def test_a_dataset_is_the_same_in_a_store(tmp_path: Path) -> None:
     """Interrupted, gone on with, and made larger: every file is that of a folder."""
-    local, folder = collected(tmp_path / "local"), fresh(protocol)
+    local, folder = collected(tmp_path / "local"), fresh()
     with pytest.raises(KeyboardInterrupt):
         collected(str(folder), progress=stop_at(6))
     assert "shard-00001.csv" not in everything(folder)
@@ -159,10 +154,10 @@ def test_a_recording_is_read_from_a_store() -> None:
 # --- faults ---------------------------------------------------------------------------------------
 
 
-def spoil(folder: Remote, pattern: str) -> str:
+def spoil(folder: Location, pattern: str) -> str:
     """Cut the end of a file off; give its name."""
     file = next(folder.glob(pattern))
-    file.put(file.read_bytes()[:-9])
+    file.write_bytes(file.read_bytes()[:-9])
     return file.name
 
 
@@ -184,12 +179,15 @@ def test_damaged_objects_are_named() -> None:
     assert collected(str(data)) == load(str(data))
 
 
-def test_nothing_is_done_where_nobody_may_write() -> None:
+def test_nothing_is_done_where_nobody_may_write(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error comes before the first episode."""
     told: list[int] = []
+    monkeypatch.setattr(MemoryFileSystem, "mkdir", refuse)
+    monkeypatch.setattr(MemoryFileSystem, "pipe_file", refuse)
+    monkeypatch.setattr(MemoryFileSystem, "_open", refuse)
     for do in (evaluated, collected):
-        with pytest.raises(UnwritableFolder, match=r"closed://.*Access Denied"):
-            do(str(fresh("closed")), progress=lambda done, _: told.append(done))
+        with pytest.raises(UnwritableFolder, match=r"memory://.*Access Denied"):
+            do(str(fresh()), progress=lambda done, _: told.append(done))
     assert not any(told)
 
 

@@ -24,9 +24,9 @@ from scm_world.discovery.data.shards import (
 from scm_world.discovery.data.sources import FORMAT, SourceRows
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.graph.structure import Edge
-from scm_world.output.durable import is_draft, locked, removed, write_durably
+from scm_world.output.durable import PARTIAL, is_draft, locked, removed, said, write_durably
 from scm_world.output.reading import LARGEST_TABLE, read_bytes, read_text
-from scm_world.output.remote import PARTIAL, Location, located, said
+from scm_world.output.remote import Location, located
 
 SIDECAR = "dataset.json"
 SHARD = 100
@@ -186,7 +186,7 @@ class Folder:
                     removed(stale)
             if (self.path / SIDECAR).exists():
                 self._check_same(read_sidecar(self.path))
-            elif any(not path.name.startswith(".") for path in self.path.iterdir()):
+            elif any(not path.name.startswith(".") for path in self.path.glob("*")):
                 reason = f"it holds other files, and no {SIDECAR}"
                 raise UnreadableFile(str(self.path), reason, "give a new or an empty folder")
             else:
