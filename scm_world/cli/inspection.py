@@ -59,7 +59,7 @@ def graph(
         action_mode: Of the TriFinger: joint_positions, joint_torques or end_effector_positions.
     """
     from scm_world.graph import to_json
-    from scm_world.graph.exchange import causal_graph, to_html, write_graph
+    from scm_world.graph.exchange import write_graph
 
     if format_ is None:
         ending = "" if out is None else out.suffix.lower().removeprefix(".")
@@ -77,7 +77,7 @@ def graph(
     page = StringIO()
     match format_.value:
         case "png" if out is not None:
-            from scm_world.discovery.plots import draw_model
+            from scm_world.discovery.model_pictures import draw_model
 
             draw_model(model, out, title=title)
         case "table":
@@ -85,7 +85,9 @@ def graph(
         case "json":
             page.write(to_json(model) + "\n")
         case "html":
-            page.write(to_html(causal_graph(model), title=title) + "\n")
+            from scm_world.discovery.model_pictures import to_html
+
+            page.write(to_html(model, title=title))
         case other:
             page.write(write_graph(model, format=other) + "\n")
     if out is None:

@@ -1,27 +1,16 @@
-"""Figures: estimated graphs beside declared ones, a model in layers, and verifications."""
+"""Figures of what was found: estimated graphs beside declared ones, and verifications."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 
-from scm_world.discovery.names import Families, by_entity
+from scm_world.discovery.names import Families
 from scm_world.discovery.run import DiscoveryReport
-from scm_world.graph import SCM
-from scm_world.graph.exchange.html import (
-    FILLS,
-    columns_of,
-    forward,
-    heights_of,
-    neighbors_of,
-    routes_of,
-)
-from scm_world.output.canvas import DPI, FAINT, INK, WIDTH, blank, save
+from scm_world.output.canvas import FAINT, INK, blank, save
 from scm_world.output.remote import Location
 from scm_world.queries.agreement import FACTORS, Agreement
 from scm_world.queries.experiments.effects import EdgeKey
@@ -32,10 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DECLARED, MATCHED, EXTRA, MISSING = "#4a5568", "#1f6fb4", "#f28e2b", "#d62728"
-LAG_0, LAG_1 = "#5f6b7a", "#9a6fb0"
 MARKERS = {0: "o", 1: ">"}
-HUB = "one control step"
-BOX, GAP, LANE = 30.0, 8.0, 22.0  # [pixels]: height of a node, between two, of an edge that passes
 
 # --- the two graphs of a discovery ---------------------------------------------------------------
 
@@ -169,169 +155,7 @@ def _key(marker: str, label: str, color: str, *, hollow: bool = False, size: flo
     )  # fmt: skip
 
 
-# --- a declared model ---------------------------------------------------------------------------
-
-
-@final
-@dataclass(frozen=True)
-class LayeredModel:
-    """A model in layers [pixels], y downwards.
-
-    Attributes:
-        places: Center of each node.
-        kinds: Kind of each node; ``"hub"`` for a node that stands for many edges.
-        box: Width and height of a node.
-        arrows: Points from cause to effect, the lag, and whether it also points back.
-        loops: Nodes that affect themselves.
-        alone: Variables without any edge, in few words.
-        height: Of all of it.
-    """
-
-    places: dict[str, tuple[float, float]]
-    kinds: dict[str, str]
-    box: tuple[float, float]
-    arrows: tuple[tuple[tuple[tuple[float, float], ...], int, bool], ...]
-    loops: tuple[str, ...]
-    alone: tuple[str, ...]
-    height: float
-
-
-def lay_out(model: SCM) -> LayeredModel:
-    """Return places for families of variables; lagged edges of many causes run through hubs."""
-    families = Families(model, (edge.key for edge in model.edges))
-    graph = nx.DiGraph()
-    for edge in model.edges:
-        cause, effect = families.of[edge.cause], families.of[edge.effect]
-        lags = graph.get_edge_data(cause, effect, {"lags": set()})["lags"]
-        graph.add_edge(cause, effect, lags={edge.lag, *lags})
-    hubs = _bundle(graph)
-    ahead = forward(graph)
-    ahead.add_edges_from((hub, effect) for hub in hubs for effect in graph.successors(hub))
-    column = columns_of(ahead)
-    routes = routes_of(ahead, column)
-    items = column | {item: item[2] for route in routes.values() for item in route[1:-1]}
-    y = heights_of(
-        items, neighbors_of(routes.values()), lambda i: BOX + GAP if isinstance(i, str) else LANE
-    )
-    step = WIDTH / (max(column.values(), default=0) + 1)
-    half = min(170.0, 0.72 * step) / 2.0
-    at = {item: (step * (number + 0.5), y[item]) for item, number in items.items()}
-    arrows = []
-    for (cause, effect), route in routes.items():
-        lanes = [(at[i][0] + side, at[i][1]) for i in route[1:-1] for side in (-half, half)]
-        start, end = (at[cause][0] + half, at[cause][1]), (at[effect][0] - half, at[effect][1])
-        back = graph.has_edge(effect, cause) and not ahead.has_edge(effect, cause)
-        lags = sorted(graph.edges[cause, effect]["lags"])
-        for lag in lags:
-            aside = (8.0 * lag - 4.0) if len(lags) > 1 else 0.0
-            points = tuple((x, height + aside) for x, height in (start, *lanes, end))
-            arrows.append((points, lag, back))
-    first: dict[str, Any] = {name: model.declared(m[0]) for name, m in families.members.items()}
-    return LayeredModel(
-        places={name: at[name] for name in graph},
-        kinds={name: "hub" if name in hubs else first[name].kind for name in graph},
-        box=(2.0 * half, BOX),
-        arrows=tuple(arrows),
-        loops=tuple(name for name in graph if graph.has_edge(name, name)),
-        alone=tuple(by_entity(name for name in model if families.of[name] not in graph)),
-        height=max(y.values(), default=0.0) + BOX,
-    )
-
-
-def _bundle(graph: nx.DiGraph) -> list[str]:
-    """Run the lagged edges of several effects with the same causes through one node each."""
-    bundles: dict[frozenset[str], list[str]] = {}
-    for name in graph:
-        causes = frozenset(c for c, _, lags in graph.in_edges(name, data="lags") if 1 in lags)
-        bundles.setdefault(causes, []).append(name)
-    hubs: list[str] = []
-    for causes, effects in bundles.items():
-        if len(causes) > 2 and len(effects) > 1:
-            hubs.append(HUB + " " * len(hubs))
-            for effect in effects:
-                for cause in sorted(causes):
-                    lags = graph.edges[cause, effect]["lags"]
-                    lags.discard(1)
-                    if not lags:
-                        graph.remove_edge(cause, effect)
-                    graph.add_edge(cause, hubs[-1], lags={1})
-                graph.add_edge(hubs[-1], effect, lags={1})
-    return hubs
-
-
-def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
-    """Draw a model as a layered graph, causes left of effects.
-
-    Variables that differ in numbers only and have the same edges are one node. Where several
-    variables have the same causes of one step before, the arrows run through one node.
-
-    Args:
-        model: Any model.
-        path: Of the PNG, 1600 pixels wide and as high as it takes.
-        title: What the model is.
-    """
-    from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-    from matplotlib.path import Path as Line
-
-    drawing = lay_out(model)
-    alone = textwrap.fill(f"No edge at all: {', '.join(drawing.alone)}", 190)
-    below = 22.0 * (alone.count("\n") + 1) + 10.0 if drawing.alone else 10.0
-    top, height = 85.0, 85.0 + drawing.height + below
-    figure = blank(WIDTH / DPI, height / DPI)
-    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    ax.set_xlim(0, WIDTH)
-    ax.set_ylim(height - top, -top)
-    ax.axis("off")
-    for points, lag, both in drawing.arrows:
-        line, codes = [points[0]], [Line.MOVETO]
-        for (x0, y0), (x1, y1) in pairwise(points):  # it leaves and arrives horizontally
-            bend = 0.5 * (x1 - x0)
-            line += [(x0 + bend, y0), (x1 - bend, y1), (x1, y1)]
-            codes += [Line.CURVE4] * 3
-        style: Any = {"arrowstyle": "<|-|>" if both else "-|>", "mutation_scale": 9, "lw": 1.1}
-        style |= {"color": LAG_1 if lag else LAG_0, "ls": (0, (4, 2.5)) if lag else "solid"}
-        ax.add_patch(FancyArrowPatch(path=Line(line, codes), shrinkA=0, shrinkB=0, **style))
-    width, high = drawing.box
-    for name, (x, y) in drawing.places.items():
-        hub = drawing.kinds[name] == "hub"
-        face, ink = (INK, "white") if hub else (FILLS[drawing.kinds[name]], INK)
-        look: Any = {"boxstyle": "round,pad=0,rounding_size=6", "fc": face, "ec": "#6b7686"}
-        corner = (x - width / 2, y - high / 2)
-        ax.add_patch(FancyBboxPatch(corner, width, high, lw=0.8, zorder=3, **look))
-        upper, dot, lower = name.strip().partition(".")
-        text = f"{upper}.\n{lower}" if dot else upper
-        size = min(9.0, 1.15 * width / max(map(len, text.split("\n"))))
-        place: Any = {"ha": "center", "va": "center", "linespacing": 1.05, "zorder": 4}
-        ax.text(x, y, text, fontsize=size, color=ink, **place)
-        if name in drawing.loops:
-            style = {"connectionstyle": "arc3,rad=-1.3", "arrowstyle": "-|>", "mutation_scale": 8}
-            style |= {"color": LAG_1, "ls": (0, (3, 2)), "shrinkA": 0, "shrinkB": 0, "zorder": 2}
-            ends = ((x - 16, y - high / 2), (x + 16, y - high / 2))
-            ax.add_patch(FancyArrowPatch(*ends, **style))
-    ax.text(20, 34 - top, title or "causal model", fontsize=17, weight="bold", color=INK)
-    counts = f"{len(model)} variables, {len(model.edges)} edges"
-    ax.text(20, 62 - top, counts, fontsize=12, color=INK)
-    if drawing.alone:
-        ax.text(20, height - top - 10, alone, fontsize=10, color=INK, va="bottom")
-    _legend(ax, set(drawing.kinds.values()))
-    save(figure, path)
-
-
-def _legend(ax: Axes, kinds: set[str]) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles: list[Any] = [
-        Patch(fc=fill, ec="#6b7686", label=kind) for kind, fill in FILLS.items() if kind in kinds
-    ]
-    handles.append(Line2D([], [], color=LAG_0, label="contemporaneous"))
-    handles.append(Line2D([], [], color=LAG_1, ls="--", label="one control step later"))
-    if "hub" in kinds:
-        label = "each arrow in stands for one to every node it points at"
-        handles.append(Patch(fc=INK, label=label))
-    place: Any = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
-    ax.legend(handles=handles, ncol=4, frameon=False, fontsize=10, **place)
-
+# --- verifications ------------------------------------------------------------------------------
 
 SHADES = ("#1f6fb4", "#f28e2b", "#4c9a6a", "#9a6fb0")
 GOOD, BAD = "#4c9a6a", "#d62728"

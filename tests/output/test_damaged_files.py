@@ -25,7 +25,6 @@ from scm_world.evaluation import Evaluation, check, evaluate
 from scm_world.evaluation.players import as_player
 from scm_world.evaluation.recording import Recording
 from scm_world.geometry.hulls import load_hull
-from scm_world.graph.exchange import read_graph
 from scm_world.graph.files import from_dict, from_json
 from scm_world.output import reading
 from scm_world.policies import load_sb2
@@ -73,7 +72,6 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "recipe": (".json", Recipe.load),
     "dataset": ("", lambda path: dataset_of(path.parent)),
     "settings": (".csv", lambda path: read_protocol(path, World("pushing", backend="fake").model)),
-    "graph": (".gml", lambda path: read_graph(path, format="gml")),
     "model": (".xml", read_model),
     "mesh": (".stl", lambda path: _named_by(MESH, path)),
     "included": (".xml", lambda path: _named_by(INCLUDE, path)),
