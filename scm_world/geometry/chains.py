@@ -127,8 +127,9 @@ def end_of_chain(numbers: Floats, links: Floats) -> Floats:
             _product(turn, ball[0], ball[1], ball[2], ball[3])
             _add_turned(place, turn, at[2], at[3], at[4], -1.0)
         else:
-            place[:] = numbers[i : i + 3]
-            turn[0], turn[1:] = numbers[i + 6], numbers[i + 3 : i + 6]
+            for k in range(3):
+                place[k], turn[1 + k] = numbers[i + k], numbers[i + 3 + k]
+            turn[0] = numbers[i + 6]
             _normalize(turn)
     if links[0] == 0.0:
         return place

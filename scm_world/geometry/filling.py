@@ -11,13 +11,13 @@ that coplanar faces are no special case.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.geometry.arrays import rows
+from scm_world.geometry.arrays import copy_rows, rows
 from scm_world.geometry.overlap import WORKSPACE, overlap_kernel
 from scm_world.geometry.rotations import rotation_kernel
 
@@ -27,6 +27,9 @@ Boxes: TypeAlias = tuple[Floats, Floats, Floats]
 SIDES = 6
 NOTHING = 1e-15  # of the volume of a box: a piece of it that can be left out
 _FIVE = np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 3, 6], [4, 0, 5, 6], [7, 3, 5, 6]])
+_NONE: Any = np.int64(0)
+_ONE: Any = np.int64(1)
+"""No literals: numba would compile a kernel once more for each of them."""
 
 
 @njit(cache=True)
@@ -75,8 +78,8 @@ def _volume(corners: Floats) -> float:
 def _wedge(wedge: Floats, out: Floats) -> None:
     """Write a wedge between two triangles, shape (6, 3), as three tetrahedra."""
     for t in range(3):
-        for n in range(4):
-            out[t, n] = wedge[n if n <= 2 - t else n + 2]
+        copy_rows(wedge[: 3 - t], out[t])
+        copy_rows(wedge[5 - t :], out[t, 3 - t :])
 
 
 @njit(cache=True)
@@ -119,29 +122,30 @@ def _split(corners: Floats, plane: Floats, out: Floats) -> int:
     heights, order = np.empty(4), np.empty(4, dtype=np.int64)
     inside = _sort(corners, plane, heights, order)
     if inside == 4:
-        out[0] = corners
+        copy_rows(corners, out[0])
         return 1
     if inside == 0:
-        out[3] = corners
+        copy_rows(corners, out[3])
         return 10
     wedge = np.empty((6, 3))
     if inside == 2:
-        for here, there, start in ((0, 2, 0), (2, 0, 3)):
+        for side in range(2):
+            here, there = 2 * side, 2 - 2 * side
             for n in range(2):
-                wedge[3 * n] = corners[order[here + n]]
+                p = order[here + n]
+                copy_rows(corners[p : p + 1], wedge[3 * n :])
                 for m in range(2):
-                    _between(
-                        corners, heights, order[here + n], order[there + m], wedge[3 * n + 1 + m]
-                    )
-            _wedge(wedge, out[start : start + 3])
+                    _between(corners, heights, p, order[there + m], wedge[3 * n + 1 + m])
+            _wedge(wedge, out[3 * side : 3 * side + 3])
         return 33
-    alone, others = (order[0], order[1:]) if inside == 1 else (order[3], order[:3])
-    tip, rest = (0, 3) if inside == 1 else (3, 0)
-    out[tip, 0] = corners[alone]
+    alone, first, tip, rest = (0, 1, 0, 3) if inside == 1 else (3, 0, 3, 0)
+    p = order[alone]
+    copy_rows(corners[p : p + 1], out[tip])
     for n in range(3):
-        wedge[n] = corners[others[n]]
-        _between(corners, heights, alone, others[n], wedge[3 + n])
-        out[tip, n + 1] = wedge[3 + n]
+        q = order[first + n]
+        copy_rows(corners[q : q + 1], wedge[n:])
+        _between(corners, heights, p, q, wedge[3 + n])
+    copy_rows(wedge[3:], out[tip, 1:])
     _wedge(wedge, out[rest : rest + 3])
     return 31 if inside == 1 else 13
 
@@ -161,8 +165,8 @@ def remainder_kernel(box: Floats, planes: Floats, kept: int) -> float:
     stack = np.empty((5 + 6 * len(planes), 4, 3))
     at = np.zeros(len(stack), dtype=np.int64)  # the plane that comes next
     pieces, total, least = np.empty((6, 4, 3)), 0.0, 0.0
-    stack[:5] = box
     for t in range(5):
+        copy_rows(box[t], stack[t])
         least += NOTHING * _volume(box[t])
     height = 5
     while height > 0:
@@ -177,13 +181,13 @@ def remainder_kernel(box: Floats, planes: Floats, kept: int) -> float:
         if must or not last:  # inside all six of a box that takes away, nothing remains
             for n in range(count % 10):
                 if _volume(pieces[n]) > least:
-                    stack[height] = pieces[n]
+                    copy_rows(pieces[n], stack[height])
                     at[height] = plane + 1
                     height += 1
         if not must:
             for n in range(count // 10):
                 if _volume(pieces[3 + n]) > least:
-                    stack[height] = pieces[3 + n]
+                    copy_rows(pieces[3 + n], stack[height])
                     at[height] = SIDES * (plane // SIDES + 1)
                     height += 1
     return total
@@ -254,7 +258,7 @@ def overlap_fraction_kernel(
             wanted += goal_sizes[g, 0] * goal_sizes[g, 1] * goal_sizes[g, 2]
         else:
             _tetrahedra(*goal, tetrahedra)
-            wanted += remainder_kernel(tetrahedra, planes[SIDES:first], 0)
+            wanted += remainder_kernel(tetrahedra, planes[SIDES:first], _NONE)
         for b in range(len(sizes)):
             block = (sizes[b], positions[b], orientations[b])
             shared[b] = overlap_kernel(*block, *goal, work)
@@ -265,7 +269,7 @@ def overlap_fraction_kernel(
                 filled += shared[b]
             else:
                 _tetrahedra(*block, tetrahedra)
-                filled += remainder_kernel(tetrahedra, planes[:used], 1)
+                filled += remainder_kernel(tetrahedra, planes[:used], _ONE)
     return min(filled / wanted, 1.0) if wanted > 0.0 else 1.0
 
 

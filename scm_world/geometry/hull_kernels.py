@@ -162,7 +162,8 @@ def _outside(vertices: Floats, corners: Integers, cone: Floats) -> bool:
 def _pyramid(vertices: Floats, corners: Integers, cone: Floats, work: Floats) -> float:
     """Give six times the volume that a triangle of A encloses with the tip of a cone of B."""
     for n in range(3):
-        work[0, n] = vertices[corners[n]]
+        for k in range(3):
+            work[0, n, k] = vertices[corners[n], k]
     count = 3
     count = _cut(work[0], count, cone[0], 1.0, work[1])
     count = _cut(work[1], count, cone[1], 1.0, work[0])

@@ -424,7 +424,8 @@ def _dense(x: Floats, weight: Floats, bias: Floats, after: int) -> Floats:
     found = np.empty((rows, outputs))
     for row in range(rows):
         total = found[row]
-        total[:] = bias
+        for j in range(outputs):
+            total[j] = bias[j]
         for i in range(inputs):
             share = x[row, i]
             for j in range(outputs):

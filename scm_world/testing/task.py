@@ -77,8 +77,8 @@ class WorldConformance(ABC):
 
     def test_one_seed_has_one_future(self, world: World) -> None:
         """Same seed, actions and interventions give the same bits, here and in another process."""
-        elsewhere = _pool().submit(_future, type(self), dict(vars(self)))
         first = story(world)
+        elsewhere = _pool().submit(_future, type(self), dict(vars(self)))
         assert story(world) == first
         assert elsewhere.result(timeout=120) == first
 

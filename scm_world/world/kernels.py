@@ -37,7 +37,11 @@ def _write_number(row: Any, where: Any, i: int, value: Any) -> None:
 
 
 def _write_vector(row: Any, where: Any, i: int, value: Any) -> None:
-    row[where[i, 0] : where[i, 1]] = value
+    first, length = where[i, 0], where[i, 1] - where[i, 0]
+    if len(value) != length:
+        raise ValueError("a compiled mechanism gave a vector of another length than declared")
+    for k in range(length):  # numba compiles an assignment of slices for seconds
+        row[first + k] = value[k]
 
 
 def _called(typing: Any, address: Any, row: Any, where: Any, kinds: Any, result: Any) -> Any:

@@ -176,7 +176,8 @@ def draw_mesh(mesh: Triangles, view: View, light: Floats, alpha: float, canvas: 
     corners, edges, box = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
     for f in range(len(mesh.faces)):
         for i in range(3):
-            corners[i] = pixels[mesh.faces[f, i]]
+            for k in range(3):
+                corners[i, k] = pixels[mesh.faces[f, i], k]
         _rectangle(corners, near, box)
         left, right = math.ceil(max(box[0], 0.0)), int(min(box[1], depth.shape[1] - 1.0)) + 1
         top, bottom = math.ceil(max(box[2], 0.0)), int(min(box[3], depth.shape[0] - 1.0)) + 1

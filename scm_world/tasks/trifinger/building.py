@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world.geometry.arrays import compact
 from scm_world.geometry.filling import overlap_fraction_kernel
 from scm_world.geometry.overlap import aabb_overlap_fraction
 from scm_world.geometry.rotations import rotation_matrix
@@ -206,7 +207,7 @@ class Building(TriFingerTask):
 
 def _split(boxes: Floats) -> tuple[Floats, Floats, Floats]:
     parts = (boxes[:, :3], boxes[:, 3:6], boxes[:, 6:])
-    size, position, orientation = (np.ascontiguousarray(part) for part in parts)
+    size, position, orientation = (compact(part) for part in parts)
     return size, position, orientation
 
 

@@ -27,6 +27,7 @@ from scm_world.backends.bullet.vectors import (
     turned,
     vector,
 )
+from scm_world.geometry.arrays import copy_rows
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.models.bodies import ModelBodies
 
@@ -339,14 +340,16 @@ def _dynamics(
     for i in range(n):
         parent = links.parents[i]
         if parent < 0:
-            turns[i], places[i], points[i] = links.turns[i], links.offsets[i], links.offsets[i]
-            rises[i] = -gravity
+            copy_rows(links.turns[i], turns[i])
+            _put(places[i], vector(links.offsets[i]))
+            _put(points[i], vector(links.offsets[i]))
+            _put(rises[i], scaled(-1.0, vector(gravity)))
         else:
-            turns[i] = _product(turns[parent], links.turns[i])
-            places[i] = places[parent]
-            _add(places[i], applied(turns[parent], vector(links.offsets[i])))
-            points[i], spins[i], speeds[i] = points[parent], spins[parent], speeds[parent]
-            growths[i], rises[i] = growths[parent], rises[parent]
+            copy_rows(_product(turns[parent], links.turns[i]), turns[i])
+            offset = applied(turns[parent], vector(links.offsets[i]))
+            _put(places[i], plus(vector(places[parent]), offset))
+            for inherited in (points, spins, speeds, growths, rises):
+                _put(inherited[i], vector(inherited[parent]))
         for joint in range(links.joints[i, 0], links.joints[i, 1]):
             _move(i, joint, state, joints, turns, places, points, directions, levers)
             dof, start, kind = joints.dofs[joint], joints.starts[joint], joints.kinds[joint]
@@ -380,11 +383,13 @@ def _move(
     """Let a joint move the frame of body i, and write down its axes about the point of the tree."""
     start, dof, kind = joints.starts[joint], joints.dofs[joint], joints.kinds[joint]
     if kind == FREE:
-        places[i] = points[i] = state[start : start + 3]
+        place = vector(state[start : start + 3])
+        _put(places[i], place)
+        _put(points[i], place)
         rotation_kernel(state[start + 3 : start + 7], turns[i])
         for k in range(3):
             levers[dof + k, k] = 1.0
-            directions[dof + 3 + k] = turns[i, :, k]
+            _put(directions[dof + 3 + k], vector(turns[i, :, k]))
         return
     anchor = applied(turns[i], vector(joints.anchors[joint]))
     hold = plus(vector(places[i]), anchor)
@@ -401,9 +406,9 @@ def _move(
     else:
         own = np.empty((3, 3))
         rotation_kernel(state[start : start + 4], own)
-        turns[i] = _product(turns[i], own)
+        copy_rows(_product(turns[i], own), turns[i])
         for k in range(3):
-            directions[dof + k] = turns[i, :, k]
+            _put(directions[dof + k], vector(turns[i, :, k]))
     for k in range(1 if kind == HINGE else 3):
         arm = minus(hold, vector(points[i]))
         _put(levers[dof + k], cross(arm, vector(directions[dof + k])))
@@ -444,15 +449,15 @@ def _gathered(
         for j in range(3):
             for k in range(3):
                 own[j, k] += mass * ((square if j == k else 0.0) - center[j] * center[k])
-        inertias[i] = own
+        copy_rows(own, inertias[i])
     for i in range(n - 1, -1, -1):
         parent = links.parents[i]
         if parent >= 0:
             masses[parent] += masses[i]
-            moments[parent] += moments[i]
-            inertias[parent] += inertias[i]
-            pushes[parent] += pushes[i]
-            torques[parent] += torques[i]
+            for part in (moments, pushes, torques):
+                _add(part[parent], vector(part[i]))
+            for k in range(3):
+                _add(inertias[parent, k], vector(inertias[i, k]))
     matrix, bias = np.zeros((n_dofs, n_dofs)), np.empty(n_dofs)
     for dof in range(n_dofs):
         i, axis, lever = links.owners[dof], vector(directions[dof]), vector(levers[dof])

@@ -143,9 +143,11 @@ def pressing(joints: Floats, height: float, forces: Floats) -> Floats:
     out, here, there, moved = np.empty(9), np.empty(9), np.empty(9), joints.copy()
     forward_kernel(joints, height, here)
     for joint in range(3):
-        moved[joint::3] += NUDGE
+        for finger in range(N_FINGERS):
+            moved[3 * finger + joint] += NUDGE
         forward_kernel(moved, height, there)
-        moved[joint::3] = joints[joint::3]
+        for finger in range(N_FINGERS):
+            moved[3 * finger + joint] = joints[3 * finger + joint]
         for finger in range(N_FINGERS):
             i, work = 3 * finger, 0.0
             for k in range(3):

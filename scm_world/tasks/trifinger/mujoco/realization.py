@@ -187,15 +187,16 @@ def read_states(
     end = ROBOT_SIZE + BLOCK_SIZE * ((positions.shape[1] - N_JOINTS) // 7)
     wrong = -1
     for i in which:
-        position[:] = positions[i]
-        velocity[:] = velocities[i]
-        torque[:] = torques[i, :N_JOINTS]
-        read_state(position, velocity, torque, into[i, :end])
         total = 0.0
-        for value in position:
-            total += value * 0.0
-        for value in velocity:
-            total += value * 0.0
+        for k in range(len(position)):
+            position[k] = positions[i, k]
+            total += position[k] * 0.0
+        for k in range(len(velocity)):
+            velocity[k] = velocities[i, k]
+            total += velocity[k] * 0.0
+        for k in range(N_JOINTS):
+            torque[k] = torques[i, k]
+        read_state(position, velocity, torque, into[i, :end])
         if total != 0.0:  # also where it is not a number
             wrong = i
     return wrong
