@@ -9,26 +9,24 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from scm_world.errors import UnknownOption
-from scm_world.evaluation.outputs.labels import (
+from scm_world.evaluation.outputs.comparisons import (
     Comparison,
     Gaps,
     Line,
-    beside,
     causes_of,
     comparisons_of,
     counted,
-    framed,
     gaps_of,
     is_flat,
     is_fraction,
     lines_of,
-    looks_of,
     metric_words,
     protocol_words,
     scores_of,
@@ -38,17 +36,90 @@ from scm_world.evaluation.statistics import Cause, Causes, Interval
 from scm_world.output.canvas import INK, PALETTE, blank, styled
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ALPHA = 0.05
 """Effects with a corrected p-value up to this are marked."""
 BAR = 0.16  # [inches] of a bar, and of a line of text
-MOST_BARS = 60  # in a column of panels
 MOST_CAUSES = 10  # variables in a panel, unless more of them have an effect
 SURE, UNSURE = PALETTE[0], "#aab2bd"
-SIGNS: Mapping[str, str] = {"up": "▲", "down": "▼", "unclear": "?"}
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
+SIGNS: Mapping[str, str] = {"up": "▲", "down": "▼", "unclear": "?"}
+HATCHES = ("", "////", "....", "xxxx")
+MARKERS = "osD^vPX*<>ph"
+DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
+
+
+@final
+@dataclass(frozen=True)
+class Look:
+    """How a line looks: agents differ in color and marker, engines in dashes and hatches.
+
+    Attributes:
+        label: In legends.
+        line: Arguments of a line.
+        bar: Arguments of a bar.
+    """
+
+    label: str
+    line: Mapping[str, Any]
+    bar: Mapping[str, Any]
+
+
+def looks_of(lines: Sequence[Line]) -> dict[Line, Look]:
+    """Choose how all lines of a figure look."""
+    import matplotlib
+    from matplotlib.colors import to_hex
+
+    agents = list(dict.fromkeys(line.agent for line in lines))
+    engines = list(dict.fromkeys(line.engine for line in lines))
+    colors = list(PALETTE)
+    if len(agents) > len(PALETTE):
+        colors = [*map(to_hex, matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, len(agents))))]
+    found = {}
+    for line in lines:
+        a, e = agents.index(line.agent), engines.index(line.engine)
+        name = line.agent if len(engines) == 1 else f"{line.agent} on {line.engine}"
+        dashes, marker = DASHES[e % len(DASHES)], MARKERS[a % len(MARKERS)]
+        found[line] = Look(
+            textwrap.fill(name, 60),
+            {"color": colors[a], "marker": marker, "linestyle": dashes, "markersize": 5.0},
+            {"facecolor": colors[a], "edgecolor": "white", "hatch": HATCHES[e % len(HATCHES)]},
+        )
+    return found
+
+
+def _sheet(
+    width: float, height: float, title: str, note: str, handles: Sequence[Artist] = ()
+) -> Figure:
+    """Begin a figure with a title above, and legend and note below what will be drawn.
+
+    Args:
+        width: Of the figure [inches].
+        height: Of what will be drawn [inches].
+        title: Of the figure.
+        note: What the figure shows, in sentences.
+        handles: Of the legend.
+    """
+    head, notes = textwrap.wrap(title, int(8 * width)), textwrap.wrap(note, int(13 * width))
+    longest = max((len(row) for h in handles for row in str(h.get_label()).split("\n")), default=1)
+    columns = max(1, int(width / (0.8 + 0.08 * longest)))
+    rows = math.ceil(len(handles) / columns)
+    around = 0.4 + 0.2 * len(head) + 0.17 * len(notes) + 0.2 * rows
+    figure = blank(width, height + around, layout="constrained")
+    figure.suptitle("\n".join(head), size=12, weight="bold")
+    figure.legend(
+        handles=handles, title="\n".join(notes), title_fontsize=9, alignment="left", fontsize=9,
+        ncols=columns, handlelength=2.6, loc="outside lower center",
+    )  # fmt: skip
+    return figure
+
+
+def _reach(one: Interval) -> list[list[float]] | None:
+    """Return how far an interval reaches to either side, as matplotlib takes it; None without."""
+    return None if math.isnan(one.width) else [[one.value - one.low], [one.high - one.value]]
 
 
 # --- by protocol ------------------------------------------------------------------------------
@@ -69,39 +140,35 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     metric = evaluation.metric(metric)
     looks, scores = looks_of(lines_of(evaluation)), scores_of(evaluation, metric)
     words = protocol_words(evaluation)
-    across = min(len(words), math.ceil(len(words) * len(looks) / MOST_BARS))
-    figure, panels, row = _rows(words, len(looks), across, 1)
-    seen = [0.0, *(end for one in scores.values() for end in one.ends)]
-    seen += [1.0] if is_fraction(metric) else []
-    room = 0.06 * ((max(seen) - min(seen)) or 1.0)
-    for ax, protocols in panels:
-        ax.set_xlim(min(seen) - room * (min(seen) < 0.0), max(seen) + 2.5 * room)
-        ax.set_xlabel(metric_words(metric))
-        for x in (0.0, 1.0) if is_fraction(metric) else (0.0,):
-            ax.axvline(x, color=INK, lw=0.9, zorder=1.5, gid=f"line {x:g}")
-        for place, protocol in enumerate(protocols):
-            for number, (line, look) in enumerate(looks.items()):
-                y = place + (number - (len(looks) - 1) / 2) * BAR / row
-                one = scores.get((line, protocol))
-                if one is None:
-                    ax.text(0.0, y, " –", va="center_baseline", size=7)
-                    continue
-                gid = f"{line.agent}|{line.engine}|{protocol}"
-                ax.barh(y, one.value, 0.9 * BAR / row, gid=gid, **look.bar)
-                if not math.isnan(one.width):
-                    for color, wide in (("white", 2.4), (INK, 1.1)):  # it is seen on black, too
-                        ax.hlines(
-                            y, one.low, one.high, gid=f"{color} interval {gid}", zorder=3,
-                            color=color, lw=wide,
-                        )  # fmt: skip
-                end = max(0.0, *one.ends)
-                beside(ax, end, y, _number(one.value), size=7, bbox=PAPER)
-    return framed(
-        figure,
+    row, height = _row(words, len(looks))
+    figure = _sheet(
+        6.6,
+        height,
         f"{evaluation.task}: {metric_words(metric)}",
         f"Means of {counted(evaluation)}, with 95 % intervals.",
         [Patch(label=look.label, **look.bar) for look in looks.values()],
     )
+    ax = figure.add_subplot()
+    _protocol_axis(ax, words)
+    seen = [0.0, *(end for one in scores.values() for end in one.ends)]
+    seen += [1.0] if is_fraction(metric) else []
+    room = 0.06 * ((max(seen) - min(seen)) or 1.0)
+    ax.set_xlim(min(seen) - 2.5 * room * (min(seen) < 0.0), max(seen) + 2.5 * room)
+    ax.set_xlabel(metric_words(metric))
+    for x in (0.0, 1.0) if is_fraction(metric) else (0.0,):
+        ax.axvline(x, color=INK, lw=0.9, zorder=1.5, gid=f"line {x:g}")
+    for place, protocol in enumerate(words):
+        for number, (line, look) in enumerate(looks.items()):
+            y = place + (number - (len(looks) - 1) / 2) * BAR / row
+            one = scores.get((line, protocol))
+            if one is None:
+                ax.text(0.0, y, " –", va="center_baseline", size=7)
+                continue
+            gid = f"{line.agent}|{line.engine}|{protocol}"
+            bar = ax.barh(y, one.value, 0.9 * BAR / row, gid=gid, xerr=_reach(one),
+                          error_kw={"ecolor": INK, "elinewidth": 1.1}, **look.bar)  # fmt: skip
+            ax.bar_label(bar, [_number(one.value)], padding=3, size=7, bbox=PAPER)
+    return figure
 
 
 @styled
@@ -121,68 +188,59 @@ def gap_figure(
     metric = evaluation.metric(metric)
     gaps = gaps_of(evaluation, metric) if gaps is None else gaps
     pairs, words = list(combinations(evaluation.engines, 2)), protocol_words(evaluation)
-    agents = [Line(agent, "") for agent in evaluation.agents]
     looks = {
         line.agent: {**look.line, "linestyle": "none", "label": look.label}
-        for line, look in looks_of(agents).items()
+        for line, look in looks_of([Line(agent, "") for agent in evaluation.agents]).items()
     }
-    figure, panels, row = _rows(words, len(agents), 1, len(pairs))
-    reach = 1.15 * max([abs(end) for one in gaps.values() for end in one.ends], default=0.0) or 1.0
-    for pair, (ax, protocols) in zip(pairs, panels, strict=True):
-        ax.axvline(0.0, color=INK, lw=0.9, zorder=1.5)
-        ax.set_xlim(-reach, reach)
-        ax.set_xlabel(f"{pair[0]} minus {pair[1]}")
-        for place, protocol in enumerate(protocols):
-            for number, (agent, style) in enumerate(looks.items()):
-                y = place + (number - (len(looks) - 1) / 2) * BAR / row
-                if (one := gaps.get((*pair, agent, protocol))) is not None:
-                    _point(ax, one, y, f"{agent}|{protocol}", **style)
-    return framed(
-        figure,
+    row, height = _row(words, len(looks))
+    figure = _sheet(
+        4.2 * len(pairs) + 2.4,
+        height,
         f"{evaluation.task}: gap between engines, {metric_words(metric)}",
         f"Paired differences of the same episodes, with 95 % intervals; {counted(evaluation)}. "
         "Where an interval excludes 0, the engine makes a difference.",
         [Line2D([], [], **style) for style in looks.values()],
     )
+    reach = 1.15 * max([abs(end) for one in gaps.values() for end in one.ends], default=0.0) or 1.0
+    axes = figure.subplots(1, len(pairs), squeeze=False, sharey=True)[0]
+    for pair, ax in zip(pairs, axes, strict=True):
+        _protocol_axis(ax, words)
+        ax.axvline(0.0, color=INK, lw=0.9, zorder=1.5)
+        ax.set_xlim(-reach, reach)
+        ax.set_xlabel(f"{pair[0]} minus {pair[1]}")
+        for place, protocol in enumerate(words):
+            for number, (agent, style) in enumerate(looks.items()):
+                y = place + (number - (len(looks) - 1) / 2) * BAR / row
+                if (one := gaps.get((*pair, agent, protocol))) is not None:
+                    point = ax.errorbar(one.value, y, xerr=_reach(one), **style)
+                    point.lines[0].set_gid(f"{agent}|{protocol}")
+    return figure
 
 
-def _rows(
-    words: Mapping[str, str], count: int, across: int, repeat: int
-) -> tuple[Figure, list[tuple[Axes, list[str]]], float]:
-    """Make panels with a row for each protocol.
+def _row(words: Mapping[str, str], count: int) -> tuple[float, float]:
+    """Return the heights of a row and of all rows [inches]: one for each protocol.
 
     Args:
         words: What varies, by protocol.
         count: Bars or points of a protocol.
-        across: In how many panels side by side protocols are parted.
-        repeat: How many such panels there are.
-
-    Returns:
-        The figure; panels with their protocols, that of number i at y = i; height of a row
-        [inches].
     """
-    labels = {p: "\n".join([*textwrap.wrap(p, 36), *textwrap.wrap(doc, 36)])
-              for p, doc in words.items()}  # fmt: skip
-    each = math.ceil(len(words) / across)
-    parts = [list(words)[i : i + each] for i in range(0, len(words), each)]
-    lines = max(label.count("\n") + 1 for label in labels.values())
+    lines = max(label.count("\n") + 1 for label in _labels(words))
     row = max(count, lines) * BAR + 0.12
-    size = (4.2 * max(len(parts), repeat) + 2.4, each * row + 0.5)
-    figure = blank(*size, layout="constrained")
-    axes = figure.subplots(1, len(parts) * repeat, squeeze=False, sharey=repeat > 1)[0]
-    for ax, part in zip(axes, parts * repeat, strict=True):
-        ax.set_yticks(range(len(part)), [labels[protocol] for protocol in part])
-        ax.set_ylim(each - 0.5, -0.5)
-        ax.grid(visible=False, axis="y")
-        for edge in range(1, len(part)):
-            ax.axhline(edge - 0.5, color="#e6e9ee", lw=0.8, zorder=0.5)
-    return figure, list(zip(axes, parts * repeat, strict=True)), row
+    return row, row * len(words) + 0.5
 
 
-def _point(ax: Axes, one: Interval, y: float, gid: str, **style: Any) -> None:
-    ax.plot([one.value], [y], gid=gid, clip_on=False, zorder=3, **style)
-    if not math.isnan(one.width):
-        ax.hlines(y, one.low, one.high, color=style["color"], lw=1.5, clip_on=False)
+def _labels(words: Mapping[str, str]) -> list[str]:
+    return ["\n".join([*textwrap.wrap(protocol, 36), *textwrap.wrap(doc, 36)])
+            for protocol, doc in words.items()]  # fmt: skip
+
+
+def _protocol_axis(ax: Axes, words: Mapping[str, str]) -> None:
+    """Let protocol of number i be at y = i, the first one above."""
+    ax.set_yticks(range(len(words)), _labels(words))
+    ax.set_ylim(len(words) - 0.5, -0.5)
+    ax.grid(visible=False, axis="y")
+    for edge in range(1, len(words)):
+        ax.axhline(edge - 0.5, color="#e6e9ee", lw=0.8, zorder=0.5)
 
 
 def _number(value: float) -> str:
@@ -215,49 +273,48 @@ def profile_figure(
     found = comparisons_of(evaluation, metric) if found is None else found
     looks = looks_of(lines_of(evaluation))
     most = max(len(one.better) for one in found.values())
-    size = (13.0 if most else 6.2, len(found) * max(4.2, 0.3 * most + 0.6))
-    figure = blank(*size, layout="constrained")
-    axes = figure.subplots(len(found), 2 if most else 1, squeeze=False)
-    for (engine, one), row in zip(found.items(), axes, strict=True):
-        _profiles(row[0], one, {a: looks[Line(a, engine)].line for a in one.profiles})
-        row[0].set_xlabel(f"threshold of the {metric_words(metric)}")
-        row[0].set_title(f"on {engine}" if len(found) > 1 else "", loc="left", weight="bold")
-        if one.better:
-            _improvement(row[1], one)
     unit = {"runs": "a run", "episodes": "an episode"}
     over = " and ".join(sorted({f"of {unit[one.over]} in a protocol" for one in found.values()}))
     note = f"Left: share of the scores {over} that are higher; bands are 95 % intervals."
     if most:
         note += " Right: probability that the first agent scores higher, a tie counts half."
-    handles = [Line2D([], [], label=look.label, **look.line) for look in looks.values()]
-    return framed(figure, f"{evaluation.task}: {metric_words(metric)}", note, handles)
-
-
-def _profiles(ax: Axes, found: Comparison, styles: Mapping[str, Mapping[str, Any]]) -> None:
-    for agent, one in found.profiles.items():
-        style = {**styles[agent], "markevery": 0.12, "markersize": 4.0}
-        ax.plot(one.thresholds, one.share, drawstyle="steps-post", gid=agent, **style)
-        band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {agent}"}
-        ax.fill_between(one.thresholds, one.low, one.high, step="post", **band)
-    ax.set_ylim(-0.03, 1.03)
-    ax.set_ylabel("share of scores above it")
-    ax.set_box_aspect(0.65)
-    ax.set_anchor("N")
-
-
-def _improvement(ax: Axes, found: Comparison) -> None:
-    ax.axvline(0.5, color=INK, lw=0.9, zorder=1.5)
-    ax.set_xlim(0.0, 1.0)
-    ax.set_xlabel("probability that the first one scores higher")
-    ax.set_yticks(
-        range(len(found.better)), [textwrap.fill(" > ".join(pair), 40) for pair in found.better]
+    figure = _sheet(
+        13.0 if most else 6.2,
+        len(found) * max(4.2, 0.36 * most + 0.6),
+        f"{evaluation.task}: {metric_words(metric)}",
+        note,
+        [Line2D([], [], label=look.label, **look.line) for look in looks.values()],
     )
-    ax.set_ylim(len(found.better) - 0.5, -0.5)
+    axes = figure.subplots(len(found), 2 if most else 1, squeeze=False)
+    for (engine, one), (left, *right) in zip(found.items(), axes, strict=True):
+        for agent, profile in one.profiles.items():
+            style = {**looks[Line(agent, engine)].line, "markevery": 0.12, "markersize": 4.0}
+            at, gid = profile.thresholds, f"band {agent}"
+            left.plot(at, profile.share, drawstyle="steps-post", gid=agent, **style)
+            left.fill_between(at, profile.low, profile.high, step="post", color=style["color"],
+                              alpha=0.16, lw=0, gid=gid)  # fmt: skip
+        left.set_ylim(-0.03, 1.03)
+        left.set_ylabel("share of scores above it")
+        left.set_xlabel(f"threshold of the {metric_words(metric)}")
+        left.set_title(f"on {engine}" if len(found) > 1 else "", loc="left", weight="bold")
+        if one.better:
+            _improvement(right[0], one.better)
+    return figure
+
+
+def _improvement(ax: Axes, better: Mapping[tuple[str, str], Interval]) -> None:
+    """Draw the probability that the first of a pair of agents scores higher."""
+    ax.axvline(0.5, color=INK, lw=0.9, zorder=1.5)
+    ax.set_xlim(-0.02, 1.02)
+    ax.set_xlabel("probability that the first one scores higher")
+    names = [f"{textwrap.fill(' > '.join(pair), 40)}\n{one}" for pair, one in better.items()]
+    ax.set_yticks(range(len(better)), names)
+    ax.set_ylim(len(better) - 0.5, -0.5)
     ax.grid(visible=False, axis="y")
-    for y, (pair, one) in enumerate(found.better.items()):
+    for y, (pair, one) in enumerate(better.items()):
         color = SURE if one.excludes(0.5) else "#6b7686"
-        _point(ax, one, y, " > ".join(pair), color=color, marker="o", linestyle="none")
-        beside(ax, 1.0, y, str(one))
+        point = ax.errorbar(one.value, y, xerr=_reach(one), color=color, marker="o")
+        point.lines[0].set_gid(" > ".join(pair))
 
 
 # --- causes -----------------------------------------------------------------------------------
@@ -274,10 +331,10 @@ def causes_figure(
     """Draw what each varied variable does to the score, the strongest one above.
 
     A bar is the share of the score's variance that a variable explains, with its 95 % interval. It
-    is blue with a star if the effect is significant (Holm p at most 0.05 within the protocol). To
-    its right stands how much higher the score is in the upper third of the drawn values than in the
-    lower third: ▲ if it rises, ▼ if it falls. Agent and engine need not be named if there is only
-    one; ``found`` are effects by protocol that are known already.
+    is blue with a star if the effect is significant (Holm p at most 0.05 within the protocol).
+    Below the name stands how much higher the score is in the upper third of the drawn values than
+    in the lower third: ▲ if it rises, ▼ if it falls. Agent and engine need not be named if there
+    is only one; ``found`` are effects by protocol that are known already.
 
     Raises:
         UnknownOption: There is no such agent, engine or metric, or it has to be named.
@@ -288,8 +345,8 @@ def causes_figure(
     words = protocol_words(evaluation)
     note = (
         "Share of the score's variance that a variable explains, with 95 % intervals. Blue with a "
-        "star: it has an effect (Holm p ≤ 0.05). Right: mean score with high values minus that "
-        "with low ones, ▲ it rises, ▼ it falls with the value, ? unclear."
+        "star: it has an effect (Holm p ≤ 0.05). Below the name: mean score with high values minus "
+        "that with low ones, ▲ it rises, ▼ it falls with the value, ? unclear."
     )
     panels: dict[str, tuple[Sequence[Cause], str]] = {}
     for protocol, one in found.items():
@@ -303,37 +360,32 @@ def causes_figure(
     across = 2 if len(panels) > 1 else 1
     parts = [list(panels)[i : i + across] for i in range(0, len(panels), across)]
     rows = [max(len(panels[name][0]) for name in part) for part in parts]
-    height = sum(0.3 * n + 1.0 for n in rows) or 0.1
-    figure = blank(6.6 * across, height, layout="constrained")
+    title = f"{evaluation.task}: what the {metric_words(metric)} of {agent} on {engine} depends on"
+    figure = _sheet(6.6 * across, sum(0.4 * n + 1.1 for n in rows), title, note)
     grid = figure.add_gridspec(len(parts) or 1, across, height_ratios=rows or [1])
     for number, (name, (causes, rest)) in enumerate(panels.items()):
         ax = figure.add_subplot(grid[divmod(number, across)])
-        _causes(ax, causes, rows[number // across], name)
-        ax.set_title(
-            textwrap.fill(f"{name}: {words[name]}".removesuffix(": "), 70),
-            loc="left",
-            weight="bold",
-        )
+        head = textwrap.fill(f"{name}: {words[name]}".removesuffix(": "), 70)
+        ax.set_title(head, loc="left", weight="bold")
         ax.set_xlabel("\n".join(["share of variance", *textwrap.wrap(rest, 90)]))
-    said = metric_words(metric)
-    title = f"{evaluation.task}: what the {said} of {agent} on {engine} depends on"
-    return framed(figure, title, note, ())
+        ax.set_xlim(0.0, 1.02)
+        ax.set_ylim(rows[number // across] - 0.5, -0.5)
+        ax.set_yticks(range(len(causes)), [_effect(cause) for cause in causes])
+        ax.grid(visible=False, axis="y")
+        for y, cause in enumerate(causes):
+            color = SURE if cause.p_holm <= ALPHA else UNSURE
+            gid, whisker = f"{name}|{cause.variable}", {"ecolor": INK, "elinewidth": 1.0}
+            ax.barh(y, cause.share.value, 0.6, color=color, gid=gid, xerr=_reach(cause.share),
+                    error_kw=whisker)  # fmt: skip
+    return figure
 
 
-def _causes(ax: Axes, causes: Sequence[Cause], rows: int, protocol: str) -> None:
-    ax.set_xlim(0.0, 1.0)
-    ax.set_yticks(range(len(causes)), [textwrap.fill(cause.variable, 34) for cause in causes])
-    ax.set_ylim(rows - 0.5, -0.5)
-    ax.grid(visible=False, axis="y")
-    for y, cause in enumerate(causes):
-        sure = cause.p_holm <= ALPHA
-        gid = f"{protocol}|{cause.variable}"
-        ax.barh(y, cause.share.value, 0.6, color=SURE if sure else UNSURE, gid=gid)
-        ax.hlines(y, cause.share.low, cause.share.high, color=INK, lw=1.0, clip_on=False)
-        column = cause.column
-        text = f"{SIGNS[column.direction]} {column.contrast.value:+z.2f} "
-        text = (text + column.name.removeprefix(cause.variable)).rstrip() + (" *" if sure else "")
-        beside(ax, 1.0, y, text, weight="bold" if sure else "normal")
+def _effect(cause: Cause) -> str:
+    """Return the name of a variable, and below it what its values do to the score."""
+    column, star = cause.column, " *" if cause.p_holm <= ALPHA else ""
+    part = column.name.removeprefix(cause.variable)
+    text = f"{SIGNS[column.direction]} {column.contrast.value:+z.2f} {part}".rstrip() + star
+    return f"{textwrap.fill(cause.variable, 34)}\n{text}"
 
 
 def _rest(found: Causes, shown: Sequence[Cause]) -> str:
@@ -369,15 +421,20 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     seen = [end for one in scores.values() for end in one.ends]
     low, high = min(seen), max(seen)
     room = 0.05 * ((high - low) or 1.0)
-    fraction = is_fraction(metric)
-    limits = (min(0.0, low), max(1.0, high)) if fraction else (low - room, high + room)
-    figure = blank(*[max(5.0, 0.25 * len(words))] * 2)
-    ax: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="polar")
+    note = f"Means of {counted(evaluation)}; bands are 95 % intervals. "
+    note += "; ".join(f"{name}: {doc}" for name, doc in words.items() if doc)
+    size = max(7.0, 0.3 * len(words))
+    figure = _sheet(
+        size, size, f"{evaluation.task}: {metric_words(metric)}", note,
+        [Line2D([], [], label=look.label, **look.line) for look in looks.values()],
+    )  # fmt: skip
+    ax: Any = figure.add_subplot(projection="polar")
     turns = np.linspace(0.0, 2.0 * np.pi, len(words) + 1)
     ax.set_theta_zero_location("N")
     ax.set_theta_direction(-1)
     ax.set_xticks(turns[:-1], [textwrap.fill(name, 16) for name in words], weight="bold")
-    ax.set_ylim(*limits)
+    fraction = is_fraction(metric)
+    ax.set_ylim(min(0.0, low) if fraction else low - room, max(1.0, high) if fraction else high)
     ax.set_rlabel_position(180.0 / len(words))
     ax.tick_params(axis="x", pad=12)
     ax.tick_params(axis="y", labelsize=7)
@@ -389,8 +446,4 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
         lows, highs = ([f(one.ends) for one in known] for f in (min, max))
         band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {gid}"}
         ax.fill_between(turns, lows, highs, **band)
-    note = f"Means of {counted(evaluation)}; bands are 95 % intervals. "
-    note += "; ".join(f"{name}: {doc}" for name, doc in words.items() if doc)
-    handles = [Line2D([], [], label=look.label, **look.line) for look in looks.values()]
-    beyond = 0.4 + 0.15 * max(len(textwrap.wrap(name, 16)) for name in words)
-    return framed(figure, f"{evaluation.task}: {metric_words(metric)}", note, handles, beyond)
+    return figure

@@ -11,15 +11,7 @@ from urllib.parse import quote
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.checking import shard_runner_of
 from scm_world.evaluation.files import summarized
-from scm_world.evaluation.outputs.figures import (
-    ALPHA,
-    bars_figure,
-    causes_figure,
-    gap_figure,
-    profile_figure,
-    radar_figure,
-)
-from scm_world.evaluation.outputs.labels import (
+from scm_world.evaluation.outputs.comparisons import (
     Line,
     best,
     causes_of,
@@ -31,6 +23,14 @@ from scm_world.evaluation.outputs.labels import (
     lines_of,
     metric_words,
     protocol_words,
+)
+from scm_world.evaluation.outputs.figures import (
+    ALPHA,
+    bars_figure,
+    causes_figure,
+    gap_figure,
+    profile_figure,
+    radar_figure,
 )
 from scm_world.evaluation.outputs.videos import record_videos
 from scm_world.evaluation.results import Evaluation

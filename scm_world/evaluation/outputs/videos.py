@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import load
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import SnapshotMismatch
-from scm_world.evaluation.outputs.labels import metric_words, protocol_words
+from scm_world.evaluation.outputs.comparisons import metric_words, protocol_words
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.results import KEYS, Evaluation
 from scm_world.models.camera import Camera
