@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, final
 
 import numpy as np
-from scipy.stats import rankdata
 
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Dataset
@@ -314,6 +313,8 @@ def auroc(edge_scores: Floats, present: Bools) -> float | None:
     negatives = len(present) - positives
     if not positives or not negatives:
         return None
+    from scipy.stats import rankdata  # takes a third of a second
+
     above = rankdata(edge_scores)[present].sum() - positives * (positives + 1) / 2.0
     return float(above / (positives * negatives))
 

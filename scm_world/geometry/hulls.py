@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
@@ -215,6 +214,8 @@ def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:
     thickness = np.linalg.svd((cloud - middle) / extent, compute_uv=False)
     if thickness[2] <= THINNEST * thickness[0]:
         raise ModelError(["the points lie in one plane and have no volume"])
+    from scipy.spatial import ConvexHull, QhullError  # takes a fifth of a second
+
     try:
         wrapped = ConvexHull((cloud - middle) / extent, qhull_options=f"Qt C-{ROUGHNESS}")
     except QhullError as error:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-from scipy.special import stdtrit
 
 from scm_world._types import Floats
 from scm_world.queries.equations import Equations, System
@@ -117,6 +116,8 @@ def difference(
     Returns:
         Mean, lower and upper end, and the ratio of the variances unpaired : paired.
     """
+    from scipy.special import stdtrit
+
     n = len(treated)
     apart = treated.var(axis=0, ddof=1) + control.var(axis=0, ddof=1)
     together = (treated - control).var(axis=0, ddof=1)

@@ -9,7 +9,6 @@ from typing import Any, final
 
 import networkx as nx
 import numpy as np
-from scipy.special import stdtrit
 
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
@@ -294,6 +293,8 @@ def _standardised(
         z = (rows - middle) / scale
         pairs = [z[:, i] * z[:, j] for i in range(z.shape[1]) for j in range(i + 1)]
         return np.column_stack([np.ones(len(z)), z, *pairs])
+
+    from scipy.special import stdtrit
 
     table = design(causes)
     inverse = np.linalg.pinv(table.T @ table)

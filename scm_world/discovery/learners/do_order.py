@@ -33,8 +33,6 @@ from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, ndtri
-from scipy.stats import false_discovery_control, rankdata
 
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools, Dataset
@@ -291,6 +289,8 @@ def do_order(
                 "no earlier control steps"
             ]
         )
+    from scipy.stats import false_discovery_control  # takes a third of a second
+
     form = _Form(features, ranks, spread)
     p_values = _tested(rows, ~still & ~rows.past, causes & ~still, form)
     if still.any():  # one row of each episode: the others say the same once more
@@ -491,6 +491,8 @@ def regression_tail(explained: float, left: float, m: int, free: float) -> float
     """
     if explained <= 0.0 or free <= 0.0:
         return 1.0
+    from scipy.special import chdtrc
+
     statistic = (free + 0.5 * m - 1.0) * math.log1p(explained / max(left, SMALLEST))
     return float(chdtrc(m, statistic)) if statistic > 0.0 else 1.0
 
@@ -501,4 +503,7 @@ def normal_scores(values: Floats) -> Floats:
     Source:
         Blom, *Statistical Estimates and Transformed Beta-Variables*, 1958, for the ranks.
     """
+    from scipy.special import ndtri
+    from scipy.stats import rankdata
+
     return np.asarray(ndtri((rankdata(values) - 0.375) / (len(values) + 0.25)))
