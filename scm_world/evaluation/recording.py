@@ -30,7 +30,6 @@ from scm_world.errors import (
 from scm_world.evaluation.players import as_player
 from scm_world.evaluation.recording_files import (
     Recorded,
-    from_minari,
     from_parquet,
     header_of,
     parts,
@@ -181,7 +180,8 @@ class Recording:
         target = located(path)
         if target.suffix != ".parquet":
             target = target.with_name(target.name + ".parquet")
-        write_durably(target, to_parquet(self._header(), self.episodes))
+        header = header_of(self.environment, self.versions, self.policy, self.episodes)
+        write_durably(target, to_parquet(header, self.episodes))
         return target
 
     @classmethod
@@ -202,10 +202,14 @@ class Recording:
         except OSError as error:
             advice = "give one that a Recording was saved to"
             raise UnreadableFile(str(path), said(error), advice) from None
-        return cls._of(*from_parquet(data, str(path), trusted), trusted)
+        header, episodes = from_parquet(data, str(path), trusted)
+        about = header["environment"], tuple(episodes), header["versions"], header["policy"]
+        return cls(*about, tuple(trusted))
 
     def to_minari(self, dataset_id: str, **about: Any) -> Any:
         """Write a dataset of Minari; its ``recover_environment`` returns the environment.
+
+        It is for learners: what a bit-exact replay needs besides is in the file of ``save`` alone.
 
         Args:
             dataset_id: Such as ``"scm_world/pushing/sweep-v0"``.
@@ -228,32 +232,7 @@ class Recording:
             "algorithm_name": str((self.policy or {}).get("name", "unknown")),
             "description": f"{self!r}, recorded by scm_world.",
         }
-        return to_minari(self._header(), self.episodes, dataset_id, **{**usual, **about})
-
-    @classmethod
-    def from_minari(cls, dataset: Any, *, trusted: Sequence[str] = ()) -> Recording:
-        """Read a dataset of ``to_minari``, or a part of it.
-
-        Args:
-            dataset: A ``minari.MinariDataset``, also a filtered one, or the id of a local one.
-            trusted: Packages, besides this one, whose functions may be mechanisms.
-
-        Raises:
-            MissingExtra: Minari is not installed.
-            UnreadableFile: It is another dataset, or a damaged one.
-            ModelError: A mechanism is a function of no trusted package.
-        """
-        return cls._of(*from_minari(dataset, trusted), trusted)
-
-    @classmethod
-    def _of(
-        cls, header: Mapping[str, Any], episodes: Sequence[Recorded], trusted: Sequence[str]
-    ) -> Recording:
-        about = header["environment"], tuple(episodes), header["versions"], header["policy"]
-        return cls(*about, tuple(trusted))
-
-    def _header(self) -> str:
-        return header_of(self.environment, self.versions, self.policy, self.episodes)
+        return to_minari(self.episodes, dataset_id, **{**usual, **about})
 
 
 def _name(made_with: Mapping[str, Any]) -> str:

@@ -1,9 +1,8 @@
-"""Recorded episodes, and their Parquet files and datasets of Minari.
+"""Recorded episodes, their Parquet files, and their export to Minari.
 
 A Parquet file has a row for each instant. The last instant of an episode has an observation and a
-state, but no action and no reward. Minari keeps observations, actions, rewards and infos. All else
-that a replay needs is a header: JSON in the metadata of the file or dataset. All numbers keep their
-bits.
+state, but no action and no reward. All else that a replay needs is a header: JSON in the metadata
+of the file. All numbers keep their bits. Minari gets observations, actions, rewards and infos.
 """
 
 from __future__ import annotations
@@ -36,7 +35,6 @@ from scm_world.variables.kinds import SPACES
 
 FORMAT = "scm_world/recording/1"
 KEY = "scm_world"
-STATE = "scm_world_state"
 ONLY = ""
 """Name of an observation that has no parts."""
 
@@ -408,12 +406,12 @@ def _array(row: NDArray[Any], *shape: int) -> NDArray[Any]:
 # --- Minari -----------------------------------------------------------------------------------
 
 
-def to_minari(header: str, episodes: Sequence[Recorded], dataset_id: str, **about: Any) -> Any:
+def to_minari(episodes: Sequence[Recorded], dataset_id: str, **about: Any) -> Any:
     """Write a dataset of Minari; see ``Recording.to_minari``."""
     minari = load("minari", "minari", "minari")
     buffer = load("minari.data_collector.episode_buffer", "minari", "minari").EpisodeBuffer
-    made_with = json.loads(header)["environment"]
-    env: Any = gymnasium.make(disable_env_checker=True, **_gym_arguments(made_with))
+    arguments = _gym_arguments(as_data(episodes[0].environment))
+    env: Any = gymnasium.make(disable_env_checker=True, **arguments)
     shapes = {
         tuple((name, part.shape) for name, part in parts(observation).items())
         for episode in episodes
@@ -450,10 +448,7 @@ def to_minari(header: str, episodes: Sequence[Recorded], dataset_id: str, **abou
             rewards=episode.rewards.tolist(),
             terminations=episode.terminations.tolist(),
             truncations=episode.truncations.tolist(),
-            infos={
-                **{name: episode.infos[name].tolist() for name in names},
-                STATE: episode.states.tolist(),
-            },
+            infos={name: episode.infos[name].tolist() for name in names},
         )
         for number, (episode, observations) in enumerate(zip(episodes, seen, strict=True))
     ]
@@ -462,47 +457,13 @@ def to_minari(header: str, episodes: Sequence[Recorded], dataset_id: str, **abou
     folder = Path(load("minari.storage.local", "minari", "minari").get_dataset_path(dataset_id))
     was_there = folder.exists()
     try:
-        made = minari.create_dataset_from_buffers(dataset_id, buffers, **given)
-        made.storage.update_metadata({KEY: header})
+        return minari.create_dataset_from_buffers(dataset_id, buffers, **given)
     except BaseException:
         if not was_there and folder.exists():
             shutil.rmtree(folder)
         raise
     finally:
         env.close()
-    return made
-
-
-def from_minari(dataset: Any, trusted: Sequence[str]) -> tuple[dict[str, Any], list[Recorded]]:
-    """Read the header and the episodes of a dataset; see ``Recording.from_minari``."""
-    minari = load("minari", "minari", "minari")
-    if isinstance(dataset, str):
-        try:
-            dataset = minari.load_dataset(dataset)
-        except FileNotFoundError as error:
-            raise UnreadableFile(dataset, str(error), _ADVICE) from None
-    path = str(dataset.id)
-    header = _header(dataset.storage.metadata.get(KEY), path)
-
-    def read(held: Any) -> dict[str, Any]:
-        infos = {name: np.asarray(value) for name, value in (held.infos or {}).items()}
-        states, seen = infos.pop(STATE), held.observations
-        seen = seen if isinstance(seen, dict) else {ONLY: seen}
-        return {
-            "observations": tuple(
-                _whole({name: part[at] for name, part in seen.items()}) for at in range(len(states))
-            ),
-            "actions": held.actions,
-            **{name: getattr(held, name) for name in _STEPS.values()},
-            "infos": infos,
-            "states": states,
-        }
-
-    episodes = [
-        _episode(header, int(place), lambda held=held: read(held), path, trusted)
-        for place, held in zip(dataset.episode_indices, dataset.iterate_episodes(), strict=True)
-    ]
-    return header, episodes
 
 
 def _gym_arguments(made_with: Mapping[str, Any]) -> dict[str, Any]:
