@@ -87,7 +87,7 @@ def _as_published(variable: Variable) -> Variable:
     if variable.name == "gravity":
         a = b = None
     elif variable.name.endswith("color") and not variable.name.startswith(("robot", "stage")):
-        a, b = numbers.BRIGHT, numbers.DARK
+        a, b = numbers.COLOR.b, numbers.COLOR.a
     if a is not variable.a or b is not variable.b:
         changes = {"a": a, "b": b}
     hull = _hull(variable.shape, a, b)

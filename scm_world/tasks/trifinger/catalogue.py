@@ -1,4 +1,4 @@
-"""The ranges, bounds and defaults of the benchmark, as numbers only.
+"""The ranges, bounds and defaults of the benchmark.
 
 Source:
     Ahmed et al., *CausalWorld: A Robotic Manipulation Benchmark for Causal Structure and
@@ -8,17 +8,46 @@ Source:
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any, Literal, final
 
+from scm_world.variables import Derived, Exogenous, Function
 from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations
 
+
+@final
+@dataclass(frozen=True)
+class Range:
+    """What variables of one kind have in common.
+
+    Attributes:
+        bounds: What is physically possible.
+        a: The training space.
+        b: The held-out space.
+        unit: Of each number.
+        shape: Of the value.
+        dtype: Of the value.
+    """
+
+    bounds: Any
+    a: Any
+    b: Any
+    unit: str = "1"
+    shape: tuple[int, ...] = ()
+    dtype: Literal["real", "integer", "categorical"] = "real"
+
+    def root(self, name: str, default: Any, doc: str) -> Exogenous:
+        """Declare an exogenous variable of this kind."""
+        return Exogenous(name=name, default=default, doc=doc, **vars(self))
+
+    def derived(
+        self, name: str, parents: tuple[str, ...], mechanism: Function, doc: str
+    ) -> Derived:
+        """Declare a derived variable of this kind."""
+        return Derived(name=name, parents=parents, mechanism=mechanism, doc=doc, **vars(self))
+
+
 # --- what is physically possible -----------------------------------------------------------------
-COLOR_BOUNDS = Box(0.0, 1.0)
-FRICTION_BOUNDS = Box(0.0, 2.0)
-BLOCK_MASS_BOUNDS = Box(0.001, 2.0)  # [kg]
-LINK_MASS_BOUNDS = Box(0.005, 5.0)  # [kg]
-SIZE_BOUNDS = Box(0.02, 0.2)  # [m]
-GRAVITY_BOUNDS = Box(-30.0, 30.0)  # [m/s²]
-ROBOT_HEIGHT_BOUNDS = Box(0.2, 0.6)  # [m]
 POSITION_BOUNDS = Box((-0.24, -0.24, 0.0), (0.24, 0.24, 0.5))  # [m]
 POLAR_BOUNDS = Box((0.0, -math.pi), (0.24, math.pi))  # [m, rad]
 QUATERNION_BOUNDS = Rotations()
@@ -27,36 +56,13 @@ ANGULAR_VELOCITY_BOUNDS = Box(-100.0, 100.0)  # [rad/s]
 JOINT_BOUNDS = Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3)
 """The stops at a quarter and half a turn, and 0.1 rad that a joint may press into them [rad]."""
 JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
-CONTROL_INDEX_BOUNDS = Integers(0, 10**9)
 OBSTACLE_SIZE_BOUNDS = Box(0.005, 0.6)  # [m]
-RESTITUTION_BOUNDS = Box(0.0, 0.8)
-SPINNING_BOUNDS = Box(0.0, 0.1)
-DAMPING_BOUNDS = Box(0.0, 0.5)  # [N m s/rad]
-POSITION_GAIN_BOUNDS = Box(0.0, 50.0)  # [N m/rad]
-TORQUE_BOUNDS = Box(0.05, 1.0)  # [N m]
-NOISE_BOUNDS = Box(0.0, 1.0)
-PRESET_BOUNDS = Categories((0, 1))
-SIDE_BOUNDS = Categories((0, 1))
 TYPE_BOUNDS = Categories((1, 2, 10, 20, 21, 23))
 
 # --- training space A and held-out space B ---------------------------------
 JOINTS_A = Box((-1.57, -1.2, -3.0) * 3, (-0.69, 0.0, 0.0) * 3)
 JOINTS_B = Box((-0.69, 0.0, 0.0) * 3, (1.0, 1.57, 3.0) * 3)
-SIZE_A = Box(0.055, 0.075)
-SIZE_B = Box(0.075, 0.095)
-MASS_A = Box(0.015, 0.045)
-MASS_B = Box(0.045, 0.100)
-FRICTION_A = Box(0.3, 0.6)
-FRICTION_B = Box(0.6, 0.8)
-BLOCK_FRICTION_A = Box(0.6, 1.0)
-BLOCK_FRICTION_B = Box(1.0, 1.4)
-ROBOT_HEIGHT_A = Box(0.33, 0.35)
-ROBOT_HEIGHT_B = Box(0.35, 0.36)
-DARK = Box(0.0, 0.5)
-BRIGHT = Box(0.5, 1.0)
 YAW = Box((0.0, 0.0, -math.pi), (0.0, 0.0, math.pi))  # a rotation about z, as a rotation vector
-GRAVITY_A = Box((0.0, 0.0, -10.0), (0.0, 0.0, -7.0))  # the paper; its code has no space
-GRAVITY_B = Box((0.0, 0.0, -7.0), (0.0, 0.0, -4.0))
 
 RADIUS_A = (0.0, 0.11)  # [m]
 RADIUS_B = (0.11, 0.15)  # [m]
@@ -83,56 +89,57 @@ def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
 
 # --- goal families whose blocks follow from a few numbers -----------------------------------------
 PART_SIZE_BOUNDS = Box(0.005, 0.3)  # [m] edges of a block that is a part of something
-BLOCKS_MASS_A = Box(0.02, 0.06)  # [kg]
-BLOCKS_MASS_B = Box(0.06, 0.08)
 BLOCKS_MASS = 0.08  # [kg]
-
-TOWER_COUNT_BOUNDS = Integers(1, 6)
-TOWER_COUNT_A = Integers(1, 4)
-TOWER_COUNT_B = Integers(4, 6)
-TOWER_DIMS_BOUNDS = Box(0.02, 0.24)  # [m]
-TOWER_DIMS_A = Box(0.08, 0.12)
-TOWER_DIMS_B = Box(0.12, 0.20)
-TOWER_CENTER_BOUNDS = Box(-0.15, 0.15)  # [m]
-TOWER_CENTER_A = Box(-0.1, 0.05)
-TOWER_CENTER_B = Box(0.05, 0.1)
-
-STACK_LEVELS_BOUNDS = Integers(1, 10)
-STACK_LEVELS_A = Integers(1, 5)
-STACK_LEVELS_B = Integers(6, 8)
-CREATIVE_LEVELS_A = Integers(3, 5)
-MIN_SIZE_BOUNDS = Box(0.02, 0.1)  # [m]
-MIN_SIZE_A = Box(0.035, 0.065)
-MIN_SIZE_B = Box(0.065, 0.075)
-LEVEL_WIDTH_BOUNDS = Box(0.02, 0.3)  # [m]
-LEVEL_WIDTH_A = Box(0.035, 0.12)
-LEVEL_WIDTH_B = Box(0.12, 0.15)
-
-NUMS_OBJECTS_BOUNDS = Integers(1, 9)
-NUMS_OBJECTS_A = Integers(1, 5)
-NUMS_OBJECTS_B = Integers(6, 9)
-DROPPED_SIZE_BOUNDS = Box(0.02, 0.1)  # [m]
-DROPPED_SIZE_A = Box(0.05, 0.07)
-DROPPED_SIZE_B = Box(0.04, 0.05)
 DROP_REGION = ((-0.11, -0.11, 0.0), (0.11, 0.11, 0.22))  # [m]
 
-# --- spaces of what the predecessor hides: ours, around the defaults -----------------------------
-RESTITUTION_A = Box(0.0, 0.3)
-RESTITUTION_B = Box(0.3, 0.6)
-SPINNING_A = Box(0.0, 0.002)
-SPINNING_B = Box(0.002, 0.01)
-JOINT_DAMPING_A = Box(0.0, 0.01)  # [N m s/rad]
-JOINT_DAMPING_B = Box(0.01, 0.03)
-POSITION_GAINS_A = Box(8.0, 12.0)  # [N m/rad]
-POSITION_GAINS_B = Box(12.0, 15.0)
-VELOCITY_GAINS_A = Box((0.08, 0.24, 0.0), (0.12, 0.36, 0.002))  # [N m s/rad]
-VELOCITY_GAINS_B = Box((0.12, 0.36, 0.002), (0.2, 0.5, 0.005))
-SAFETY_DAMPING_A = Box((0.06, 0.06, 0.03), (0.1, 0.1, 0.05))  # [N m s/rad]
-SAFETY_DAMPING_B = Box((0.1, 0.1, 0.05), (0.15, 0.15, 0.08))
-TORQUE_A = Box(0.3, 0.4)  # [N m]
-TORQUE_B = Box(0.4, 0.5)
-NOISE_A = Box(0.0, 0.01)
-NOISE_B = Box(0.01, 0.05)
+# --- kinds of variables: bounds, A, B; those of what the predecessor hides are ours ---------------
+RESTITUTION = Range(Box(0.0, 0.8), Box(0.0, 0.3), Box(0.3, 0.6))
+SPINNING = Range(Box(0.0, 0.1), Box(0.0, 0.002), Box(0.002, 0.01), unit="m")
+NOISE = Range(Box(0.0, 1.0), Box(0.0, 0.01), Box(0.01, 0.05))
+ROBOT_HEIGHT = Range(Box(0.2, 0.6), Box(0.33, 0.35), Box(0.35, 0.36), unit="m")
+BLOCK_SIZES = Range(Box(0.02, 0.2), Box(0.055, 0.075), Box(0.075, 0.095), unit="m", shape=(3,))
+TOWER_COUNT = Range(Integers(1, 6), Integers(1, 4), Integers(4, 6), shape=(3,), dtype="integer")
+TOWER_DIMS = Range(Box(0.02, 0.24), Box(0.08, 0.12), Box(0.12, 0.20), unit="m", shape=(3,))
+TOWER_CENTER = Range(Box(-0.15, 0.15), Box(-0.1, 0.05), Box(0.05, 0.1), unit="m", shape=(2,))
+MIN_SIZE = Range(Box(0.02, 0.1), Box(0.035, 0.065), Box(0.065, 0.075), unit="m")
+LEVEL_WIDTH = Range(Box(0.02, 0.3), Box(0.035, 0.12), Box(0.12, 0.15), unit="m")
+NUMS_OBJECTS = Range(Integers(1, 9), Integers(1, 5), Integers(6, 9), dtype="integer")
+DROPPED_SIZE = Range(Box(0.02, 0.1), Box(0.05, 0.07), Box(0.04, 0.05), unit="m")
+COLOR = Range(Box(0.0, 1.0), Box(0.0, 0.5), Box(0.5, 1.0), shape=(3,))
+GRAVITIES = Range(  # A and B of the paper; its code has no space
+    Box(-30.0, 30.0),
+    Box((0.0, 0.0, -10.0), (0.0, 0.0, -7.0)),
+    Box((0.0, 0.0, -7.0), (0.0, 0.0, -4.0)),
+    "m/s^2",
+    (3,),
+)
+FRICTION = Range(Box(0.0, 2.0), Box(0.3, 0.6), Box(0.6, 0.8))
+BLOCK_FRICTIONS = Range(Box(0.0, 2.0), Box(0.6, 1.0), Box(1.0, 1.4))
+LINK_MASSES = Range(Box(0.005, 5.0), Box(0.015, 0.045), Box(0.045, 0.100), "kg")
+BLOCK_MASSES = Range(Box(0.001, 2.0), Box(0.015, 0.045), Box(0.045, 0.100), "kg")
+SHARED_MASSES = Range(Box(0.001, 2.0), Box(0.02, 0.06), Box(0.06, 0.08), "kg")
+JOINT_DAMPING = Range(Box(0.0, 0.5), Box(0.0, 0.01), Box(0.01, 0.03), "N m s/rad")
+POSITION_GAINS = Range(Box(0.0, 50.0), Box(8.0, 12.0), Box(12.0, 15.0), "N m/rad", (3,))
+VELOCITY_GAINS = Range(
+    Box(0.0, 0.5),
+    Box((0.08, 0.24, 0.0), (0.12, 0.36, 0.002)),
+    Box((0.12, 0.36, 0.002), (0.2, 0.5, 0.005)),
+    "N m s/rad",
+    (3,),
+)
+SAFETY_DAMPING = Range(
+    Box(0.0, 0.5),
+    Box((0.06, 0.06, 0.03), (0.1, 0.1, 0.05)),
+    Box((0.1, 0.1, 0.05), (0.15, 0.15, 0.08)),
+    "N m s/rad",
+    (3,),
+)
+TORQUE = Range(Box(0.05, 1.0), Box(0.3, 0.4), Box(0.4, 0.5), "N m")
+PRESETS = Range(Categories((0, 1)), Categories((0,)), Categories((1,)), dtype="categorical")
+_SIDE = Categories((0, 1))
+SIDES = Range(_SIDE, _SIDE, _SIDE, dtype="categorical")
+STACK_LEVELS = Range(Integers(1, 10), Integers(1, 5), Integers(6, 8), dtype="integer")
+CREATIVE_LEVELS = Range(Integers(1, 10), Integers(3, 5), Integers(6, 8), dtype="integer")
 
 # --- defaults ------------------------------------------------------------------------------
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]

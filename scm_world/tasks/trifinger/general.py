@@ -157,9 +157,9 @@ class General(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
-        self._size = checked(SIZE, tool_block_size, numbers.DROPPED_SIZE_BOUNDS)
-        self._number = checked(COUNT, nums_objects, numbers.NUMS_OBJECTS_BOUNDS)
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
+        self._size = checked(SIZE, tool_block_size, numbers.DROPPED_SIZE.bounds)
+        self._number = checked(COUNT, nums_objects, numbers.NUMS_OBJECTS.bounds)
 
     def arrange(self, values: Values) -> int:
         """Count the blocks."""
@@ -187,24 +187,8 @@ class General(Building):
     def shared(self) -> Iterable[Variable]:
         """Declare the blocks, and how they are dropped."""
         yield blocks_mass(self._mass)
-        yield Exogenous(
-            name=COUNT,
-            dtype="integer",
-            bounds=numbers.NUMS_OBJECTS_BOUNDS,
-            a=numbers.NUMS_OBJECTS_A,
-            b=numbers.NUMS_OBJECTS_B,
-            default=self._number,
-            doc="How many blocks there are.",
-        )
-        yield Exogenous(
-            name=SIZE,
-            unit="m",
-            bounds=numbers.DROPPED_SIZE_BOUNDS,
-            a=numbers.DROPPED_SIZE_A,
-            b=numbers.DROPPED_SIZE_B,
-            default=self._size,
-            doc="Edge length of every block.",
-        )
+        yield numbers.NUMS_OBJECTS.root(COUNT, self._number, "How many blocks there are.")
+        yield numbers.DROPPED_SIZE.root(SIZE, self._size, "Edge length of every block.")
         yield from _drops()
 
 

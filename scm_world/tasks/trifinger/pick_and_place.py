@@ -166,14 +166,10 @@ class PickAndPlace(OneBlock):
     def shared(self) -> Iterable[Variable]:
         """One size for both, and on which side of the wall they are."""
         yield from super().shared()
-        yield Exogenous(
-            name=SIDE,
-            dtype="categorical",
-            bounds=numbers.SIDE_BOUNDS,
-            a=numbers.SIDE_BOUNDS,
-            b=numbers.SIDE_BOUNDS,
-            default=0,
-            doc="Where the block begins: 0 is at negative y, 1 at positive y; the goal is across.",
+        yield numbers.SIDES.root(
+            SIDE,
+            0,
+            "Where the block begins: 0 is at negative y, 1 at positive y; the goal is across.",
         )
 
     def dense(self) -> Iterable[Variable]:

@@ -302,14 +302,8 @@ def blocks_mass(default: float) -> Exogenous:
     Args:
         default: Without an intervention [kg].
     """
-    return Exogenous(
-        name=MASS,
-        unit="kg",
-        bounds=numbers.BLOCK_MASS_BOUNDS,
-        a=numbers.BLOCKS_MASS_A,
-        b=numbers.BLOCKS_MASS_B,
-        default=default,
-        doc="Mass of every block, unless a block is given another one.",
+    return numbers.SHARED_MASSES.root(
+        MASS, default, "Mass of every block, unless a block is given another one."
     )
 
 

@@ -84,7 +84,7 @@ class OneBlock(Building):
                 [f"shape must be a Hull: load_hull(path) or hull_of(points); {shape!r}"]
             )
         self.shape = shape
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
         self._turns = {
             TOOL: shapes.turn_of("tool_block_orientation", tool_block_orientation, shape),
             GOAL: shapes.turn_of("goal_block_orientation", goal_block_orientation, shape),

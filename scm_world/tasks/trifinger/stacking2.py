@@ -168,8 +168,8 @@ class Stacking2(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
-        edge = checked("tool_block_size", tool_block_size, numbers.SIZE_BOUNDS)
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
+        edge = checked("tool_block_size", tool_block_size, numbers.BLOCK_SIZES.bounds)
         self._size = (edge, edge, edge)
         given = (
             (tool_block_1_position, tool_block_1_orientation),

@@ -25,7 +25,7 @@ from scm_world.tasks.trifinger.shapes import (
     part_goal,
     part_tool,
 )
-from scm_world.variables import Exogenous, Function, Variable
+from scm_world.variables import Function, Variable
 
 DIMS = "tower_dims"
 NUMBER = "number_of_blocks_in_tower"
@@ -164,11 +164,11 @@ class Towers(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        bounds = numbers.TOWER_COUNT_BOUNDS
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
+        bounds = numbers.TOWER_COUNT.bounds
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
         self._number = checked(NUMBER, number_of_blocks_in_tower, bounds, shape=(3,))
-        self._dims = checked(DIMS, tower_dims, numbers.TOWER_DIMS_BOUNDS, shape=(3,))
-        self._center = checked(CENTER, tower_center, numbers.TOWER_CENTER_BOUNDS, shape=(2,))
+        self._dims = checked(DIMS, tower_dims, numbers.TOWER_DIMS.bounds, shape=(3,))
+        self._center = checked(CENTER, tower_center, numbers.TOWER_CENTER.bounds, shape=(2,))
 
     def arrange(self, values: Values) -> Counts:
         """Count the blocks along each axis."""
@@ -199,33 +199,10 @@ class Towers(Building):
     def shared(self) -> Iterable[Variable]:
         """Declare the tower."""
         yield blocks_mass(self._mass)
-        yield Exogenous(
-            name=NUMBER,
-            shape=(3,),
-            dtype="integer",
-            bounds=numbers.TOWER_COUNT_BOUNDS,
-            a=numbers.TOWER_COUNT_A,
-            b=numbers.TOWER_COUNT_B,
-            default=self._number,
-            doc="How many blocks the tower has along x, y and z.",
+        yield numbers.TOWER_COUNT.root(
+            NUMBER, self._number, "How many blocks the tower has along x, y and z."
         )
-        yield Exogenous(
-            name=DIMS,
-            unit="m",
-            shape=(3,),
-            bounds=numbers.TOWER_DIMS_BOUNDS,
-            a=numbers.TOWER_DIMS_A,
-            b=numbers.TOWER_DIMS_B,
-            default=self._dims,
-            doc="Full edge lengths of the tower.",
-        )
-        yield Exogenous(
-            name=CENTER,
-            unit="m",
-            shape=(2,),
-            bounds=numbers.TOWER_CENTER_BOUNDS,
-            a=numbers.TOWER_CENTER_A,
-            b=numbers.TOWER_CENTER_B,
-            default=self._center,
-            doc="Where the middle of its base is, x and y.",
+        yield numbers.TOWER_DIMS.root(DIMS, self._dims, "Full edge lengths of the tower.")
+        yield numbers.TOWER_CENTER.root(
+            CENTER, self._center, "Where the middle of its base is, x and y."
         )

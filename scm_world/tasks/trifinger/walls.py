@@ -26,7 +26,7 @@ from scm_world.tasks.trifinger.shapes import (
     part_goal,
     part_tool,
 )
-from scm_world.variables import Box, Categories, Derived, Exogenous, Function, Integers, Variable
+from scm_world.variables import Box, Categories, Derived, Exogenous, Function, Variable
 from scm_world.variables.kinds import SpaceName
 
 LEVELS = "stack_levels"
@@ -88,7 +88,7 @@ class Walls(Building):
     goal_causes = (LEVELS, MASS, SIZE, WIDTH, NOISE)
     interleaved = True
     rest = hardware.RAISED
-    levels_a: ClassVar[Integers] = numbers.STACK_LEVELS_A
+    levels: ClassVar[numbers.Range] = numbers.STACK_LEVELS
 
     def __init__(
         self,
@@ -100,10 +100,10 @@ class Walls(Building):
         **common: Unpack[Common],
     ) -> None:
         super().__init__(**common)
-        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASS_BOUNDS)
-        self._size = checked(SIZE, blocks_min_size, numbers.MIN_SIZE_BOUNDS)
-        self._levels = checked("num_of_levels", num_of_levels, numbers.STACK_LEVELS_BOUNDS)
-        self._width = checked(WIDTH, max_level_width, numbers.LEVEL_WIDTH_BOUNDS)
+        self._mass = checked("tool_block_mass", tool_block_mass, numbers.BLOCK_MASSES.bounds)
+        self._size = checked(SIZE, blocks_min_size, numbers.MIN_SIZE.bounds)
+        self._levels = checked("num_of_levels", num_of_levels, numbers.STACK_LEVELS.bounds)
+        self._width = checked(WIDTH, max_level_width, numbers.LEVEL_WIDTH.bounds)
 
     def arrange(self, values: Values) -> Any:
         """Count the blocks of each level.
@@ -199,32 +199,14 @@ class Walls(Building):
 
     def _numbers(self) -> Iterable[Variable]:
         """Declare what the predecessor has too."""
-        yield Exogenous(
-            name=LEVELS,
-            dtype="integer",
-            bounds=numbers.STACK_LEVELS_BOUNDS,
-            a=self.levels_a,
-            b=numbers.STACK_LEVELS_B,
-            default=self._levels,
-            doc="How many levels the wall has, as far as they fit into the arena.",
+        yield self.levels.root(
+            LEVELS, self._levels, "How many levels the wall has, as far as they fit into the arena."
         )
-        yield Exogenous(
-            name=SIZE,
-            unit="m",
-            bounds=numbers.MIN_SIZE_BOUNDS,
-            a=numbers.MIN_SIZE_A,
-            b=numbers.MIN_SIZE_B,
-            default=self._size,
-            doc="Depth and height of every block, and the least width.",
+        yield numbers.MIN_SIZE.root(
+            SIZE, self._size, "Depth and height of every block, and the least width."
         )
-        yield Exogenous(
-            name=WIDTH,
-            unit="m",
-            bounds=numbers.LEVEL_WIDTH_BOUNDS,
-            a=numbers.LEVEL_WIDTH_A,
-            b=numbers.LEVEL_WIDTH_B,
-            default=self._width,
-            doc="Greatest width of a level; it is never narrower than a block.",
+        yield numbers.LEVEL_WIDTH.root(
+            WIDTH, self._width, "Greatest width of a level; it is never narrower than a block."
         )
 
 
@@ -290,7 +272,7 @@ class CreativeStackedBlocks(Walls):
 
     name = "creative_stacked_blocks"
     decided_by = (LAYOUT, COUNT)
-    levels_a = numbers.CREATIVE_LEVELS_A
+    levels = numbers.CREATIVE_LEVELS
 
     def __init__(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -170,13 +171,10 @@ class ToolBlock(Entity):
         yield object_type(self._v("type"), CUBOID if self._hull is None else MESH)
         yield self._size
         yield self._mass
-        yield Exogenous(
-            name=self._v("friction"),
-            bounds=numbers.FRICTION_BOUNDS,
-            a=numbers.BLOCK_FRICTION_A,
-            b=numbers.BLOCK_FRICTION_B,
-            default=numbers.BLOCK_FRICTION,
-            doc="Friction of its surface; a contact has the product of two frictions.",
+        yield numbers.BLOCK_FRICTIONS.root(
+            self._v("friction"),
+            numbers.BLOCK_FRICTION,
+            "Friction of its surface; a contact has the product of two frictions.",
         )
         yield color(self._v("color"), numbers.BLOCK_COLOR)
         yield from coordinates(self.name, a=self._a, b=self._b)
@@ -282,18 +280,11 @@ def block_size(
         default: Full edge lengths of a root [m].
         spaces: Whether it has the spaces A and B of a block.
     """
-    common: dict[str, Any] = {
-        "name": name,
-        "unit": "m",
-        "shape": (3,),
-        "bounds": numbers.SIZE_BOUNDS,
-        "a": numbers.SIZE_A if spaces else None,
-        "b": numbers.SIZE_B if spaces else None,
-        "doc": "Full edge lengths.",
-    }
+    kind = numbers.BLOCK_SIZES if spaces else replace(numbers.BLOCK_SIZES, a=None, b=None)
+    doc = "Full edge lengths."
     if size_from is None:
-        return Exogenous(default=default, **common)
-    return Derived(parents=(size_from,), mechanism=_COPY, **common)
+        return kind.root(name, default, doc)
+    return kind.derived(name, (size_from,), _COPY, doc)
 
 
 def block_mass(
@@ -306,17 +297,10 @@ def block_mass(
         mass_from: The variable that it copies.
         default: Of a root [kg].
     """
-    common: dict[str, Any] = {
-        "name": name,
-        "unit": "kg",
-        "bounds": numbers.BLOCK_MASS_BOUNDS,
-        "a": numbers.MASS_A,
-        "b": numbers.MASS_B,
-        "doc": "Mass; the inertia of the solid follows from it.",
-    }
+    kind, doc = numbers.BLOCK_MASSES, "Mass; the inertia of the solid follows from it."
     if mass_from is None:
-        return Exogenous(default=default, **common)
-    return Derived(parents=(mass_from,), mechanism=_COPY, **common)
+        return kind.root(name, default, doc)
+    return kind.derived(name, (mass_from,), _COPY, doc)
 
 
 def hull_size(name: str, size: tuple[float, float, float]) -> Fixed:
@@ -343,12 +327,4 @@ def object_type(name: str, value: int) -> Fixed:
 
 def color(name: str, default: tuple[float, float, float]) -> Exogenous:
     """Declare a color. Space A is dark and B is bright, as in the paper."""
-    return Exogenous(
-        name=name,
-        shape=(3,),
-        bounds=numbers.COLOR_BOUNDS,
-        a=numbers.DARK,
-        b=numbers.BRIGHT,
-        default=default,
-        doc="Red, green and blue; nothing physical depends on it.",
-    )
+    return numbers.COLOR.root(name, default, "Red, green and blue; nothing physical depends on it.")

@@ -58,13 +58,10 @@ class Obstacle(Entity):
             default=numbers.IDENTITY,
             doc="Orientation as a unit quaternion (x, y, z, w).",
         )
-        yield Exogenous(
-            name=self._v("friction"),
-            bounds=numbers.FRICTION_BOUNDS,
-            a=numbers.FRICTION_A,
-            b=numbers.FRICTION_B,
-            default=numbers.SURFACE_FRICTION,
-            doc="Friction of its surface; a contact has the product of two frictions.",
+        yield numbers.FRICTION.root(
+            self._v("friction"),
+            numbers.SURFACE_FRICTION,
+            "Friction of its surface; a contact has the product of two frictions.",
         )
         yield color(self._v("color"), (0.0, 0.0, 0.0))
         yield from coordinates(self.name, a=None, b=None, yaw=False)

@@ -22,7 +22,6 @@ from scm_world.tasks.trifinger.kinematics import forward_kernel, inverse_kernel,
 from scm_world.variables import (
     Action,
     Box,
-    Exogenous,
     Function,
     Measured,
     Normal,
@@ -45,40 +44,24 @@ ACTIONS = {
 _SPEC = ControllerSpec()
 
 CONTROLLER = (
-    (
-        "position_gains",
-        "N m/rad",
-        numbers.POSITION_GAIN_BOUNDS,
-        (numbers.POSITION_GAINS_A, numbers.POSITION_GAINS_B),
-        _SPEC.kp,
-        "Proportional gain of the three joints of a finger.",
+    numbers.POSITION_GAINS.root(
+        "position_gains", _SPEC.kp, "Proportional gain of the three joints of a finger."
     ),
-    (
-        "velocity_gains",
-        "N m s/rad",
-        numbers.DAMPING_BOUNDS,
-        (numbers.VELOCITY_GAINS_A, numbers.VELOCITY_GAINS_B),
-        _SPEC.kd,
-        "Derivative gain of the three joints of a finger.",
+    numbers.VELOCITY_GAINS.root(
+        "velocity_gains", _SPEC.kd, "Derivative gain of the three joints of a finger."
     ),
-    (
+    numbers.SAFETY_DAMPING.root(
         "safety_damping",
-        "N m s/rad",
-        numbers.DAMPING_BOUNDS,
-        (numbers.SAFETY_DAMPING_A, numbers.SAFETY_DAMPING_B),
         _SPEC.safety,
         "Damping of the safety filter, for the three joints of a finger.",
     ),
-    (
+    numbers.TORQUE.root(
         "torque_limit",
-        "N m",
-        numbers.TORQUE_BOUNDS,
-        (numbers.TORQUE_A, numbers.TORQUE_B),
         _SPEC.limit,
         "Largest torque of a joint. Torques that are commanded end at 0.36 N m whatever it is.",
     ),
 )
-"""The joint controller: name, unit, bounds, spaces A and B, default, sentence."""
+"""The joint controller."""
 
 
 @njit(cache=True)
@@ -238,14 +221,10 @@ class Robot(Entity):
     def variables(self) -> Iterable[Variable]:
         """Declare the action, the height, the links and the fingertips."""
         yield from self._actions()
-        yield Exogenous(
-            name="robot_height",
-            unit="m",
-            bounds=numbers.ROBOT_HEIGHT_BOUNDS,
-            a=numbers.ROBOT_HEIGHT_A,
-            b=numbers.ROBOT_HEIGHT_B,
-            default=hardware.NOMINAL_HEIGHT,
-            doc="Height of the robot's base above a plane 0.011 m below the table top.",
+        yield numbers.ROBOT_HEIGHT.root(
+            "robot_height",
+            hardware.NOMINAL_HEIGHT,
+            "Height of the robot's base above a plane 0.011 m below the table top.",
         )
         for finger in FINGERS:
             yield from self._links(finger)
@@ -309,55 +288,24 @@ class Robot(Entity):
         for index, mass in enumerate(hardware.LINK_MASS):
             link = hardware.link_name(finger, index)
             still = " It is fixed to the base, so nothing depends on it." if index == 0 else ""
-            yield Exogenous(
-                name=f"{link}.mass",
-                unit="kg",
-                bounds=numbers.LINK_MASS_BOUNDS,
-                a=numbers.MASS_A,
-                b=numbers.MASS_B,
-                default=mass,
-                doc=f"Mass of the link; its inertia scales with it.{still}",
+            yield numbers.LINK_MASSES.root(
+                f"{link}.mass", mass, f"Mass of the link; its inertia scales with it.{still}"
             )
             yield color(f"{link}.color", hardware.LINK_COLORS[finger])
 
     def _hidden(self) -> Iterable[Variable]:
         """Declare what the predecessor keeps to itself: friction, damping, control and noise."""
-        yield Exogenous(
-            name="finger_friction",
-            bounds=numbers.FRICTION_BOUNDS,
-            a=numbers.FRICTION_A,
-            b=numbers.FRICTION_B,
-            default=numbers.FINGER_FRICTION,
-            doc="Friction of all links; a contact has the product of two frictions.",
+        yield numbers.FRICTION.root(
+            "finger_friction",
+            numbers.FINGER_FRICTION,
+            "Friction of all links; a contact has the product of two frictions.",
         )
-        yield Exogenous(
-            name="joint_damping",
-            unit="N m s/rad",
-            bounds=numbers.DAMPING_BOUNDS,
-            a=numbers.JOINT_DAMPING_A,
-            b=numbers.JOINT_DAMPING_B,
-            default=0.0,
-            doc="Passive damping of every joint.",
-        )
-        for name, unit, bounds, (a, b), default, doc in CONTROLLER:
-            shape = (3,) if isinstance(default, tuple) else ()
-            yield Exogenous(
-                name=name,
-                unit=unit,
-                shape=shape,
-                bounds=bounds,
-                a=a,
-                b=b,
-                default=default,
-                doc=doc,
-            )
-        yield Exogenous(
-            name=ACTUATOR_NOISE,
-            bounds=numbers.NOISE_BOUNDS,
-            a=numbers.NOISE_A,
-            b=numbers.NOISE_B,
-            default=0.0,
-            doc="Standard deviation of a command, as a fraction of half the range of an action.",
+        yield numbers.JOINT_DAMPING.root("joint_damping", 0.0, "Passive damping of every joint.")
+        yield from CONTROLLER
+        yield numbers.NOISE.root(
+            ACTUATOR_NOISE,
+            0.0,
+            "Standard deviation of a command, as a fraction of half the range of an action.",
         )
 
     def states(self) -> Iterable[State]:
@@ -445,7 +393,7 @@ class Robot(Entity):
             for link in hardware.LINK_NAMES
             for quantity in ("mass", "color")
         }
-        control = {name: ("controller", name) for name, *_ in CONTROLLER}
+        control = {variable.name: ("controller", variable.name) for variable in CONTROLLER}
         own = {
             "robot_height": ("robot", "height"),
             "finger_friction": ("robot", "friction"),

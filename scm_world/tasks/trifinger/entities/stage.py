@@ -14,7 +14,7 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.cameras import CAMERAS, published_poses
 from scm_world.tasks.trifinger.entities.blocks import color
 from scm_world.tasks.trifinger.hardware import PRESET_NAMES
-from scm_world.variables import Box, Categories, Derived, Exogenous, Variable
+from scm_world.variables import Box, Derived, Exogenous, Variable
 from scm_world.variables.reserved import PRESET, SENSOR_NOISE
 
 
@@ -33,60 +33,36 @@ class Stage(Entity):
 
     def variables(self) -> Iterable[Variable]:
         """Declare gravity, frictions and colors."""
-        yield Exogenous(
-            name="gravity",
-            unit="m/s^2",
-            shape=(3,),
-            bounds=numbers.GRAVITY_BOUNDS,
-            a=numbers.GRAVITY_A,
-            b=numbers.GRAVITY_B,
-            default=numbers.GRAVITY,
-            doc="Acceleration of free fall; it pulls the fingers too.",
+        yield numbers.GRAVITIES.root(
+            "gravity", numbers.GRAVITY, "Acceleration of free fall; it pulls the fingers too."
         )
         for surface, what in (("floor", "the table"), ("stage", "the ring wall")):
-            yield Exogenous(
-                name=f"{surface}_friction",
-                bounds=numbers.FRICTION_BOUNDS,
-                a=numbers.FRICTION_A,
-                b=numbers.FRICTION_B,
-                default=numbers.SURFACE_FRICTION,
-                doc=f"Friction of {what}; a contact has the product of two frictions.",
+            yield numbers.FRICTION.root(
+                f"{surface}_friction",
+                numbers.SURFACE_FRICTION,
+                f"Friction of {what}; a contact has the product of two frictions.",
             )
         yield color("floor_color", numbers.FLOOR_COLOR)
         yield color("stage_color", numbers.STAGE_COLOR)
-        yield Exogenous(  # this and what follows the predecessor keeps to itself
-            name="restitution",
-            bounds=numbers.RESTITUTION_BOUNDS,
-            a=numbers.RESTITUTION_A,
-            b=numbers.RESTITUTION_B,
-            default=0.0,
-            doc="Speed after a head-on impact over speed before it, for every contact.",
+        yield numbers.RESTITUTION.root(
+            "restitution",
+            0.0,
+            "Speed after a head-on impact over speed before it, for every contact.",
         )
-        yield Exogenous(
-            name="spinning_friction",
-            unit="m",
-            bounds=numbers.SPINNING_BOUNDS,
-            a=numbers.SPINNING_A,
-            b=numbers.SPINNING_B,
-            default=numbers.SPINNING_FRICTION,
-            doc="Friction of every contact against turning about its normal.",
+        yield numbers.SPINNING.root(
+            "spinning_friction",
+            numbers.SPINNING_FRICTION,
+            "Friction of every contact against turning about its normal.",
         )
-        yield Exogenous(
-            name=PRESET,
-            dtype="categorical",
-            bounds=numbers.PRESET_BOUNDS,
-            a=Categories((0,)),
-            b=Categories((1,)),
-            default=PRESET_NAMES.index(self._preset),
-            doc="How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
+        yield numbers.PRESETS.root(
+            PRESET,
+            PRESET_NAMES.index(self._preset),
+            "How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
         )
-        yield Exogenous(
-            name=SENSOR_NOISE,
-            bounds=numbers.NOISE_BOUNDS,
-            a=numbers.NOISE_A,
-            b=numbers.NOISE_B,
-            default=0.0,
-            doc="Standard deviation of every observed number, as a fraction of half its range.",
+        yield numbers.NOISE.root(
+            SENSOR_NOISE,
+            0.0,
+            "Standard deviation of every observed number, as a fraction of half its range.",
         )
 
     def inputs(self) -> Iterable[str]:
