@@ -18,7 +18,7 @@ from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.graph import flatten
 from scm_world.queries.timed import as_act
 from scm_world.variables import Draw, Function, Intervention, Noise
-from scm_world.variables.mechanisms import OWN_MECHANISMS
+from scm_world.variables.mechanisms import check_trusted
 from scm_world.variables.spaces import Frozen
 from scm_world.world import World
 from scm_world.world.compiled_task import CompiledTask
@@ -345,12 +345,5 @@ def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str])
         made: Made = validate.model_validate({k: v for k, v in data.items() if k != "format"})
     except (ValidationError, TypeError, ValueError) as error:
         raise ModelError([f"not a {what}: {error}"]) from None
-    problems = [
-        f"it calls {function.reference!r}; pass trusted=(…) to read it"
-        for part in made.part.walk()
-        for function in part.functions()
-        if not function.is_defined_in((*OWN_MECHANISMS, *trusted))
-    ]
-    if problems:
-        raise ModelError(problems)
+    check_trusted((f for part in made.part.walk() for f in part.functions()), trusted)
     return made

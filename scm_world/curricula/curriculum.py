@@ -16,6 +16,7 @@ from scm_world.output.reading import read_text
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Subset
 from scm_world.variables.checks import check_subset
+from scm_world.variables.mechanisms import check_portable
 from scm_world.variables.spaces import Frozen
 from scm_world.world import World
 
@@ -55,15 +56,7 @@ class Curriculum(Frozen):
         Raises:
             ModelError: It calls a function that cannot be found again under its name.
         """
-        problems = [
-            f"the function {function.reference!r} cannot be found under this name; define it at "
-            "the top level of a module"
-            for part in self.part.walk()
-            for function in part.functions()
-            if not function.is_portable()
-        ]
-        if problems:
-            raise ModelError(problems)
+        check_portable(function for part in self.part.walk() for function in part.functions())
         return {"format": FORMAT, **self.model_dump(mode="json")}
 
     def to_json(self, *, indent: int | None = None) -> str:

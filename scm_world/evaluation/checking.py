@@ -32,7 +32,7 @@ from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import refuse_untrusted
 from scm_world.tasks.model import is_model
-from scm_world.variables.mechanisms import OWN_MECHANISMS
+from scm_world.variables.mechanisms import check_trusted
 
 _TASK = ("task", "arguments", "class", "model")
 """What says of an evaluation where it happened."""
@@ -178,9 +178,7 @@ def _acts(options: Any, trusted: Sequence[str]) -> Any:
         return options
     if isinstance(options.get("kind"), str):
         part = Do({"option": options})
-        for function in part.functions():
-            if not function.is_defined_in((*OWN_MECHANISMS, *trusted)):
-                raise ModelError([f"it calls {function.reference!r}; pass trusted=(…) to read it"])
+        check_trusted(part.functions(), trusted)
         return part.request["option"]
     return {name: _acts(value, trusted) for name, value in options.items()}
 

@@ -122,24 +122,41 @@ def _summary(graph: nx.MultiDiGraph) -> nx.MultiDiGraph:
     return made
 
 
-def _sliced(graph: nx.MultiDiGraph) -> nx.MultiDiGraph:
-    past = _past_of(graph)
-    roles = graph.nodes(data="role")
-    held = [name for name, role in roles if role == "parameter" and not graph.in_degree(name)]
-
-    def at(name: str, ago: int) -> str:
-        return f"{name}@{'=' if name in held else ''}-{ago}" if ago else name
-
-    made = nx.MultiDiGraph()
-    for ago in range(past + 1):
-        made.add_nodes_from((at(name, ago), data) for name, data in graph.nodes(data=True))
-    for cause, effect, lag, data in graph.edges(keys=True, data=True):
-        for ago in range(past - lag + 1):
-            made.add_edge(at(cause, ago + lag), at(effect, ago), 0, **{**data, "lag": 0})
-    for name in held:
-        made.add_edges_from(
-            (at(name, ago + 1), at(name, ago), 0, {"lag": 0}) for ago in range(past)
+def slices_of(graph: nx.MultiDiGraph, steps: int) -> nx.DiGraph:
+    """Unroll a graph of ``to_digraph``; nodes are ``(name, -steps + 1)`` to ``(name, 0)``."""
+    made = nx.DiGraph()
+    for slice_ in range(1 - steps, 1):
+        made.add_nodes_from(
+            ((name, slice_), {**data, "variable": name, "slice": slice_})
+            for name, data in graph.nodes(data=True)
         )
+        for cause, effect, lag, data in graph.edges(keys=True, data=True):
+            if slice_ - lag > -steps:
+                made.add_edge((cause, slice_ - lag), (effect, slice_), **data)
+        for name in _held(graph) if slice_ > 1 - steps else ():
+            made.add_edge((name, slice_ - 1), (name, slice_), lag=1, persists=True)
+    return made
+
+
+def _held(graph: nx.MultiDiGraph) -> list[str]:
+    """List the parameters without causes: they keep their value from one step to the next."""
+    roles = graph.nodes(data="role")
+    return [name for name, role in roles if role == "parameter" and not graph.in_degree(name)]
+
+
+def _sliced(graph: nx.MultiDiGraph) -> nx.MultiDiGraph:
+    held, past = _held(graph), _past_of(graph)
+
+    def named(node: tuple[str, int]) -> str:
+        name, slice_ = node
+        return f"{name}@{'=' if name in held else ''}{slice_}" if slice_ else name
+
+    unrolled, made = slices_of(graph, past + 1), nx.MultiDiGraph()
+    for node in sorted(unrolled, key=lambda node: -node[1]):  # the present first
+        made.add_node(named(node), **graph.nodes[node[0]])
+    for cause, effect, data in unrolled.edges(data=True):
+        when = {"when": data["when"]} if "when" in data else {}
+        made.add_edge(named(cause), named(effect), 0, lag=0, **when)
     return made
 
 

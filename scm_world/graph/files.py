@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from scm_world.errors import DAMAGED, InterventionError, ModelError
 from scm_world.graph.scm import SCM
 from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
-from scm_world.variables.mechanisms import OWN_MECHANISMS
+from scm_world.variables.mechanisms import check_portable, check_trusted
 
 FORMAT = "scm_world/model/1"
 
@@ -34,15 +34,11 @@ def _plain(data: Any) -> Any:
 
 def _functions(
     variables: Iterable[Variable], held: Mapping[str, Intervention]
-) -> Iterator[tuple[str, Function]]:
-    for name, act in held.items():
-        if isinstance(act, Mechanism) and isinstance(act.function, Function):
-            yield name, act.function
-    for variable in variables:
-        for field in ("mechanism", "inverse", "start", "carry"):
-            mechanism = getattr(variable, field, None)
-            if isinstance(mechanism, Function):
-                yield variable.name, mechanism
+) -> Iterator[Function]:
+    named: list[Any] = [act.function for act in held.values() if isinstance(act, Mechanism)]
+    for field in ("mechanism", "inverse", "start", "carry"):
+        named += [getattr(variable, field, None) for variable in variables]
+    yield from (function for function in named if isinstance(function, Function))
 
 
 def to_dict(model: SCM) -> dict[str, Any]:
@@ -51,14 +47,7 @@ def to_dict(model: SCM) -> dict[str, Any]:
     Raises:
         ModelError: A mechanism is a lambda or another function without a name of its own.
     """
-    problems = [
-        f"{name!r} has the function {function.reference!r}, which cannot be found "
-        "under this name; define it at the top level of a module"
-        for name, function in _functions(model.variables, model.interventions)
-        if not function.is_portable()
-    ]
-    if problems:
-        raise ModelError(problems)
+    check_portable(_functions(model.variables, model.interventions))
     return {
         "format": FORMAT,
         "variables": _plain(_VARIABLES.dump_python(list(model.variables), mode="json")),
@@ -89,15 +78,7 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         ) from None
     except DAMAGED as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
-    allowed = (*OWN_MECHANISMS, *trusted)
-    problems = [
-        f"{name!r} has the function {function.reference!r}, which lies outside the trusted "
-        f"packages {', '.join(allowed)}; pass trusted=(…) to read it"
-        for name, function in _functions(variables, held)
-        if not function.is_defined_in(allowed)
-    ]
-    if problems:  # before anything of theirs is imported
-        raise ModelError(problems)
+    check_trusted(_functions(variables, held), trusted)  # before anything of theirs is imported
     model = SCM(variables)
     try:
         return model.hold(held)

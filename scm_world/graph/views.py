@@ -8,6 +8,7 @@ from typing import Any
 import networkx as nx
 
 from scm_world.errors import UnknownVariable
+from scm_world.graph.exchange import slices_of, to_digraph
 from scm_world.graph.scm import SCM
 
 Node = str | tuple[str, int]
@@ -19,20 +20,7 @@ def unrolled(model: SCM, steps: int) -> nx.DiGraph:
 
     A parameter keeps its value from one step to the next: an edge with ``persists=True``.
     """
-    graph = nx.DiGraph()
-    persistent = [n for n in model if model[n].role == "parameter" and not model.parents(n)]
-    for slice_ in range(1 - steps, 1):
-        graph.add_nodes_from(
-            ((name, slice_), {"variable": name, "slice": slice_}) for name in model
-        )
-        for edge in model.edges:
-            if edge.lag == 0 or slice_ > 1 - steps:
-                cause = (edge.cause, slice_ - edge.lag)
-                graph.add_edge(cause, (edge.effect, slice_), lag=edge.lag)
-        if slice_ > 1 - steps:
-            for name in persistent:
-                graph.add_edge((name, slice_ - 1), (name, slice_), lag=1, persists=True)
-    return graph
+    return slices_of(to_digraph(model), steps)
 
 
 def episode_outcome(

@@ -13,7 +13,7 @@ from scm_world.graph import flatten
 from scm_world.queries.equations import System
 from scm_world.queries.timed import ACTS, TIMED, At, Clamp, On, Timed, as_act
 from scm_world.variables import Function, Hard, Intervention, Mechanism, Natural
-from scm_world.variables.mechanisms import OWN_MECHANISMS
+from scm_world.variables.mechanisms import check_portable, check_trusted
 
 FORMAT = "scm_world/plan/1"
 PACKAGE = "scm_world"
@@ -115,14 +115,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         Raises:
             ModelError: It has a function that cannot be found again under its name.
         """
-        problems = [
-            f"the mechanism of {name!r} is {function.reference!r}, which cannot be found under "
-            "this name; define it at the top level of a module"
-            for name, function in self._functions()
-            if not function.is_portable()
-        ]
-        if problems:
-            raise ModelError(problems)
+        check_portable(self._functions())
         return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json")}
 
     def to_json(self) -> str:
@@ -147,13 +140,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             plan._parts = _PARTS.validate_json(json.dumps(data["do"]))
         except DAMAGED as error:
             raise ModelError([f"not a plan: {error}"]) from None
-        problems = [
-            f"the mechanism of {name!r} is {function.reference!r}; pass trusted=(…) to read it"
-            for name, function in plan._functions()
-            if not function.is_defined_in((*OWN_MECHANISMS, *trusted))
-        ]
-        if problems:
-            raise ModelError(problems)
+        check_trusted(plan._functions(), trusted)
         return plan
 
     @classmethod
@@ -165,10 +152,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             raise ModelError([f"not a plan: {error}"]) from None
         return cls.from_dict(data, trusted=trusted)
 
-    def _functions(self) -> Iterable[tuple[str, Function]]:
-        for name, act in self.acts():
+    def _functions(self) -> Iterable[Function]:
+        for _, act in self.acts():
             if isinstance(act, Mechanism) and isinstance(act.function, Function):
-                yield name, act.function
+                yield act.function
 
 
 def _parts(value: Any) -> tuple[Any, ...]:

@@ -202,6 +202,44 @@ class Function(Frozen):
         return hash((self.reference, tuple(sorted(self.constants))))
 
 
+def check_portable(functions: Iterable[Function]) -> None:
+    """Refuse to write functions that could not be found again.
+
+    Raises:
+        ModelError: One is a lambda, or has no name of its own.
+    """
+    problems = [
+        f"the function {function.reference!r} cannot be found under this name; define it at the "
+        "top level of a module"
+        for function in functions
+        if not function.is_portable()
+    ]
+    if problems:
+        raise ModelError(problems)
+
+
+def check_trusted(functions: Iterable[Function], trusted: Iterable[str]) -> None:
+    """Refuse functions that a file names, before anything of theirs is imported.
+
+    Args:
+        functions: That the file names.
+        trusted: Packages whose functions may be called, besides those of this package that
+            compute numbers.
+
+    Raises:
+        ModelError: One lies elsewhere.
+    """
+    allowed = (*OWN_MECHANISMS, *trusted)
+    problems = [
+        f"the function {function.reference!r} lies outside the trusted packages "
+        f"{', '.join(allowed)}; pass trusted=(…) to read it"
+        for function in functions
+        if not function.is_defined_in(allowed)
+    ]
+    if problems:
+        raise ModelError(problems)
+
+
 @final
 class Linear(Frozen):
     """A weighted sum of the parents, plus an intercept, plus the noise.

@@ -158,6 +158,10 @@ class _Space(Frozen):
         """Name the variables that the bounds depend on."""
         return frozenset()
 
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes."""
+        return prod(shape)
+
 
 @final
 class Box(_Space):
@@ -245,10 +249,6 @@ class Box(_Space):
         edges = np.where(high > low, high - low, 1.0)
         return np.asarray(np.prod(edges, axis=tuple(range(-len(shape), 0))))
 
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
-        return prod(shape)
-
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers, shape ``(..., n)``, into uniform points, ``(..., *shape)``."""
         low, high = self.bounds(shape, values)
@@ -297,10 +297,6 @@ class Integers(_Space):
         """Count the values."""
         return np.asarray(float(self.high - self.low + 1) ** int(np.prod(shape)))
 
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
-        return prod(shape)
-
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into equally likely whole numbers."""
         unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
@@ -339,10 +335,6 @@ class Categories(_Space):
     def volume(self, shape: tuple[int, ...], values: Values) -> Floats:
         """Count the values."""
         return np.asarray(float(len(self.members)) ** int(np.prod(shape)))
-
-    def n_uniforms(self, shape: tuple[int, ...]) -> int:
-        """Count the uniform numbers that one draw takes."""
-        return prod(shape)
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         """Turn uniform numbers into equally likely members."""

@@ -17,7 +17,6 @@ from scm_world.discovery.data import (
     as_tigramite,
     collect,
     from_frame,
-    from_tigramite,
 )
 from scm_world.errors import ModelError, UnknownVariable
 from scm_world.queries import World
@@ -248,7 +247,6 @@ def test_tigramite_gets_one_series_per_episode(series: Dataset) -> None:
     assert list(frame.T.values()) == [5] * 6
     assert frame.var_names == ["level", "kind"]
     np.testing.assert_array_equal(frame.data_type[0][0], [0, 1])
-    assert from_tigramite(frame, series) == series
 
 
 def test_tigramite_is_not_given_what_is_no_series(table: Dataset, series: Dataset) -> None:

@@ -14,7 +14,6 @@ from scm_world.discovery.data.views import (
     as_gies,
     as_tigramite,
     from_frame,
-    from_tigramite,
 )
 from scm_world.errors import UnwritableFolder
 
@@ -38,7 +37,6 @@ __all__ = [
     "default_causes",
     "default_outcomes",
     "from_frame",
-    "from_tigramite",
     "load",
     "save",
     "sweep",

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypedDict, Unpack, final
+from typing import Any, TypedDict, Unpack
 
 from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Dataset
@@ -199,7 +199,7 @@ def _gathered(
             tell(len(numbers))
     missing = [index for index in range(len(ranges)) if index not in parts]
     executor.check("source of episodes with several workers", source)
-    make = partial(Maker, source, tell if serial else None)
+    make = partial(partial, made_of, source, tell if serial else None)
     refused = [pair for part in parts.values() for pair in part.refused]
     made = sum(len(ranges[index]) for index in parts)
     for place, found in executor.run(make, [ranges[index] for index in missing]):
@@ -219,19 +219,7 @@ def _gathered(
     return [parts[index] for index in range(len(ranges))]
 
 
-@final
-class Maker:
-    """Makes the rows of shards, wherever it is.
-
-    Args:
-        source: Of the episodes.
-        tell: Told how many further episodes are done; nobody is if None.
-    """
-
-    def __init__(self, source: DataSource, tell: Tell | None = None) -> None:
-        self._source, self._tell = source, tell
-
-    def __call__(self, numbers: range) -> SourceRows:
-        """Let the episodes of a shard happen."""
-        part = self._source.part(numbers, self._tell or (lambda more: None))
-        return replace(part, table=replace(part.table, about={}))  # it is the same in all of them
+def made_of(source: DataSource, tell: Tell | None, numbers: range) -> SourceRows:
+    """Make the rows of a shard, in whatever process; ``tell`` is of this one, or None."""
+    part = source.part(numbers, tell or (lambda more: None))
+    return replace(part, table=replace(part.table, about={}))  # it is the same in all of them

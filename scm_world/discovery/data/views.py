@@ -6,7 +6,7 @@ import ast
 import json
 from collections.abc import Container, Iterable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -191,18 +191,6 @@ def as_tigramite(dataset: Dataset) -> Any:
         var_names=list(dataset.names),
         analysis_mode="multiple",
     )
-
-
-def from_tigramite(frame: Any, like: Dataset) -> Dataset:
-    """Read time series back, with the regimes of the dataset they were made of.
-
-    Raises:
-        ModelError: They have other names, or other lengths.
-    """
-    if tuple(frame.var_names) != like.names or sum(map(len, frame.values.values())) != len(like):
-        raise ModelError(["these are other time series"])
-    values = np.concatenate([frame.values[number] for number in sorted(frame.values)])
-    return replace(like, values=values)
 
 
 # --- causal-learn -----------------------------------------------------------------------------

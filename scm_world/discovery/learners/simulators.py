@@ -22,7 +22,6 @@ from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
 from scm_world.queries.outcomes import Outcome, read
-from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous, Noise
@@ -156,23 +155,17 @@ class StepSimulator:
     Args:
         world: It is reset; its task and options stay.
         seed: Of states and values.
-        progress: Called after each state with how many experiments there were, and the budget.
     """
 
-    def __init__(self, world: World, seed: int = 0, *, progress: Progress | None = None) -> None:
-        self._world, self._seed, self._progress = world, seed, progress
+    def __init__(self, world: World, seed: int = 0) -> None:
+        self._world, self._seed = world, seed
         self.names = tuple(world.model)
 
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time; see ``PairedSimulator``."""
         series = Series(Paired(self._world, self._seed), MOST)
-
-        def enough(effects: Effects, _: int) -> bool:
-            if self._progress is not None:
-                self._progress(min(effects.rollouts, budget), budget)
-            return effects.rollouts >= budget
-
-        series.run(probes(self._world, MOST, self._seed), enough)
+        states = probes(self._world, MOST, self._seed)
+        series.run(states, lambda effects, _: effects.rollouts >= budget)
         return series.effects
 
 
@@ -190,7 +183,6 @@ class EpisodeSimulator:
         outcomes: What episodes end with.
         settings: Who acts, what varies by itself, how long, and the seed: the first one for the
             first unit, and so on, in turn.
-        progress: Called after each unit with how many experiments there were, and the budget.
     """
 
     def __init__(
@@ -199,12 +191,9 @@ class EpisodeSimulator:
         causes: Sequence[str],
         outcomes: Iterable[Outcome],
         settings: Sequence[Setting],
-        *,
-        progress: Progress | None = None,
     ) -> None:
         self._world, self._twins, self._settings = world, twins_of(world), tuple(settings)
         self._causes, self._outcomes = tuple(causes), tuple(outcomes)
-        self._progress = progress
         self._target = {n: world.model.target(n) for n in self._causes}
         declared = world.model.declared
         self._drawn = tuple(n for n in self._causes if isinstance(declared(n), Exogenous))
@@ -218,8 +207,6 @@ class EpisodeSimulator:
         found = Effects()
         for unit in count():
             self._unit(unit, found)
-            if self._progress is not None:
-                self._progress(min(found.rollouts, budget), budget)
             if found.rollouts >= budget:
                 return found
         return found
