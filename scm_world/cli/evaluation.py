@@ -16,7 +16,6 @@ from scm_world.cli.datasets import check_parquet
 from scm_world.errors import UnknownOption
 
 WORDS = {"true": True, "false": False, "none": None}
-SHOWN = 8  # variables that are listed
 
 
 def evaluate(
@@ -229,35 +228,13 @@ def explain(
             causes = found.causes(name, metric, agent=agent, engine=engine)
             score = found.score(name, metric, agent=agent, engine=engine)
             title = f"{name}: {agent} on {engine}, {metric.replace('_', ' ')} {score}"
-            if not causes.causes:
-                if protocol is not None:
-                    console.say(title, causes if causes.left_out else "nothing is varied in it")
-                continue
-            rows: list[tuple[object, ...]] = []
-            for cause in causes.ranked()[:SHOWN]:
-                column = cause.column
-                of = "" if column.name == cause.variable else f" ({column.name})"
-                contrast = f"{column.contrast}{of}"
-                rows.append((cause.variable, cause.share, f"{cause.p_holm:.3g}", contrast))
-            if len(causes.causes) > SHOWN:
-                rows.append((f"and {len(causes.causes) - SHOWN} more", "", "", ""))
-            heads = ("variable", "share of variance", "p (Holm)", "upper - lower third")
-            console.table(heads, rows, title=title, whole=(0,))
+            if causes.causes or protocol is not None:
+                console.say(title, causes if str(causes) else "nothing is varied in it", "")
         return
     if protocol is None:
         raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
     asked: dict[str, Any] = {"agent": agent, "engine": engine, "metric": metric, "versus": versus}
     with console.progress("counterfactuals") as tell:
         reasons = why(found, protocol, episode, **asked, trusted=tuple(trust or ()), progress=tell)
-    rows = [
-        (
-            f"{other.variable} = {console.show(other.would_be)}",
-            console.show(other.was),
-            f"{other.would_score:.3g} ({other.gain:+.3g})",
-            "yes" if other.would_succeed else "no",
-        )
-        for other in reasons.others
-    ]
-    rows += [(name, "", "left out", reason) for name, reason in reasons.left_out.items()]
     title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
-    console.table(("had it been", "instead of", "score", "success"), rows, title=title)
+    console.say(title, reasons)

@@ -20,7 +20,6 @@ from scm_world.cli.arguments import (
     refuse_settings,
     tag,
 )
-from scm_world.errors import UnknownOption
 
 PICTURES = ("before.png", "after.png", "scene.png")
 DIVIDER = 4  # [pixels] between two pictures
@@ -50,115 +49,30 @@ def do(
         space: Refuse values outside this space: A (training support), B (held out) or 'A|B'.
         show_all: Show descendants that did not move, too.
     """
-    from scm_world.policies.scripted import as_policy
-    from scm_world.queries import World
-    from scm_world.queries.experiments.effects import gap
+    from scm_world.queries import SCM, consequences
     from scm_world.queries.experiments.versions import versions
-    from scm_world.queries.twins import asked
-    from scm_world.variables import Draw, Scale, Shift
-    from scm_world.variables.kinds import SPACES
 
-    if space not in (None, *SPACES):
-        raise UnknownOption("space", space, SPACES)
     request = parse_assignments(assignments)
     with open_system(task, option, backend=backend, preset=preset) as system:
-        used, is_world = backend_of(system), isinstance(system, World)
-        steps = steps if system.graph.is_temporal else 0
-        if not is_world:
+        used = backend_of(system)
+        if isinstance(system, SCM):
             refuse_settings(space=space)
         folder = console.results_folder(out, "do", tag(task), used, f"seed{seed}", option=option)
-        stepped: Any = asked(system)[1]
-        stepped.reset(seed=seed)
-        start, before = stepped.snapshot(), stepped.values()
-        scenes = [stepped.scene()] if is_world else []
-        action = as_policy(None, stepped)(stepped)
-        audit = stepped.do(request, space=space) if is_world else stepped.do(request)
-        right_after, models = stepped.values(), [stepped.model]
-        for _ in range(steps):
-            stepped.step(action)
-        after = stepped.values()
-        scenes += [stepped.scene()] if is_world else []
-        stepped.restore(start)
-        for _ in range(steps):
-            stepped.step(action)
-        without = stepped.values()
-        models.append(stepped.model)
-        engine = stepped.engine if is_world else ""
-
-    targets = {models[0].target(name) for name in audit.targets}
-    follow = {
-        name
-        for model in models  # the intervention may change which bodies there are
-        for target in targets & {*model}
-        for name in model.descendants(target)
-    }
-    rows: dict[str, dict[str, Any]] = {}
-    for name in models[1]:
-        values = [found.get(name) for found in (before, right_after, after, without)]
-        if any(value is None for value in values) or (name in targets and name not in follow):
-            continue
-        difference = gap(after[name], without[name])
-        rows[name] = {
-            "unit": models[1].declared(name).unit,
-            "descendant": name in follow,
-            "moved": difference > 0.0 or gap(right_after[name], before[name]) > 0.0,
-            **dict(zip(("before", "right_after", "after", "without"), values, strict=True)),
-            "difference": difference,
-        }
-    astray = [name for name, row in rows.items() if row["moved"] and not row["descendant"]]
-
-    def changes(pairs: Any) -> dict[str, Any]:
-        return {name: {"before": old, "after": new} for name, (old, new) in pairs.items()}
-
+        found = consequences(system, request, steps=steps, seed=seed, space=space)  # type: ignore[arg-type] # it checks the space
+    steps, rows, astray = found.steps, found.variables, found.astray
     result = {
         "format": "scm_world/do/1",
         "task": task,
         "backend": used,
         "preset": preset,
         "seed": seed,
-        "steps": steps,
         "space": space,
         "arguments": option or (),
-        "audit": {
-            name: {part: getattr(one, part) for part in ("requested", "applied", "read_back")}
-            for name, one in audit.targets.items()
-        },
-        "followed": changes(audit.followed),
-        "engine": changes(audit.engine),
-        "came": audit.came,
-        "went": audit.went,
-        "variables": rows,
-        "moved_without_a_path": astray,
-        "versions": versions(engine),
+        **found.as_dict(),
+        "versions": versions(found.engine),
     }
-    targeted: list[tuple[object, ...]] = []
-    for name, entry in audit.targets.items():
-        match entry.requested:
-            case Shift() | Scale():
-                words = f"{entry.requested.kind} by {console.show(entry.requested.by)}"
-            case Draw():
-                words = f"draw from {entry.requested.source}"
-            case asked:
-                words = console.show(getattr(asked, "value", asked))
-        applied = "at every step" if entry.applied is None else console.show(entry.applied)
-        back = "-" if entry.read_back is None else console.show(entry.read_back)
-        targeted.append((Text(name, style="bold"), words, applied, back))
-    title = f"do() in {tag(task)} on {engine or used}, seed {seed}"
-    heads = ("target", "requested", "applied", "backend reports")
-    columns = 4 if is_world else 3
-    rows_shown = [row[:columns] for row in targeted]
-    console.table(heads[:columns], rows_shown, title=title, width=console.PAGE)
-    for label, pairs in (
-        ("followed at lag 0", audit.followed),
-        ("backend, inertia [kg m²]", audit.engine),
-    ):
-        for name, (old, new) in pairs.items():
-            change = f"{console.show(old, per_line=9)} -> {console.show(new, per_line=9)}"
-            console.say(f"{label}: {name} {change}")
-    for label, names in (("new", audit.came), ("gone", audit.went)):
-        if names:
-            console.say(f"{label}: {', '.join(names)}")
-    descendants = [row for row in rows.values() if row["descendant"]]
+    console.say(f"do() in {tag(task)} on {found.engine or used}, seed {seed}:", found.audit, "")
+    descendants = [row for row in rows.values() if row.descendant]
     console.table(
         (
             *("descendant", "unit", "before", "right after", f"after {steps} steps"),
@@ -167,21 +81,21 @@ def do(
         [
             (
                 Text(name, style="bold"),
-                row["unit"],
-                console.show(row["before"]),
-                _or_same(row["right_after"], row["before"]),
-                console.show(row["after"]),
-                _or_same(row["without"], row["after"]),
-                Text(f"{row['difference']:.3g}", style="bold" if row["difference"] else "dim"),
+                row.unit,
+                console.show(row.before),
+                _or_same(row.right_after, row.before),
+                console.show(row.after),
+                _or_same(row.without, row.after),
+                Text(f"{row.difference:.3g}", style="bold" if row.difference else "dim"),
             )
             for name, row in rows.items()
-            if row["descendant"] and (row["moved"] or show_all)
+            if row.descendant and (row.moved or show_all)
         ],
         title="What followed",
         whole=(0, 6),
         width=console.PAGE,
     )
-    still = sum(not row["moved"] for row in descendants)
+    still = sum(not row.moved for row in descendants)
     line = f"{still} of {len(descendants)} descendants did not move"
     line += " (--all shows them)" if still and not show_all else ""
     if not astray:
@@ -191,7 +105,7 @@ def do(
         wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
         console.terminal().print(Text(f"{wrong} The graph is wrong.", style="bold white on red"))
     with console.staged(folder) as draft:
-        if shown := _pictures(scenes):
+        if shown := _pictures(found.scenes):
             for name, frames in zip(PICTURES, ([shown[0]], [shown[1]], shown), strict=True):
                 _write_picture(draft / name, frames)
         console.write_json(draft / "result.json", result)
@@ -272,17 +186,7 @@ def effect(
                 seed=seed,
                 policy=policy_of(policy, system),
             )
-    show = console.show
-    rows = [
-        ("effect", show(found.mean), f"{show(found.low)} … {show(found.high)}"),
-        ("with it", show(found.treated), ""),
-        ("without", show(found.control), ""),
-        ("episodes", found.rollouts, "paired" if found.paired else "unpaired"),
-    ]
-    if found.paired:
-        rows.append(("variance unpaired : paired", show(found.variance_ratio), ""))
-    title = f"{found.outcome}, {tag(task)} on {found.engine}, seed {seed}"
-    console.table(("", "mean", "95 % interval"), rows, title=title)
+    console.say(f"{tag(task)} on {found.engine}, seed {seed}, with its 95 % interval:", found)
     with console.staged(folder) as draft:
         (draft / "effect.json").write_text(found.to_json() + "\n")
 
@@ -319,27 +223,11 @@ def counterfactual(
         episode = system.rollout(acts, seed=seed, steps=length)
         other = episode.counterfactual(request, at=at)
         apart = compare(episode, other)
-    rows = [
-        (
-            name,
-            one.first,
-            f"{console.show(one.largest)} at {one.at}",
-            console.show(np.abs(one.final).max(initial=0.0)),
-        )
-        for name, one in apart.variables.items()
-    ]
-    console.table(
-        ("variable", "differs from", "most, and when", "at the end"),
-        rows or [("nothing", "", "", "")],
-        title=f"{tag(task)} on {used}, seed {seed}: intervention at control step {at}",
+    console.say(
+        f"{tag(task)} on {used}, seed {seed}: with the intervention at control step {at} (b), and "
+        "without it (a)",
+        apart,
     )
-    if apart.contacts:
-        step, pair, which = apart.contacts[0]
-        episode_name = ("the factual", "the counterfactual")[which]
-        console.say(
-            f"{len(apart.contacts)} contacts in one of the two only, first {pair[0]} and {pair[1]} "
-            f"at {step}, in {episode_name} episode"
-        )
     result = {
         "format": "scm_world/counterfactual/1",
         "at": at,

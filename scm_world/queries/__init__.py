@@ -2,6 +2,7 @@
 
 from scm_world.policies.scripted import Random
 from scm_world.queries.agreement import Agreement
+from scm_world.queries.consequences import Consequence, Consequences, consequences
 from scm_world.queries.differences import ButFor, Difference, Divergence, but_for, compare
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
@@ -30,6 +31,8 @@ __all__ = [
     "At",
     "ButFor",
     "Clamp",
+    "Consequence",
+    "Consequences",
     "Contact",
     "Difference",
     "Divergence",
@@ -49,6 +52,7 @@ __all__ = [
     "but_for",
     "check_backdoor",
     "compare",
+    "consequences",
     "do",
     "identify",
     "load_episode",

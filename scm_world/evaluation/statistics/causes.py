@@ -140,6 +140,7 @@ class Causes:
         ]
         widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
         lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in (head, *rows)]
+        lines = lines if rows else []
         lines += [f"{name}: left out, {reason}" for name, reason in self.left_out.items()]
         return "\n".join(lines)
 
