@@ -113,7 +113,7 @@ def consequences(
 
     Example:
         >>> found = consequences(World("pushing", backend="fake"), {"tool_block.mass": 0.05})
-        >>> found.astray, found.variables["tool_block.mass"].descendant
+        >>> found.astray, found.variables["tool_block.linear_velocity"].descendant
         ((), True)
     """
     if space not in (None, *SPACES):
