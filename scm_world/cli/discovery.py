@@ -274,7 +274,7 @@ def _benchmark(
         truth = result.problems[name]
         console.table(
             (*HEADS[1:], *(column.title for column in columns)),
-            [  # the means over seeds; the ranges are in results.md
+            [  # the means over seeds; the ranges are in report.html
                 (
                     *row.heads[1:],
                     *(
@@ -289,9 +289,7 @@ def _benchmark(
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
         console.say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
-    console.written(
-        *(folder / name for name in ("report.html", "results.md", "results.csv", "budget.png"))
-    )
+    console.written(*(folder / name for name in ("report.html", "results.csv", "budget.png")))
 
 
 def verify(

@@ -1,11 +1,10 @@
-"""Tables, the picture and the report of a benchmark."""
+"""The table, the picture and the report of a benchmark."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -177,12 +176,8 @@ def counted(result: BenchmarkResult) -> str:
 
 
 def write_files(result: BenchmarkResult, folder: Location) -> None:
-    """Write ``results.csv``, ``results.md``, ``budget.png`` and ``report.html``.
-
-    A missing number is an empty field of the first, and a dash in the second.
-    """
+    """Write ``results.csv``, ``budget.png`` and ``report.html``; a missing number is empty."""
     write_whole(_csv(result), folder / "results.csv")
-    write_whole(_markdown(result), folder / "results.md")
     save(draw_budgets(result), folder / "budget.png")
     write_whole(report(result), folder / "report.html")
 
@@ -196,28 +191,6 @@ def _csv(result: BenchmarkResult) -> str:
     writer.writeheader()
     writer.writerows(result.records)
     return stream.getvalue()
-
-
-def _markdown(result: BenchmarkResult) -> str:
-    titles = [*HEADS[1:], *(column.title for column in COLUMNS)]
-    rule = ["---" if title in HEADS[1:3] else "---:" for title in titles]
-    lines = ["# Results of the benchmark", "", f"{counted(result)}. {NOTE}"]
-    for name, rows in summary(result).items():
-        truth = result.problems[name]
-        size = f"{len(truth.names)} variables, {len(truth.edges)} edges"
-        lines += ["", f"## {_safe(name)}", "", size, ""]
-        lines += [f"| {' | '.join(titles)} |", f"|{'|'.join(rule)}|"] if rows else ["No runs."]
-        for row in rows:
-            marks = ["**" * (column.key in row.best) for column in COLUMNS]
-            numbers = (f"{m}{row.text(c)}{m}" for m, c in zip(marks, COLUMNS, strict=True))
-            lines.append(f"| {' | '.join([*map(_safe, row.heads[1:]), *numbers])} |")
-    return "\n".join(lines) + "\n"
-
-
-def _safe(text: str) -> str:
-    """Escape Markdown."""
-    escaped = re.sub(r"([\\|*`\[\]])", r"\\\1", " ".join(text.split()))
-    return escaped.replace("&", "&amp;").replace("<", "&lt;")
 
 
 # --- the picture ----------------------------------------------------------------------------------
@@ -303,7 +276,6 @@ VERDICTS = {
 }
 """The sign in a matrix, what it means, and its color; each sign alone is enough."""
 BESIDE = ("shd", "f1", "precision", "recall")  # scores beside a single run
-NAMED = 25  # wrong edges of a kind that are named in words
 
 
 class Link(NamedTuple):
@@ -402,14 +374,8 @@ def _entry(row: SummaryRow, column: ScoreColumn) -> Entry:
 def _compared(truth: GroundTruth, run: BenchmarkRun) -> dict[str, Any]:
     links = [] if run.found is None else compare(truth, run.found)
     cells: dict[tuple[str, str], list[Link]] = {}
-    named: dict[str, str] = {}
     for link in links:
         for ends in [link[:2]] if link.directed else [link[:2], link[1::-1]]:
             cells.setdefault(ends, []).append(link)
-    for verdict in ("missing", "extra", "reversed", "undirected"):
-        words = [link.words for link in links if link.verdict == verdict]
-        more = f"; … and {len(words) - NAMED} more" if len(words) > NAMED else ""
-        if words:
-            named[f"{len(words)} {verdict}"] = "; ".join(words[:NAMED]) + more
     scores = {c.title: number(run.scores.get(c.key), c) for c in COLUMNS if c.key in BESIDE}
-    return {"run": run, "cells": cells, "named": named, "scores": scores}
+    return {"run": run, "cells": cells, "scores": scores}

@@ -167,7 +167,7 @@ class BenchmarkResult:
         return load("pandas", "pandas", "data").DataFrame(self.records)
 
     def write(self, folder: Location | str) -> None:
-        """Write ``benchmark.json``, ``results.csv``, ``results.md``, a picture and a report."""
+        """Write ``benchmark.json``, ``results.csv``, a picture and a report."""
         from scm_world.discovery.benchmark_report import write_files
 
         plain = {
@@ -252,8 +252,7 @@ def benchmark(
         progress: Called with (done, planned) after each run.
 
     Returns:
-        All runs and scores; in ``out`` also ``results.csv``, ``results.md``, ``budget.png`` and
-        ``report.html``.
+        All runs and scores; in ``out`` also ``results.csv``, ``budget.png`` and ``report.html``.
 
     Raises:
         UnknownOption: Something does not exist, or a learner cannot use a kind of data.

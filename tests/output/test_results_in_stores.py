@@ -114,7 +114,7 @@ def test_a_benchmark_resumes_from_a_store() -> None:
     assert [run.as_dict() for run in again.runs] == [run.as_dict() for run in done.runs]
     assert everything(folder) == first
     assert sum(name.startswith("runs/") for name in first) == 2
-    files = {"benchmark.json", "budget.png", "report.html", "results.csv", "results.md"}
+    files = {"benchmark.json", "budget.png", "report.html", "results.csv"}
     assert {name for name in first if "/" not in name} == {*files, "settings.json"}
     assert BenchmarkResult.read(str(folder)).problems.keys() == {"er2:4"}
     with pytest.raises(UnreadableFile, match="another benchmark: seeds"):
