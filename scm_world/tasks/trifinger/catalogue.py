@@ -30,8 +30,8 @@ class Range:
     """
 
     bounds: Any
-    a: Any
-    b: Any
+    a: Any = None
+    b: Any = None
     unit: str = "1"
     shape: tuple[int, ...] = ()
     dtype: Literal["real", "integer", "categorical"] = "real"
@@ -56,7 +56,6 @@ ANGULAR_VELOCITY_BOUNDS = Box(-100.0, 100.0)  # [rad/s]
 JOINT_BOUNDS = Box((-1.67, -1.67, -3.24) * 3, (1.67, 1.67, 3.24) * 3)
 """The stops at a quarter and half a turn, and 0.1 rad that a joint may press into them [rad]."""
 JOINT_VELOCITY_BOUNDS = Box(-50.0, 50.0)  # [rad/s]
-OBSTACLE_SIZE_BOUNDS = Box(0.005, 0.6)  # [m]
 TYPE_BOUNDS = Categories((1, 2, 10, 20, 21, 23))
 
 # --- training space A and held-out space B ---------------------------------
@@ -88,7 +87,6 @@ def cylindrical(radii: tuple[float, float], low: Bound, high: Bound) -> Box:
 
 
 # --- goal families whose blocks follow from a few numbers -----------------------------------------
-PART_SIZE_BOUNDS = Box(0.005, 0.3)  # [m] edges of a block that is a part of something
 BLOCKS_MASS = 0.08  # [kg]
 DROP_REGION = ((-0.11, -0.11, 0.0), (0.11, 0.11, 0.22))  # [m]
 
@@ -140,6 +138,12 @@ _SIDE = Categories((0, 1))
 SIDES = Range(_SIDE, _SIDE, _SIDE, dtype="categorical")
 STACK_LEVELS = Range(Integers(1, 10), Integers(1, 5), Integers(6, 8), dtype="integer")
 CREATIVE_LEVELS = Range(Integers(1, 10), Integers(3, 5), Integers(6, 8), dtype="integer")
+
+POSITIONS = Range(POSITION_BOUNDS, unit="m", shape=(3,))
+ORIENTATIONS = Range(QUATERNION_BOUNDS, shape=(4,))
+PART_SIZES = Range(Box(0.005, 0.3), unit="m", shape=(3,))
+"""Edges of a block that is a part of something."""
+OBSTACLE_SIZES = Range(Box(0.005, 0.6), unit="m", shape=(3,))
 
 # --- defaults ------------------------------------------------------------------------------
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]

@@ -26,7 +26,7 @@ from scm_world.tasks.trifinger.single import (
     tips_to_block,
     turned,
 )
-from scm_world.variables import Box, Derived, Exogenous, Function, Parent, Switch, Variable
+from scm_world.variables import Box, Function, Parent, Switch, Variable
 
 WALL = "obstacle"
 SIDE = "wall_side"
@@ -194,21 +194,9 @@ class PickAndPlace(OneBlock):
 
 def _wall_position(conventions: Conventions) -> Variable:
     """Stand the wall on the floor; the predecessor's keeps its center when its size changes."""
+    name = f"{WALL}.cartesian_position"
     if conventions.published_spaces:
-        return Exogenous(
-            name=f"{WALL}.cartesian_position",
-            unit="m",
-            shape=(3,),
-            bounds=numbers.POSITION_BOUNDS,
-            default=(0.0, 0.0, WALL_SIZE[2] / 2.0),
-            doc="Position of the center.",
-        )
-    return Derived(
-        name=f"{WALL}.cartesian_position",
-        unit="m",
-        shape=(3,),
-        bounds=numbers.POSITION_BOUNDS,
-        parents=(f"{WALL}.size",),
-        mechanism=Function(wall_on_the_floor),
-        doc="Position of the center; it stands on the floor in the middle.",
-    )
+        center = (0.0, 0.0, WALL_SIZE[2] / 2.0)
+        return numbers.POSITIONS.root(name, center, "Position of the center.")
+    doc = "Position of the center; it stands on the floor in the middle."
+    return numbers.POSITIONS.derived(name, (f"{WALL}.size",), Function(wall_on_the_floor), doc)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from scm_world._types import Floats
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.obstacles import Obstacle, obstacle_size
 from scm_world.tasks.trifinger.structure import ARENA_HALF_WIDTH, ARENA_HEIGHT
-from scm_world.variables import Box, Derived, Exogenous, Function, Integers, Variable
+from scm_world.variables import Box, Exogenous, Function, Integers, Variable
 
 COUNT = "number_of_obstacles"
 PLACES = "obstacle_places"
@@ -71,13 +70,11 @@ def scattering(default: int) -> Iterable[Variable]:
 def scattered(count: int) -> Iterable[Obstacle]:
     """List the obstacles that there are."""
     for index, name in enumerate(obstacle_names(count)):
-        common: dict[str, Any] = {"name": f"{name}.cartesian_position", "unit": "m", "shape": (3,)}
-        position = Derived(
-            parents=(PLACES,),
-            mechanism=Function(place, constants={"index": float(index)}),
-            bounds=numbers.POSITION_BOUNDS,
-            doc="Position of the center.",
-            **common,
+        position = numbers.POSITIONS.derived(
+            f"{name}.cartesian_position",
+            (PLACES,),
+            Function(place, constants={"index": float(index)}),
+            "Position of the center.",
         )
         yield Obstacle(
             name,

@@ -314,16 +314,7 @@ def part_size(name: str, size: Mechanism) -> Derived:
         name: Of the block or goal.
         size: Where they come from.
     """
-    parents, function = size
-    return Derived(
-        name=f"{name}.size",
-        unit="m",
-        shape=(3,),
-        bounds=numbers.PART_SIZE_BOUNDS,
-        parents=parents,
-        mechanism=function,
-        doc="Full edge lengths.",
-    )
+    return numbers.PART_SIZES.derived(f"{name}.size", *size, "Full edge lengths.")
 
 
 def part_tool(name: str, *, size: Mechanism, spawn: Mechanism, airborne: bool) -> ToolBlock:

@@ -14,7 +14,7 @@ from scm_world.models import Goal
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.blocks import color, coordinates, object_type, same
-from scm_world.variables import Box, Derived, Exogenous, Function, Variable
+from scm_world.variables import Box, Exogenous, Function, Variable
 
 SILHOUETTE_CUBOID = 20
 SILHOUETTE_SPHERE = 21
@@ -64,23 +64,8 @@ def goal_position(
     """Declare the center of a goal: a root, or where a mechanism puts it [m]."""
     quantity, doc = f"{name}.cartesian_position", "Position of the center."
     if mechanism is None:
-        return Exogenous(
-            name=quantity,
-            unit="m",
-            shape=(3,),
-            bounds=numbers.POSITION_BOUNDS,
-            default=default,
-            doc=doc,
-        )
-    return Derived(
-        name=quantity,
-        unit="m",
-        shape=(3,),
-        bounds=numbers.POSITION_BOUNDS,
-        parents=parents,
-        mechanism=mechanism,
-        doc=doc,
-    )
+        return numbers.POSITIONS.root(quantity, default, doc)
+    return numbers.POSITIONS.derived(quantity, parents, mechanism, doc)
 
 
 def goal_orientation(
@@ -92,17 +77,9 @@ def goal_orientation(
 ) -> Variable:
     """Declare the orientation of a goal: a root, or what a mechanism makes it."""
     quantity, doc = f"{name}.orientation", "Orientation as a unit quaternion (x, y, z, w)."
-    bounds = numbers.QUATERNION_BOUNDS
     if not parents:
-        return Exogenous(name=quantity, shape=(4,), bounds=bounds, default=default, doc=doc)
-    return Derived(
-        name=quantity,
-        shape=(4,),
-        bounds=bounds,
-        parents=parents,
-        mechanism=mechanism or Function(same),
-        doc=doc,
-    )
+        return numbers.ORIENTATIONS.root(quantity, default, doc)
+    return numbers.ORIENTATIONS.derived(quantity, parents, mechanism or Function(same), doc)
 
 
 def polar(name: str, default: tuple[float, float], *, a: Box, b: Box) -> Exogenous:

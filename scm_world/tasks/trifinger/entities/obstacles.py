@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import final
 
 from scm_world._types import Floats, Value
@@ -51,12 +52,10 @@ class Obstacle(Entity):
         yield object_type(self._v("type"), STATIC_CUBOID)
         yield self._size
         yield self._position
-        yield Exogenous(
-            name=self._v("orientation"),
-            shape=(4,),
-            bounds=numbers.QUATERNION_BOUNDS,
-            default=numbers.IDENTITY,
-            doc="Orientation as a unit quaternion (x, y, z, w).",
+        yield numbers.ORIENTATIONS.root(
+            self._v("orientation"),
+            numbers.IDENTITY,
+            "Orientation as a unit quaternion (x, y, z, w).",
         )
         yield numbers.FRICTION.root(
             self._v("friction"),
@@ -92,13 +91,4 @@ def obstacle_size(
     name: str, default: tuple[float, float, float], *, a: Box | None = None, b: Box | None = None
 ) -> Exogenous:
     """Declare the edge lengths of an obstacle [m]."""
-    return Exogenous(
-        name=name,
-        unit="m",
-        shape=(3,),
-        bounds=numbers.OBSTACLE_SIZE_BOUNDS,
-        a=a,
-        b=b,
-        default=default,
-        doc="Full edge lengths.",
-    )
+    return replace(numbers.OBSTACLE_SIZES, a=a, b=b).root(name, default, "Full edge lengths.")
