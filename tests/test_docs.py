@@ -101,7 +101,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "discovery": (),
     "environments": (),
     "evaluation": (),
-    "grasping": (),
+    "grasping": ("1",),
     "interventions": (),
     "learners": (),
     "new_family": (),

@@ -109,8 +109,9 @@ def test_native_is_sync_value_by_value(name: str, mode: AutoresetMode) -> None:
         envs.close()
 
 
-@pytest.mark.parametrize("kind", ["loop", "processes"])
-@pytest.mark.parametrize("name", CURRICULA)
+@pytest.mark.parametrize(
+    ("name", "kind"), [*((name, "loop") for name in CURRICULA), ("within episodes", "processes")]
+)
 def test_other_executors_are_sync_value_by_value(name: str, kind: str) -> None:
     """One after another in this process, or several in each of some processes."""
     mode = AutoresetMode.SAME_STEP

@@ -29,6 +29,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption, UnreadableFile
 
 MODES = list(AutoresetMode)
+KINDS = [*((mode, "loop") for mode in MODES), (AutoresetMode.SAME_STEP, "processes")]
 FRICTION, MASS = "floor_friction", "tool_block.mass"
 COUNTER = interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100)
 """Shows the number of the episode in hundredths."""
@@ -69,8 +70,7 @@ def roll(envs: Any, steps: int, mode: AutoresetMode, seed: int | None = 0) -> li
     return found
 
 
-@pytest.mark.parametrize("kind", ["loop", "processes"])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("mode", "kind"), KINDS)
 def test_every_number_is_handed_out_once(mode: AutoresetMode, kind: str) -> None:
     """Episodes have the numbers of one series, in the order in which they begin."""
     envs = made(COUNTER, mode, kind=kind)
@@ -100,8 +100,7 @@ def test_some_may_begin_anew_alone(mode: AutoresetMode) -> None:
     assert seen == set(range(max(seen) + 1))
 
 
-@pytest.mark.parametrize("kind", ["loop", "processes"])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("mode", "kind"), KINDS)
 def test_stages_are_shared(mode: AutoresetMode, kind: str) -> None:
     """Successes of all members count together; the next stage holds in each of them."""
     solved = at_step(1, {"goal_block.cartesian_position": [0.0, 0.0, 0.0325]})

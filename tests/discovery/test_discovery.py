@@ -53,7 +53,7 @@ def test_models_are_recovered_exactly(seed: int) -> None:
 @pytest.mark.parametrize("task", ["pushing", "reaching"])
 def test_worlds_are_recovered(task: str, backend: str) -> None:
     """On both engines every declared edge is found, and no other; the floor is exactly zero."""
-    report = discover(task, backend=backend, probes=16)
+    report = discover(task, backend=backend, probes=12)
     assert report.score.undeclared == ()
     assert report.score.recall >= 0.99
     assert report.floor == 0.0

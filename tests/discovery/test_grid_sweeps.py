@@ -261,13 +261,10 @@ def test_a_sweep_can_have_more_units(world: World, tmp_path: Path) -> None:
 
 
 def test_workers_change_nothing(world: World, tmp_path: Path) -> None:
-    """Two processes write the files that one does; so does a collection."""
-    design = Design("half", (MASS, FRICTION))
+    """Two processes write the files that one does."""
     for name, workers in (("one", 1), ("two", 2)):
         sweep(world, OVER, [SPEED], n=3, out=tmp_path / name, workers=workers, **FILES)
-        collect(world, design, 9, out=tmp_path / f"c{name}", workers=workers, **FILES)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
-    assert contents(tmp_path / "cone") == contents(tmp_path / "ctwo")
 
 
 def test_what_other_processes_cannot_have_is_refused(world: World, tmp_path: Path) -> None:

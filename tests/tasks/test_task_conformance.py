@@ -42,6 +42,8 @@ class OnEveryTask(TaskConformance):
     """All tasks, on one of the engines."""
 
     backend: ClassVar[str]
+    episodes = 2
+    steps = 25
     task: str
     awake: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "obstacle_places": {"number_of_obstacles": 2},
