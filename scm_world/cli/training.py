@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -90,17 +89,7 @@ def train(
     used = backend or load_task(task).backend
     folder: Any = console.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
     if not quiet:
-        rows = {
-            "recipe": made.name,
-            "curriculum": json.dumps(made.curriculum["part"]),
-            "steps": f"{made.steps:,} in {made.worlds} worlds of {used}",
-            "actions": made.env.get("action_mode", "joint_positions"),
-            "observations": made.observations + (", with goals" if made.hindsight else ""),
-            "evaluation": ", ".join(made.trials.protocols) or "none while training",
-            "seed": seed,
-            "folder": folder,
-        }
-        console.table(("", ""), rows.items(), title=f"Training {made.algo.upper()} on {made.task}")
+        console.say(f"Training {made}", f"on {used}, seed {seed}, in {folder}", "")
     bar = nullcontext() if quiet else console.progress("steps", lines=10)
     with console.resumable(folder, "checkpoints/*.pt", "checkpoints"), bar as tell:
         found = loop.train(
@@ -114,12 +103,7 @@ def train(
             progress=tell,
             tell=None if quiet else partial(console.say, stderr=True),
         )
-    score = "" if found.score is None else f", {found.score:.3f} in the evaluations while training"
-    console.say(
-        f"policy:   {found.policy} after {found.steps:,} steps",
-        f"best:     {found.best}{score}",
-        f"evaluate: scm-world evaluate {found.best} {made.task}",
-    )
+    _tell(found, made.task)
     if onnx:
         from scm_world.training.export import to_onnx
 
@@ -178,13 +162,8 @@ def clone(
     teacher = made.teacher if path is None else path.stem
     folder: Any = console.results_folder(out, "clone", tag(made.task), teacher, seed)
     if not quiet:
-        rows = {"from": source or made.teacher}
-        if path is None:
-            rows["episodes"] = f"{made.episodes} on {used}, in {', '.join(made.protocols)}"
-            rows["noise"] = f"up to {made.noise:g} of the largest action"
-            rows["rounds"] = f"{made.rounds} more, of {made.more} episodes"
-        rows |= {"observations": made.observations, "seed": str(seed), "folder": str(folder)}
-        console.table(("", ""), rows.items(), title=f"Learning {made.task} by imitation")
+        source = source or made.teacher
+        console.say(f"Learning {made}", f"from {source} on {used}, seed {seed}, in {folder}", "")
     bar = nullcontext() if quiet else console.progress("episodes")
     with console.resumable(folder, "demonstrations/*.npz", "files of episodes"), bar as tell:
         found = imitation.clone(
@@ -196,18 +175,23 @@ def clone(
             progress=tell,
             tell=None if quiet else partial(console.say, stderr=True),
         )
-    score = "" if found.score is None else f", {found.score:.3f} in the evaluations between rounds"
-    console.say(
-        f"policy:   {found.policy}",
-        f"best:     {found.best}{score}",
-        f"evaluate: scm-world evaluate {found.best} {task}",
-    )
+    _tell(found, task)
     learned = found.lesson
     usual = recipe(task, observations=learned.observations)
     same = all(usual.options.get(k) == learned.options.get(k) for k in (*FORM, *COMMON))
     if same and usual.network.activation == learned.network.activation:
         more = "" if observations is None else f" --observations {observations}"
         console.say(f"go on:    scm-world train {task}{more} --start {found.best}")
+
+
+def _tell(found: Any, task: str) -> None:
+    """Print where the policies of a training are, and what evaluates them."""
+    score = "" if found.score is None else f", {found.score:.3f} in the evaluations on the way"
+    console.say(
+        f"policy:   {found.policy}",
+        f"best:     {found.best}{score}",
+        f"evaluate: scm-world evaluate {found.best} {task}",
+    )
 
 
 def _fields(changes: list[str] | None, **given: Any) -> dict[str, Any]:

@@ -144,6 +144,14 @@ class Lesson(Frozen):
         """Options of the environment, with all that follows from the other fields."""
         return observed(self.env, self.observations)
 
+    def __str__(self) -> str:
+        """Say in a few words what is shown and learned."""
+        return (
+            f"{self.task} by imitation: {self.episodes} episodes in {', '.join(self.protocols)}, "
+            f"with noise up to {self.noise:g}, then {self.rounds} rounds of {self.more}; "
+            f"observations {self.observations}"
+        )
+
     def about(self) -> dict[str, Any]:
         """Return it as plain data."""
         return {"format": "scm_world/lesson/1", **self.model_dump(mode="json")}

@@ -163,6 +163,16 @@ class Recipe(Frozen):
             chosen(self.trials.protocols, _protocols(self.task, self.env))
         return self
 
+    def __str__(self) -> str:
+        """Say in a few words how an agent is trained."""
+        trials = ", ".join(self.trials.protocols) or "nothing"
+        goals = ", with goals" if self.hindsight else ""
+        return (
+            f"{self.algo.upper()} on {self.task}: {self.steps:,} steps in {self.worlds} worlds, "
+            f"actions {self.env.get('action_mode', 'as the task has them')}, observations "
+            f"{self.observations}{goals}; meanwhile {trials} is evaluated"
+        )
+
     def but(self, **changes: Any) -> Recipe:
         """Return the same recipe with changes, as ``recipe`` takes them; None changes nothing.
 
