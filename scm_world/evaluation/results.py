@@ -22,7 +22,6 @@ from scm_world.evaluation.statistics import (
     aggregate,
     difference_interval,
     find_causes,
-    is_binary,
     mean_interval,
 )
 from scm_world.output.remote import Location, located
@@ -34,6 +33,9 @@ KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
 
 DRAWN = "drawn "
 """First word of the columns with the values that were drawn."""
+
+RATES = (*FRACTIONS, "success")
+"""The metrics that lie in [0, 1] whatever happens."""
 
 Columns = dict[str, NDArray[Any]]
 
@@ -90,13 +92,7 @@ def paired(one: Columns, other: Columns, metric: str) -> Interval:
         raise UnknownOption("seed and episode of a pair", differ, allowed)
     units = sorted(mine)
     first, second = (np.array([scores[unit] for unit in units]) for scores in (mine, its))
-    binary = is_rate(metric, first) and is_rate(metric, second)
-    return difference_interval(first, second, proportion=binary)
-
-
-def is_rate(metric: str, scores: NDArray[np.float64]) -> bool:
-    """Tell whether scores are failures and successes: not by chance, as fractions may be."""
-    return metric == "success" and is_binary(scores)
+    return difference_interval(first, second, proportion=metric in RATES)
 
 
 def digest_of(columns: Columns) -> str:
@@ -280,7 +276,7 @@ class Evaluation:
         if len(set(mine.columns["hash"].tolist())) == len(set(runs.tolist())) < len(values):
             mean = float(values.mean())  # nothing is random here: one episode, again and again
             return Interval(mean, mean, mean, LEVEL, len(values))
-        return mean_interval(values, runs, proportion=is_rate(metric, values))
+        return mean_interval(values, runs, proportion=metric in RATES)
 
     def difference(
         self,
@@ -362,7 +358,7 @@ class Evaluation:
         units = zip(first.columns["seed"].tolist(), first.columns["episode"].tolist(), strict=True)
         varied = {n: v for n, v in first.drawn().items() if not np.isnan(v).all()}
         scores = np.array([score_of[unit] for unit in units])
-        return find_causes(varied, scores, proportion=is_rate(metric, scores))
+        return find_causes(varied, scores, proportion=metric in RATES)
 
     def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
         """Give means and standard deviations under the predecessor's names, by protocol."""

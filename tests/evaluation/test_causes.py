@@ -48,7 +48,7 @@ def by_name(causes: Causes) -> Mapping[str, Cause]:
 def test_known_effects_are_recovered() -> None:
     """With many episodes, shares and contrasts are those that were put in."""
     drawn, scores = episodes(0, n=20_000)
-    found = by_name(find_causes(drawn, scores, resamples=200, permutations=100))
+    found = by_name(find_causes(drawn, scores, permutations=100))
     for name, share in SHARES.items():
         assert found[name].share.value == pytest.approx(share, abs=0.02), name
     assert found["line"].column.contrast.value == pytest.approx(-2 / 3, abs=0.03)
@@ -62,7 +62,7 @@ def test_two_hundred_episodes_name_the_causes_and_no_other() -> None:
     """Strong causes are found in twenty protocols of twenty; others hardly ever are."""
     mistakes = 0
     for seed in range(20):
-        found = find_causes(*episodes(seed), resamples=2)
+        found = find_causes(*episodes(seed))
         assert {cause.variable for cause in found.found()} >= {"line", "parabola"}
         assert found.ranked()[0].variable in ("line", "parabola")
         mistakes += not {cause.variable for cause in found.found()} <= set(VARIANCES)
@@ -192,7 +192,7 @@ def test_shares_are_right_on_average_and_their_intervals_as_wide_as_they_vary() 
         rng = np.random.default_rng(seed)
         cause = rng.random((60, 2))
         scores = cause.sum(axis=1) + np.sqrt(1 / 6) * rng.standard_normal(60)
-        (one,) = find_causes({"x": cause}, scores, resamples=2, permutations=1).causes
+        (one,) = find_causes({"x": cause}, scores, permutations=1).causes
         found.append(one.share)
     values, low, high = np.array([(share.value, share.low, share.high) for share in found]).T
     assert values.mean() == pytest.approx(0.5, abs=4 * values.std() / np.sqrt(150))
@@ -210,7 +210,6 @@ def test_shares_are_right_on_average_and_their_intervals_as_wide_as_they_vary() 
         {"scores": []},
         {"level": 1.0},
         {"permutations": 0},
-        {"resamples": 0.5},
     ],
 )
 def test_bad_input_is_refused(given: dict[str, Any]) -> None:
@@ -227,7 +226,7 @@ def test_null_variables_are_rarely_called_causes() -> None:
         rng = np.random.default_rng(seed)
         wins = (rng.random(60) < 0.7).astype(float)
         drawn = {"one": rng.random(60), "three": rng.random((60, 3))}
-        found = find_causes(drawn, wins, permutations=99, resamples=2, seed=seed)
+        found = find_causes(drawn, wins, permutations=99, seed=seed)
         p += [cause.p for cause in found.causes]
     # Four standard errors of 400 draws from a uniform distribution.
     for level in (0.05, 0.2, 0.5):
@@ -241,7 +240,7 @@ def test_intervals_of_effects_cover_what_they_should() -> None:
     shares = dict.fromkeys(VARIANCES, 0)
     contrasts = {"line": 0, "weak": 0, "parabola": 0}
     for seed in range(400):
-        found = by_name(find_causes(*episodes(seed), permutations=1, resamples=500, seed=seed))
+        found = by_name(find_causes(*episodes(seed), permutations=1, seed=seed))
         for name in shares:
             share = found[name].share
             shares[name] += share.low <= SHARES[name] <= share.high
@@ -261,6 +260,6 @@ def test_a_family_of_null_variables_is_rarely_called_a_cause() -> None:
         rng = np.random.default_rng(seed)
         drawn = {f"v{k}": rng.random((N, 1 + k % 3)) for k in range(10)}
         scores = rng.beta(4, 1, N)
-        found = find_causes(drawn, scores, permutations=999, resamples=2, seed=seed)
+        found = find_causes(drawn, scores, permutations=999, seed=seed)
         named += bool(found.found())
     assert 5 <= named <= 38  # 20 expected; four standard errors

@@ -28,7 +28,7 @@ def test_a_planted_cause_is_found() -> None:
     rows = [
         row
         for run in (0, 1)
-        for row in by_hand((drawn["tool_block.mass"] < 0.5) + noise[run], drawn, run=run)
+        for row in by_hand(0.9 * (drawn["tool_block.mass"] < 0.5) + noise[run], drawn, run=run)
     ]
     found = Evaluation.of({"task": "pushing"}, rows).causes("P1")
     first, second = found.ranked()

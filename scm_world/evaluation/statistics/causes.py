@@ -27,7 +27,6 @@ from scm_world._types import ArrayLike, Floats, Value
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.statistics.intervals import (
     LEVEL,
-    RESAMPLES,
     Interval,
     draws,
     normal_quantile,
@@ -150,7 +149,6 @@ def find_causes(
     scores: ArrayLike,
     *,
     level: float = LEVEL,
-    resamples: int = RESAMPLES,
     permutations: int = PERMUTATIONS,
     seed: int = 0,
     proportion: bool | None = None,
@@ -163,10 +161,9 @@ def find_causes(
             not vary the variable; it is left out for this variable, or column, alone.
         scores: One per episode, shape ``(n,)``.
         level: Confidence of the intervals.
-        resamples: Of the bootstrap of the contrasts.
         permutations: Of the tests.
-        seed: Of both. What is found about one variable does not depend on which others there are,
-            except for Holm's correction.
+        seed: Of the tests. What is found about one variable does not depend on which others there
+            are, except for Holm's correction.
         proportion: Whether scores are failures and successes; as for ``mean_interval``.
 
     Returns:
@@ -174,13 +171,13 @@ def find_causes(
         varied are in ``left_out``.
 
     Raises:
-        UnknownOption: No scores; values of another shape, or not real numbers; or a level,
-            resamples or permutations that are none.
+        UnknownOption: No scores; values of another shape, or not real numbers; or a level or
+            permutations that are none.
     """
     given = numbers("scores", scores)
     normal_quantile(level)
     draws("permutations", permutations, 1)
-    how: Any = {"level": level, "resamples": resamples, "seed": seed, "proportion": proportion}
+    how: Any = {"level": level, "proportion": proportion}
     left_out: dict[str, str] = {}
     found: list[Cause] = []
     for variable, values in drawn.items():

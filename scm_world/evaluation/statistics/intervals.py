@@ -1,13 +1,14 @@
 """Estimates of scores with intervals: means, differences, and aggregates over runs and protocols.
 
-Intervals are percentiles of a bootstrap within each stratum (Efron and Tibshirani, *An Introduction
-to the Bootstrap*, 1993). Success rates get intervals of the binomial distribution instead, because
-a bootstrap of two hundred successes in a row has no width. Aggregates, profiles and improvement are
-those of rliable, which cannot be imported beside pandas 3, and draws from numpy's global generator.
+A bootstrap of three or ten numbers is too short, and one of two hundred successes in a row has no
+width. So means have intervals of Student's t, and rates those of binomial distributions. Intervals
+over training runs treat a run with its scores in all protocols as one unit. Aggregates over
+episodes are resampled within each run (Efron and Tibshirani, *An Introduction to the Bootstrap*,
+1993). ``benchmarks/coverage.py`` measures how often all of them contain the truth.
 
 Source:
     Agarwal et al., *Deep reinforcement learning at the edge of the statistical precipice*,
-    NeurIPS 2021.
+    NeurIPS 2021, for the aggregates, profiles and the probability of improvement.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from scm_world.errors import UnknownOption
 
 LEVEL = 0.95
 RESAMPLES = 2000
+FEWEST_RUNS = 3
+"""With fewer runs there is no interval over runs."""
 BLOCK = 1_000_000  # numbers that are resampled at once, some ten megabytes
 
 
@@ -83,31 +86,32 @@ def mean_interval(
     strata: ArrayLike | None = None,
     *,
     level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
     proportion: bool | None = None,
 ) -> Interval:
     """Estimate a mean, with an interval.
 
     Args:
         values: One number per episode, shape ``(n,)``.
-        strata: To which stratum each belongs, for example its training run, shape ``(n,)``. Every
-            resample has as many episodes of each stratum; a Wilson interval has no strata.
+        strata: To which stratum each belongs, for example its training run, shape ``(n,)``. The
+            interval is about other episodes of the same strata; those of failures and successes,
+            and of strata of which one has a single number, leave the strata out and are wider.
         level: Confidence.
-        resamples: Of the bootstrap, whose draws come from ``seed`` alone.
-        seed: Of the bootstrap.
-        proportion: Whether the values are failures and successes, 0 and 1, which get a Wilson
-            interval. By default they are if each of them is 0 or 1.
+        proportion: Whether the values are rates, which lie in [0, 1] whatever happens. By default
+            they are if all of them do.
 
     Returns:
-        The mean. Its ends are unknown if no stratum has two numbers, unless these are proportions.
+        The mean. Failures and successes, 0 and 1, have the interval of Wilson, other rates that of
+        ``interval_of``, all other numbers that of Student's t with the degrees of freedom of
+        Welch and Satterthwaite, whose ends are unknown where nothing varies within strata.
 
     Raises:
-        UnknownOption: No values; values, strata, level or resamples that are none; or a
-            proportion of values that are not 0 or 1.
+        UnknownOption: No values; values, strata or a level that are none; or a proportion of
+            values that do not lie in [0, 1].
 
     Source:
         Wilson, *Probable inference*, Journal of the American Statistical Association 22, 1927.
+        Satterthwaite, *An approximate distribution of estimates of variance components*,
+        Biometrics Bulletin 2, 1946.
 
     Example:
         >>> print(mean_interval([1.0] * 200))
@@ -122,33 +126,32 @@ def mean_interval(
             raise UnknownOption("strata", f"an array of shape {labels.shape}", allowed)
         members = [scores[labels == label] for label in np.unique(labels)]
     normal_quantile(level)
-    if proportion and not is_binary(scores):
-        raise UnknownOption("a value of a proportion", "another number", ("0 or 1",))
-    if not (is_binary(scores) if proportion is None else proportion):
-        return _bootstrapped_mean(scores, members, level, resamples, seed)
+    is_rate = bool(scores.min() >= 0.0 and scores.max() <= 1.0)
+    if proportion and not is_rate:
+        raise UnknownOption("a value of a proportion", "another number", ("in [0, 1]",))
+    if not (is_rate if proportion is None else proportion):
+        return _of_mean(scores, members, level, None)
+    if not is_binary(scores):
+        return _of_mean(scores, members, level, (0.0, 1.0))
     from scipy.stats import binomtest
 
     found = binomtest(int(scores.sum()), scores.size).proportion_ci(level, method="wilson")
-    return _around(scores, found.low, found.high, level)
+    mean = float(scores.mean())
+    return Interval(mean, min(found.low, mean), max(found.high, mean), level, scores.size)
 
 
 def difference_interval(
-    a: ArrayLike,
-    b: ArrayLike,
-    *,
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-    proportion: bool | None = None,
+    a: ArrayLike, b: ArrayLike, *, level: float = LEVEL, proportion: bool | None = None
 ) -> Interval:
     """Estimate how much higher ``a`` is than ``b`` in the same episodes (paired).
 
     Both have shape ``(n,)``; the other arguments are those of ``mean_interval``.
 
     Returns:
-        The mean of ``a - b``, with a bootstrap of the differences. Where every score is 0 or 1 the
-        interval is that of Bonett and Price: one episode in which only the first succeeds and one
-        in which only the second does are added.
+        The mean of ``a - b``, with the interval of Student's t; its ends are unknown where all
+        differences are the same. Where every score is 0 or 1 the interval is that of Bonett and
+        Price: one episode in which only the first succeeds and one in which only the second does
+        are added.
 
     Raises:
         UnknownOption: As for ``mean_interval``, or ``a`` and ``b`` differ in length.
@@ -161,17 +164,17 @@ def difference_interval(
     first, second = numbers("a", a), numbers("b", b)
     if first.shape != second.shape:
         raise UnknownOption("b", f"{second.size} scores", (f"one for each of the {first.size} a",))
-    difference = first - second
+    difference, both = first - second, np.concatenate([first, second])
     z = normal_quantile(level)
-    binary = is_binary(first) and is_binary(second)
-    if not (binary if proportion is None else proportion):
-        return _bootstrapped_mean(difference, [difference], level, resamples, seed)
+    if proportion is False or not is_binary(both):
+        return _of_mean(difference, [difference], level, None)
     n = len(difference) + 2.0
     wins = (np.count_nonzero(difference > 0.0) + 1.0) / n
     losses = (np.count_nonzero(difference < 0.0) + 1.0) / n
-    center = wins - losses
+    center, mean = wins - losses, float(difference.mean())
     reach = z * math.sqrt((wins + losses - center**2) / n)
-    return _around(difference, max(-1.0, center - reach), min(1.0, center + reach), level)
+    low, high = max(-1.0, center - reach), min(1.0, center + reach)
+    return Interval(mean, min(low, mean), max(high, mean), level, difference.size)
 
 
 def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
@@ -263,24 +266,67 @@ def normal_quantile(level: float) -> float:
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
-def _bootstrapped_mean(
-    values: Floats, strata: list[Floats], level: float, resamples: int, seed: int
+def _of_mean(
+    values: Floats, strata: list[Floats], level: float, bounds: tuple[float, float] | None
 ) -> Interval:
-    several = [part for part in strata if len(part) > 1]
-    if not several:
-        return Interval(float(values.mean()), math.nan, math.nan, level, values.size)
-    single = sum(float(part[0]) for part in strata if len(part) == 1)
+    """Give the mean of numbers with its interval; numbers with bounds lie between them."""
+    mean, n = float(values.mean()), values.size
+    parts = strata if min(map(len, strata)) > 1 else [values]
+    if n == 1:
+        return Interval(mean, math.nan, math.nan, level, n)
+    shares = np.array([len(part) * part.var(ddof=1) for part in parts]) / n**2
+    spent = np.array([1.0 / (len(part) - 1) for part in parts])
+    variance = float(shares.sum())
+    if variance <= (1e-15 * float(np.abs(values).max())) ** 2:  # nothing varies but by rounding
+        variance, degrees = 0.0, n - 1.0
+    else:
+        degrees = variance**2 / float((shares**2 * spent).sum())
+    low, high = interval_of(mean, math.sqrt(variance), degrees, n, level, bounds)
+    return Interval(mean, float(low), float(high), level, n)
 
-    def mean(*parts: Floats, axis: int) -> Any:
-        return (single + sum(part.sum(axis=axis) for part in parts)) / values.size
 
-    low, high = bootstrap(several, mean, level=level, resamples=resamples, seed=seed)
-    return _around(values, float(low), float(high), level)
+def interval_of(
+    value: ArrayLike,
+    error: ArrayLike,
+    degrees: float,
+    n: int,
+    level: float,
+    bounds: tuple[ArrayLike, ArrayLike] | None,
+) -> tuple[Floats, Floats]:
+    """Return the ends of the intervals of estimates, each of the shape of ``value``.
 
+    Args:
+        value: The estimates.
+        error: Their standard errors.
+        degrees: Of freedom, from which the errors are known.
+        n: How many independent units there are.
+        level: Confidence.
+        bounds: Between which values lie, so that an estimate is a share of the way from one to the
+            other. It gets the interval of Clopper and Pearson with as many effective units as give
+            its error, corrected for the degrees of freedom, but not fewer than ``n``. None: the
+            interval of Student's t, whose ends are NaN where the error is 0.
 
-def _around(values: Floats, low: float, high: float, level: float) -> Interval:
-    mean = float(values.mean())
-    return Interval(mean, min(low, mean), max(high, mean), level, values.size)
+    Source:
+        Korn and Graubard, *Confidence intervals for proportions with small expected number of
+        positive counts estimated from survey data*, Survey Methodology 24, 1998.
+    """
+    from scipy.special import betaincinv, stdtrit
+
+    center, spread = np.asarray(value, dtype=np.float64), np.asarray(error, dtype=np.float64)
+    tail, z = 0.5 - 0.5 * level, normal_quantile(level)
+    t = float(stdtrit(degrees, 1.0 - tail))
+    if bounds is None:
+        reach = np.where(spread > 0.0, t * spread, np.nan)
+        return center - reach, center + reach
+    least, most = (np.asarray(bound, dtype=np.float64) for bound in bounds)
+    share, scale = np.clip((center - least) / (most - least), 0.0, 1.0), most - least
+    with np.errstate(divide="ignore", invalid="ignore"):
+        units = share * (1.0 - share) * np.square(scale * z / (t * spread))
+    units = np.maximum(np.where(spread > 0.0, units, n), n)
+    hits, misses = share * units, (1.0 - share) * units
+    low = np.where(hits > 0.0, betaincinv(np.maximum(hits, 1e-300), misses + 1.0, tail), 0.0)
+    up = np.where(misses > 0.0, betaincinv(hits + 1.0, np.maximum(misses, 1e-300), 1 - tail), 1.0)
+    return least + scale * low, least + scale * up
 
 
 METRICS = ("mean", "median", "interquartile_mean", "optimality_gap")
@@ -296,51 +342,53 @@ def aggregate(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> dict[str, Interval]:
-    """Estimate the four aggregates, with stratified bootstrap intervals.
+    """Estimate the four aggregates, with intervals.
 
     Args:
         scores: Shape ``(runs, protocols)``, or ``(runs, protocols, episodes)``.
         over: ``"runs"``: a run's score in a protocol is the mean of its episodes, and runs are
-            resampled within each protocol; the interval is about other runs of the same training.
-            ``"episodes"``: episodes are resampled within each run and protocol; the interval is
-            about other episodes of the same runs.
+            the units, each with its scores in all protocols; the interval is about other runs of
+            the same training. ``"episodes"``: episodes are resampled within each run and
+            protocol; the interval is about other episodes of the same runs.
         gamma: Score that counts as enough, for the optimality gap.
         level: Confidence.
-        resamples: Of the bootstrap.
-        seed: Of the bootstrap.
+        resamples: Of the bootstrap over episodes.
+        seed: Of the bootstrap over episodes.
 
     Returns:
         By the names of ``METRICS``: the mean; the median protocol's mean; the mean of the middle
         half, of which the number left out at each end is rounded down; and by how much scores miss
-        ``gamma`` on average.
+        ``gamma`` on average. The ends of an interval over two runs are unknown. An interval over
+        few runs holds where the scores of runs are spread about normally. It is too short where a
+        run either learns or fails and all runs at hand did the same.
 
     Raises:
         UnknownOption: Scores, level, resamples or ``over`` that are none; or less than two runs,
-            or episodes, to resample.
+            or episodes.
 
     Example:
         >>> scores = np.random.default_rng(0).beta(8, 2, size=(5, 12))
         >>> print(aggregate(scores)["interquartile_mean"])
-        0.79 [0.76, 0.83]
+        0.79 [0.71, 0.86]
     """
     from scipy.stats import trim_mean
 
-    groups = _groups("scores", scores, over)
+    table = _units("scores", scores, over)
     normal_quantile(level)
     if not np.isfinite(gamma):
         raise UnknownOption("gamma", gamma, ("a finite number",))
 
-    def metrics(*strata: Floats, axis: int = -1) -> Any:
-        table = _pooled(strata, groups.shape)
-        flat = table.reshape(len(table), -1)
-        gap = gamma - np.minimum(flat, gamma).mean(axis=-1)
+    def metrics(table: Floats) -> Floats:
+        flat = table.reshape(*table.shape[:-2], -1)
         median = np.median(table.mean(axis=-1), axis=-1)
+        gap = gamma - np.minimum(flat, gamma).mean(axis=-1)
         return np.stack([flat.mean(axis=-1), median, trim_mean(flat, 0.25, axis=-1), gap])
 
-    found = metrics(*_strata(groups[None]))[:, 0]
-    low, high = bootstrap(_strata(groups), metrics, level=level, resamples=resamples, seed=seed)
+    most = np.array([1.0, 1.0, 1.0, max(gamma, 1.0)])
+    how: Any = {"over": over, "level": level, "resamples": resamples, "seed": seed}
+    found, low, high = _interval(table, metrics, most, **how)
     return {
-        name: Interval(float(found[k]), float(low[k]), float(high[k]), level, groups.size)
+        name: Interval(float(found[k]), float(low[k]), float(high[k]), level, table.size)
         for k, name in enumerate(METRICS)
     }
 
@@ -353,7 +401,7 @@ class Profile:
     Attributes:
         thresholds: In the unit of the scores.
         share: Of all runs (or episodes) and protocols whose score is higher.
-        low: Lower edge of the band, point by point.
+        low: Lower edge of the band, point by point; NaN over two runs.
         high: Upper edge.
         level: Confidence at each threshold.
         n: How many scores there are.
@@ -383,85 +431,121 @@ def performance_profile(
     Raises:
         UnknownOption: As for ``aggregate``, or thresholds that are no numbers.
     """
-    groups = _groups("scores", scores, over)
+    table = _units("scores", scores, over)
     normal_quantile(level)
     grid = np.linspace(0.0, 1.0, 101) if thresholds is None else numbers("thresholds", thresholds)
 
-    def shares(*strata: Floats, axis: int = -1) -> Any:
-        table = _pooled(strata, groups.shape)
-        return np.stack([(table > threshold).mean(axis=(1, 2)) for threshold in grid])
+    def shares(table: Floats) -> Floats:
+        return np.stack([(table > threshold).mean(axis=(-2, -1)) for threshold in grid])
 
-    share = shares(*_strata(groups[None]))[:, 0]
-    low, high = bootstrap(_strata(groups), shares, level=level, resamples=resamples, seed=seed)
-    return Profile(grid, share, low, high, level, groups.size)
+    how: Any = {"over": over, "level": level, "resamples": resamples, "seed": seed}
+    share, low, high = _interval(table, shares, np.ones(grid.shape), is_share=True, **how)
+    return Profile(grid, share, low, high, level, table.size)
 
 
 def probability_of_improvement(
-    x: ArrayLike,
-    y: ArrayLike,
-    *,
-    over: str = "runs",
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
+    x: ArrayLike, y: ArrayLike, *, over: str = "runs", level: float = LEVEL
 ) -> Interval:
     """Estimate how probable a run of ``x`` scores higher than a run of ``y``.
 
     Per protocol it is the share of pairs in which x is higher, a tie counting half: the
     statistic of Mann and Whitney over the number of pairs. The protocols are then averaged.
     x and y are scores in the same protocols, shaped as for ``aggregate`` like the other arguments;
-    they may have different numbers of runs, and are resampled apart.
+    they may have different numbers of runs.
+
+    Returns:
+        The probability, with the interval of a single protocol. It is not too short where the same
+        runs play all protocols, and longer than it need be where protocols differ much.
 
     Raises:
         UnknownOption: As for ``aggregate``, or x and y have different numbers of protocols.
+
+    Source:
+        Newcombe, *Confidence intervals for an effect size measure based on the Mann-Whitney
+        statistic, part 2*, Statistics in Medicine 25, 2006, method 5.
     """
-    ours, theirs = _groups("x", x, over), _groups("y", y, over)
-    normal_quantile(level)
-    protocols = ours.shape[1]
-    if theirs.shape[1] != protocols:
-        allowed = (f"the {protocols} protocols of x",)
-        raise UnknownOption("y", f"{theirs.shape[1]} protocols", allowed)
-    rng = np.random.default_rng(seed)
-    value, drawn = 0.0, np.zeros(draws("resamples", resamples))
-    for protocol in range(protocols):
-        first, second = ours[:, protocol].ravel(), theirs[:, protocol].ravel()
-        higher = 0.5 + 0.5 * np.sign(first[:, None] - second[None, :])  # (x, y)
-        of_x, of_y = (_counts(groups, resamples, rng) for groups in (ours, theirs))
-        value += float(higher.mean()) / protocols
-        drawn += np.einsum("rj,rj->r", of_x @ higher, of_y) / (higher.size * protocols)
-    low, high = np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
-    return Interval(value, float(low), float(high), level, ours.size + theirs.size)
+    from scipy.optimize import brentq
+
+    ours, theirs = _units("x", x, over), _units("y", y, over)
+    z = normal_quantile(level)
+    if len(theirs) != len(ours):
+        allowed = (f"the {len(ours)} protocols of x",)
+        raise UnknownOption("y", f"{len(theirs)} protocols", allowed)
+    pairs = zip(ours, theirs, strict=True)
+    higher = [np.sign(a.ravel()[:, None] - b.ravel()).mean() for a, b in pairs]
+    value = 0.5 + 0.5 * float(np.mean(higher))
+    m, n = ours[0].size, theirs[0].size
+    more = 0.5 * (m + n) - 1.0
+
+    def outside(p: float) -> Any:
+        """Compare the distance from the estimate with what is within the interval."""
+        spread = 1.0 + more * (1.0 - p) / (2.0 - p) + more * p / (1.0 + p)
+        return (value - p) ** 2 - z * z * p * (1.0 - p) * spread / (m * n)
+
+    tiny = 1e-12
+    low = brentq(outside, 0.0, min(value, 1.0 - tiny)) if value > 0.0 else 0.0
+    high = brentq(outside, max(value, tiny), 1.0) if value < 1.0 else 1.0
+    return Interval(value, low, high, level, ours.size + theirs.size)
 
 
-def _groups(name: str, scores: ArrayLike, over: str) -> Floats:
-    """Return scores as groups of runs or of episodes, shape ``(groups, protocols, units)``."""
+def _units(name: str, scores: ArrayLike, over: str) -> Floats:
+    """Return scores as ``(protocols, strata, units)``: runs, or episodes within each run."""
     one_of("over", over, OVER)
     array = numbers(name, scores, ndim=(2, 3))
     if over == "episodes" and array.ndim == 2:
         given = f"an array of shape {array.shape} over episodes"
         raise UnknownOption(name, given, ("an array of shape (runs, protocols, episodes)",))
     if over == "runs":
-        array = (array if array.ndim == 2 else array.mean(axis=2)).T[None]
+        array = (array if array.ndim == 2 else array.mean(axis=2))[None]
+        array = np.moveaxis(array, 1, 2)
     if array.shape[2] < 2:
         allowed = ("'runs' with two runs or more", "'episodes' with two episodes or more")
         raise UnknownOption("over", f"{over} of which {name} has one", allowed)
-    return array
+    return np.moveaxis(array, 0, 1)
 
 
-def _strata(groups: Floats) -> list[Floats]:
-    """Part scores of shape ``(..., groups, protocols, units)`` into what is resampled within."""
-    return list(np.moveaxis(groups.reshape(*groups.shape[:-3], -1, groups.shape[-1]), -2, 0))
+def _interval(
+    table: Floats,
+    statistic: Callable[[Floats], Floats],
+    most: Floats,
+    *,
+    over: str,
+    level: float,
+    resamples: int,
+    seed: int,
+    is_share: bool = False,
+) -> tuple[Floats, Floats, Floats]:
+    """Estimate numbers with their intervals, each of shape ``(k,)``.
 
+    Args:
+        table: Shape ``(protocols, strata, units)``.
+        statistic: Takes shape ``(..., protocols, scores)``, returns ``(k, ...)``.
+        most: What the numbers cannot exceed where scores lie between 0 and 1, shape ``(k,)``.
+        over: Whether units are runs, in one stratum, or episodes.
+        level: Confidence.
+        resamples: Of the bootstrap within strata.
+        seed: Of the bootstrap.
+        is_share: Whether the numbers lie between 0 and ``most`` whatever the scores are.
 
-def _pooled(strata: tuple[Floats, ...], shape: tuple[int, ...]) -> Floats:
-    """Put resampled strata together, shape ``(resamples, protocols, groups * units)``."""
-    groups, protocols, units = shape
-    table = np.stack(strata, axis=1).reshape(-1, groups, protocols, units)
-    return np.moveaxis(table, 1, 2).reshape(-1, protocols, groups * units)
+    Source:
+        Tukey's jackknife: Efron and Tibshirani, 11.
+    """
+    protocols, strata, n = table.shape
+    value = statistic(table.reshape(protocols, -1))
+    if over == "episodes":
 
+        def of_resamples(*parts: Floats, axis: int = -1) -> Any:
+            drawn = np.stack(parts, axis=1)  # (resamples, protocols * strata, units)
+            return statistic(drawn.reshape(len(drawn), protocols, strata * n))
 
-def _counts(groups: Floats, resamples: int, rng: np.random.Generator) -> Floats:
-    """Draw how often each unit of a protocol is in a resample: ``(resamples, groups * units)``."""
-    n = groups.shape[2]
-    size = (resamples, len(groups))
-    return rng.multinomial(n, np.full(n, 1.0 / n), size=size).reshape(resamples, -1).astype(float)
+        parts = list(table.reshape(-1, n))
+        low, high = bootstrap(parts, of_resamples, level=level, resamples=resamples, seed=seed)
+        return value, low, high
+    if n < FEWEST_RUNS:
+        return value, np.full(value.shape, np.nan), np.full(value.shape, np.nan)
+    runs = table[:, 0]
+    without = np.stack([statistic(np.delete(runs, run, axis=1)) for run in range(n)])
+    error = np.sqrt((n - 1) / n * np.square(without - without.mean(axis=0)).sum(axis=0))
+    is_bounded = is_share or bool(runs.min() >= 0.0 and runs.max() <= 1.0)
+    bounds = (np.zeros_like(most), most) if is_bounded else None
+    return value, *interval_of(value, error, n - 1.0, n, level, bounds)
