@@ -16,6 +16,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples
 
 CONFIDENCE = 0.95
+FEW = 20  # units that do not show how skewed their distribution is
 
 
 @final
@@ -26,9 +27,11 @@ class Effect:
     Attributes:
         outcome: What was asked for.
         mean: Of the difference, shape of the outcome.
-        low: Lower end of the confidence interval.
+        low: Lower end of the confidence interval; NaN where nothing varies.
         high: Upper end.
-        n: How many units; paired, each of them lived through both.
+        caution: When the interval is too short, as far as the sample can show; empty if it shows
+            nothing of the kind.
+        n: How many units; paired, each of them is simulated twice.
         paired: Whether both interventions met the same noise.
         variance_ratio: Variance of an unpaired difference over that of a paired one: so many
             times fewer units give an interval of the same length.
@@ -38,13 +41,14 @@ class Effect:
         seed: Of the noise.
         engine: Name and version.
         do: What was done.
-        versus: What it is held against.
+        versus: What it is compared with.
     """
 
     outcome: str
     mean: Floats
     low: Floats
     high: Floats
+    caution: str
     n: int
     paired: bool
     variance_ratio: Floats
@@ -58,19 +62,21 @@ class Effect:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether an effect is beyond doubt, in some component."""
-        return bool(np.any((self.low > 0.0) | (self.high < 0.0)))
+        """Whether the interval excludes zero in some component, or all units differ by the same."""
+        constant = np.isnan(self.low) & (self.mean != 0.0)
+        return bool(np.any((self.low > 0.0) | (self.high < 0.0) | constant))
 
     def as_dict(self) -> dict[str, Any]:
         """Write the result as plain data; functions in plans are an error, see ``Plan``."""
         numbers = ("mean", "low", "high", "variance_ratio", "treated", "control")
         found = {name: np.asarray(getattr(self, name)).tolist() for name in numbers}
-        found["variance_ratio"] = _finite(found["variance_ratio"])
+        found |= {name: _finite(found[name]) for name in ("low", "high", "variance_ratio")}
         return {
             "format": "scm_world/effect/1",
             "outcome": self.outcome,
             **found,
             "confidence": CONFIDENCE,
+            "caution": self.caution,
             "n": self.n,
             "paired": self.paired,
             "rollouts": self.rollouts,
@@ -90,6 +96,7 @@ class Effect:
         return (
             f"{self.outcome}: {_show(self.mean)} [{_show(self.low)}, {_show(self.high)}], "
             f"n = {self.n} {how}, variance unpaired : paired {ratio}"
+            + (f"; {self.caution}" if self.caution else "")
         )
 
 
@@ -114,7 +121,8 @@ def difference(
         paired: Whether they are.
 
     Returns:
-        Mean, lower and upper end, and the ratio of the variances unpaired : paired.
+        Mean, lower and upper end of the interval of Student's t, and the ratio of the variances
+        unpaired : paired. The ends are NaN where nothing varies but by rounding.
     """
     from scipy.special import stdtrit
 
@@ -125,9 +133,46 @@ def difference(
     spread = together if paired else apart
     degrees = n - 1 if paired else 2 * n - 2
     reach = stdtrit(degrees, 0.5 + 0.5 * CONFIDENCE) * np.sqrt(spread / n)
+    rounding = 1e-14 * np.maximum(np.abs(treated).max(axis=0), np.abs(control).max(axis=0))
+    reach = np.where(np.sqrt(spread) > rounding, reach, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(together > 0.0, apart / together, np.where(apart > 0.0, np.inf, 1.0))
     return mean, mean - reach, mean + reach, ratio
+
+
+def caution(treated: Floats, control: Floats, *, paired: bool) -> str:
+    """Say when the interval of ``difference`` is too short, as far as the samples can show.
+
+    An interval of Student's t needs about 25 g² units, where g is the skewness. Few units do not
+    show how skewed their distribution is, so below 20 of them there is always a word of caution.
+
+    Args:
+        treated: As for ``difference``.
+        control: As for ``difference``.
+        paired: As for ``difference``.
+
+    Source:
+        Cochran, *Sampling Techniques*, 3rd edition, 1977, 2.15.
+    """
+    from scipy.stats import skew
+
+    n = len(treated)
+    low = np.ravel(difference(treated, control, paired=paired)[1])
+    constant, samples = np.isnan(low), [treated - control] if paired else [treated, control]
+    if constant.all():
+        return f"nothing varies in {n} units, so there is no interval"
+    tables = [np.reshape(sample, (n, -1))[:, ~constant] for sample in samples]
+    varied = np.hstack([table[:, np.ptp(table, axis=0) > 0.0] for table in tables])
+    skewness = float(np.abs(skew(varied, axis=0)).max())
+    needed = math.ceil(25.0 * skewness**2)
+    words = []
+    if n < FEW:
+        words.append(f"{n} units: the interval holds where they are spread about normally")
+    elif n < needed:
+        words.append(f"a skewness of {skewness:.1f} needs {needed} units for such an interval")
+    if constant.any():
+        words.append(f"{int(constant.sum())} components do not vary and have no interval")
+    return "; ".join(words)
 
 
 def effect_of(
@@ -156,6 +201,7 @@ def effect_of(
         mean=mean,
         low=low,
         high=high,
+        caution=caution(one, other, paired=paired),
         n=len(one),
         paired=paired,
         variance_ratio=ratio if paired else np.ones_like(np.asarray(mean)),

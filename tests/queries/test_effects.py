@@ -21,7 +21,7 @@ from scm_world.queries import (
     load_episode,
     save_episode,
 )
-from scm_world.queries.estimates import difference
+from scm_world.queries.estimates import caution, difference
 from scm_world.tasks import Pushing
 
 NATURE = {"tool_block.mass": "A", "tool_block.cylindrical_position": "A"}
@@ -64,13 +64,36 @@ def test_more_friction_stops_a_block_sooner(backend: str) -> None:
 
 
 def test_colors_have_no_effect_at_all() -> None:
-    """Not a small one: none, in every unit, and the interval is a point."""
+    """Not a small one: none, in every unit, so nothing varies and there is no interval."""
     found = World("pushing").effect(
         "tool_block.cartesian_position", do={"tool_block.color": [0.9, 0.1, 0.1]}, n=4, steps=8
     )
     assert not found.mean.any()
     assert not found.excludes_zero
-    assert (found.high == 0.0).all()
+    assert np.isnan(found.high).all()
+    assert found.caution == "nothing varies in 4 units, so there is no interval"
+
+
+@pytest.mark.parametrize("n", [10, 30])
+def test_skewed_effects_come_with_a_word_of_caution(n: int) -> None:
+    """Hardly a sample of lognormal effects or of rare responders misses the truth unseen."""
+    rng, zeros = np.random.default_rng(0), np.zeros((n, 1))
+    for draw, truth in (
+        (lambda: rng.lognormal(size=(n, 1)), math.exp(0.5)),
+        (lambda: (rng.random((n, 1)) < 0.05) * 1.0, 0.05),
+    ):
+        unseen = 0
+        for _ in range(300):
+            sample = draw()
+            _, low, high, _ = difference(sample, zeros, paired=True)
+            if not caution(sample, zeros, paired=True):
+                unseen += not low[0] <= truth <= high[0]
+        assert unseen <= 24  # 5 % of 300, and two standard errors
+    ordinary = rng.normal(size=(100, 1))
+    assert caution(ordinary, np.zeros((100, 1)), paired=True) == ""
+    assert "2 components" in caution(
+        np.hstack([ordinary, zeros[:1] * ordinary, 0.0 * ordinary]), np.zeros((100, 3)), paired=True
+    )
 
 
 def test_units_are_the_same_in_every_question() -> None:
@@ -109,7 +132,7 @@ def test_effects_over_values_and_by_a_covariate() -> None:
         slid, do=SLIDE, by=place, bins=2, n=8, nature=NATURE, steps=6, policy=None
     )
     assert groups[0][0][1] <= groups[1][0][0]
-    assert all(effect.low > 0.0 for _, effect in groups)
+    assert all(effect.excludes_zero for _, effect in groups)
     assert sum(effect.n for _, effect in groups) == 8
 
 

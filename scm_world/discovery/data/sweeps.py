@@ -257,10 +257,11 @@ def _flat(point: Point) -> dict[str, float]:
 
 
 def _mean(name: str, values: Floats, base: Floats) -> dict[str, float | None]:
-    """Estimate the mean difference of paired numbers; one number alone has no interval."""
+    """Estimate the mean difference of paired numbers; equal ones and a single one: no interval."""
     found: list[float | None] = [None, None, None]
     if len(values) > 1:
-        found = [float(end) for end in difference(values, base, paired=True)[:3]]
+        ends = [float(end) for end in difference(values, base, paired=True)[:3]]
+        found = [None if np.isnan(end) else end for end in ends]
     elif len(values):
         found[0] = float(values[0] - base[0])
     return {name + end: value for end, value in zip(ENDS, found, strict=True)}
