@@ -1,17 +1,18 @@
-"""What can be learnt by watching alone, held against what happens when one acts."""
+"""Effects identified from observational data, and compared with simulated interventions."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, final
 
 import networkx as nx
 import numpy as np
 
-from scm_world._types import Floats
-from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world._types import ArrayLike, Floats, Integers
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
 from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.queries.estimates import CONFIDENCE, Effect
@@ -23,7 +24,7 @@ from scm_world.variables import Draw, Mechanism
 @final
 @dataclass(frozen=True)
 class Identification:
-    """Which variables have to be watched so that watching tells what acting would do.
+    """The sets of observed variables from which an effect follows without an intervention.
 
     Attributes:
         treatment: The cause.
@@ -31,7 +32,7 @@ class Identification:
         graph: Of one episode, with what nature does.
         backdoor: A smallest set of observed variables that blocks every back door; None if there
             is none.
-        frontdoor: Sets of observed variables through which the whole effect runs; found by pgmpy.
+        frontdoor: Smallest sets of observed mediators that meet the front-door criterion.
     """
 
     treatment: str
@@ -93,23 +94,22 @@ def identify(
     observed: Iterable[str] | None = None,
     frontdoor: bool = False,
 ) -> Identification:
-    """Find the variables to adjust for.
+    """Find the variables from which an effect can be estimated without an intervention.
 
     Args:
         graph: Directed and acyclic.
         treatment: A node.
         outcome: A node.
-        observed: The nodes that are watched; all if None.
-        frontdoor: Whether to look for front doors too, with pgmpy.
+        observed: The observed nodes; all if None.
+        frontdoor: Whether to look for front doors of up to three mediators, too.
 
     Raises:
         UnknownOption: There is no such node, or both are one.
         ModelError: The graph has a cycle, or no directions.
-        MissingExtra: pgmpy is not installed.
 
     Source:
-        Pearl, *Causality*, 2nd edition, 3.3; the smallest separator is that of networkx (van der
-        Zander, Liśkiewicz and Textor, 2019).
+        Pearl, *Causality*, 2nd edition, 3.3.1 and 3.3.2; the smallest separator is that of networkx
+        (van der Zander, Liśkiewicz and Textor, 2019).
 
     Example:
         >>> graph = nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y"), ("w", "y")])
@@ -137,69 +137,268 @@ def identify(
 
 
 def _front_doors(
-    graph: nx.DiGraph, treatment: str, outcome: str, watched: set[str]
+    graph: nx.DiGraph, treatment: str, outcome: str, observed: set[str]
 ) -> Iterator[tuple[str, ...]]:
-    try:
-        base = importlib.import_module("pgmpy.base")
-        doors = importlib.import_module("pgmpy.identification")
-    except ImportError as error:
-        raise MissingExtra("pgmpy", "pgmpy") from error
-    kept = nx.ancestors(graph, outcome) | nx.ancestors(graph, treatment) | {outcome, treatment}
-    between = nx.descendants(graph, treatment) & nx.ancestors(graph, outcome) & watched
-    part = graph.subgraph(kept)
-    dag = base.DAG(
-        list(part.edges),
-        latents=set(part) - between - {treatment, outcome},
-        roles={"exposures": treatment, "outcomes": outcome},
-    )
-    found, is_there = doors.Frontdoor(variant="all").identify(dag)
-    if is_there:
-        yield from sorted(tuple(sorted(one.get_role("frontdoor"))) for one in found)
+    """List the smallest sets of mediators that meet Pearl's front-door criterion."""
+    between = nx.descendants(graph, treatment) & nx.ancestors(graph, outcome) & observed
+    behind = graph.copy()
+    behind.remove_edges_from(list(graph.out_edges(treatment)))
+    for size in (1, 2, 3):
+        found = False
+        for mediators in combinations(sorted(between), size):
+            without, after = graph.copy(), graph.copy()
+            without.remove_nodes_from(mediators)
+            after.remove_edges_from(list(graph.out_edges(mediators)))
+            intercepts = not nx.has_path(without, treatment, outcome)
+            unconfounded = nx.is_d_separator(behind, {treatment}, set(mediators), set())
+            blocked = nx.is_d_separator(after, set(mediators), {outcome}, {treatment})
+            if intercepts and unconfounded and blocked:
+                found = True
+                yield mediators
+        if found:
+            return
+
+
+@final
+@dataclass(frozen=True)
+class ObservationalEffect:
+    """An effect of a treatment on an outcome, estimated without an intervention.
+
+    Attributes:
+        mean: Of the outcome at the second value of the treatment minus that at the first.
+        low: Lower end of the 95 % interval.
+        high: Upper end.
+        outside: Share of the units in which one of the two values lies beyond the central 98 % of
+            what the treatment was in like units. There the estimate is an extrapolation.
+        n: How many units.
+    """
+
+    mean: float
+    low: float
+    high: float
+    outside: float
+    n: int
+
+    def __str__(self) -> str:
+        text = f"{self.mean:.4g} [{self.low:.4g}, {self.high:.4g}]"
+        return text + (f" ({self.outside:.0%} extrapolated)" if self.outside > OUTSIDE else "")
+
+
+OUTSIDE = 0.1
+"""An estimate with a larger share of extrapolated units says so."""
+
+
+def adjusted_effect(
+    treatment: ArrayLike, covariates: ArrayLike, outcome: ArrayLike, values: tuple[float, float]
+) -> ObservationalEffect:
+    """Estimate an effect by adjustment for covariates that block every back door.
+
+    A regression of the outcome is averaged over the units with the treatment at both values. It is
+    a sum of cubic splines of the treatment and of each covariate, and of the products of two. What
+    three of them do together, and products of curved functions, it cannot follow.
+
+    Args:
+        treatment: Shape (n,).
+        covariates: Shape (n, k); k may be 0.
+        outcome: Shape (n,).
+        values: Of the treatment.
+
+    Raises:
+        ModelError: The treatment does not vary, or there are too few units.
+
+    Source:
+        Hernán and Robins, *Causal inference: what if*, 13; the variance is HC3 of MacKinnon and
+        White, Journal of Econometrics 29, 1985.
+    """
+    from scipy.special import stdtrit
+
+    causes = np.column_stack([treatment, np.reshape(covariates, (len(np.ravel(treatment)), -1))])
+    effect, basis = np.asarray(outcome, dtype=np.float64), _Basis(causes)
+    table = basis(causes)
+    n, terms = table.shape
+    if n < 2 * terms:
+        raise ModelError([f"{n} units are too few for {terms} coefficients; {2 * terms} will do"])
+    if not causes[:, 0].std() > 0.0:
+        raise ModelError(["the treatment does not vary: let nature draw it, or give it a cause"])
+    inverse = np.linalg.pinv(table.T @ table)
+    slopes = inverse @ table.T @ effect
+    leverage = np.minimum(np.einsum("ij,jk,ik->i", table, inverse, table), 1.0 - 1e-9)
+    residuals = (effect - table @ slopes) / (1.0 - leverage)
+    each = _contrast(basis, causes, values)
+    influence = table @ inverse @ each.mean(axis=0) * residuals
+    variance = float(influence @ influence) + float((each @ slopes).var(ddof=1)) / n
+    degrees = n - int(np.linalg.matrix_rank(table))
+    half = float(stdtrit(degrees, 0.5 + 0.5 * CONFIDENCE)) * math.sqrt(variance)
+    mean = float(each.mean(axis=0) @ slopes)
+    return ObservationalEffect(mean, mean - half, mean + half, _outside(causes, values), n)
+
+
+def frontdoor_effect(
+    treatment: ArrayLike,
+    mediators: ArrayLike,
+    outcome: ArrayLike,
+    values: tuple[float, float],
+    *,
+    seed: int = 0,
+) -> ObservationalEffect:
+    """Estimate an effect by the front-door formula.
+
+    Each mediator is a spline of the treatment plus the residual of a unit, and the outcome is the
+    regression of ``adjusted_effect`` on mediators and treatment, averaged over both.
+
+    Args:
+        treatment: Shape (n,).
+        mediators: Shape (n, k): a set that meets the front-door criterion.
+        outcome: Shape (n,).
+        values: Of the treatment.
+        seed: Of the bootstrap over units, of 400 resamples, that gives the interval.
+
+    Raises:
+        ModelError: The treatment does not vary, or there are too few units.
+
+    Source:
+        Pearl, *Causality*, 2nd edition, 3.3.2.
+    """
+    from scipy.special import stdtrit
+
+    given = np.asarray(treatment, dtype=np.float64).reshape(-1, 1)
+    between = np.asarray(mediators, dtype=np.float64).reshape(len(given), -1)
+    effect, n = np.asarray(outcome, dtype=np.float64), len(given)
+    if not given.std() > 0.0:
+        raise ModelError(["the treatment does not vary: let nature draw it, or give it a cause"])
+    first, second = _Basis(given), _Basis(np.hstack([between, given]))
+    terms = second(np.hstack([between, given])).shape[1]
+    if n < 2 * terms:
+        raise ModelError([f"{n} units are too few for {terms} coefficients; {2 * terms} will do"])
+    rng = np.random.default_rng(seed)
+
+    def estimate(rows: Integers) -> float:
+        x, m, y = given[rows], between[rows], effect[rows]
+        moved, *_ = np.linalg.lstsq(first(x), m, rcond=None)
+        slopes, *_ = np.linalg.lstsq(second(np.hstack([m, x])), y, rcond=None)
+        rest = (m - first(x) @ moved)[rng.permutation(n)]  # independent of the treatment
+        sides = []
+        for value in values:
+            there = first(np.full((1, 1), float(value))) @ moved + rest
+            sides.append(second(np.hstack([there, x])) @ slopes)
+        return float((sides[1] - sides[0]).mean())
+
+    mean = estimate(np.arange(n))
+    drawn = [estimate(rng.integers(n, size=n)) for _ in range(400)]
+    half = float(stdtrit(n - terms, 0.5 + 0.5 * CONFIDENCE)) * float(np.std(drawn, ddof=1))
+    return ObservationalEffect(mean, mean - half, mean + half, _outside(given, values), n)
+
+
+class _Basis:
+    """Functions of which a regression is a sum, fixed by the units that it is made from.
+
+    Args:
+        causes: Shape (n, k).
+    """
+
+    def __init__(self, causes: Floats) -> None:
+        n, k = causes.shape
+        self._middle, self._scale = causes.mean(axis=0), causes.std(axis=0) + 1e-300
+        pieces = int(np.clip(n // (15 * k), 1, 8))
+        self._knots: list[Floats | None] = []
+        for column in ((causes - self._middle) / self._scale).T:
+            if len(np.unique(column)) <= 4:  # a few values: a line, and the products
+                self._knots.append(None)
+                continue
+            inner = np.unique(np.quantile(column, np.linspace(0.0, 1.0, pieces + 1)))
+            self._knots.append(np.r_[[inner[0]] * 3, inner, [inner[-1]] * 3])
+
+    def __call__(self, causes: Floats) -> Floats:
+        """Give the functions at some units, shape (m, terms); beyond the data they go on."""
+        from scipy.interpolate import BSpline
+
+        z = (causes - self._middle) / self._scale
+        columns = [np.ones((len(z), 1)), z]
+        for column, knots in zip(z.T, self._knots, strict=True):
+            if knots is not None:
+                made = BSpline.design_matrix(column, knots, 3, extrapolate=True).toarray()
+                columns.append(made[:, 1:-1])  # constants and lines are there already
+        k = z.shape[1]
+        columns += [z[:, [i]] * z[:, [j]] for i in range(k) for j in range(i)]
+        return np.hstack(columns)
+
+
+def _contrast(basis: Callable[[Floats], Floats], causes: Floats, values: Any) -> Floats:
+    """Give the difference of the functions of each unit between both values of the treatment."""
+    sides = []
+    for value in values:
+        side = causes.copy()
+        side[:, 0] = value
+        sides.append(basis(side))
+    return sides[1] - sides[0]
+
+
+def _outside(causes: Floats, values: tuple[float, float]) -> float:
+    """Give the share of units in which a value is beyond what the treatment was in like units."""
+    treatment, others = causes[:, 0], causes[:, 1:]
+    expected = np.full(len(causes), treatment.mean())
+    if others.shape[1]:
+        table = _Basis(others)(others)
+        slopes, *_ = np.linalg.lstsq(table, treatment, rcond=None)
+        expected = table @ slopes
+    low, high = np.quantile(treatment - expected, [0.01, 0.99])
+    apart = np.array(values)[:, None] - expected
+    return float(np.any((apart < low) | (apart > high), axis=0).mean())
 
 
 @final
 @dataclass(frozen=True)
 class AdjustmentCheck:
-    """An effect as watching tells it, beside the one that acting shows.
+    """An effect estimated from observational data, beside that of simulated interventions.
 
     Attributes:
         identification: What was adjusted for.
-        adjusted: The effect, standardised over what was adjusted for: mean and interval.
-        naive: The same without adjustment.
-        simulated: What acting showed.
-        n: How many episodes were watched.
+        adjusted: The estimate with adjustment.
+        naive: The estimate without.
+        simulated: The effect of interventions.
+        margin: Differences up to here count as none.
     """
 
     identification: Identification
-    adjusted: tuple[float, float, float]
-    naive: tuple[float, float, float]
+    adjusted: ObservationalEffect
+    naive: ObservationalEffect
     simulated: Effect
-    n: int
+    margin: float
+
+    def difference(self, estimate: ObservationalEffect) -> tuple[float, float, float]:
+        """Give estimate minus simulated effect, with the ends of its 95 % interval.
+
+        Source:
+            Zou and Donner, *Construction of confidence limits about effect measures*, Statistics
+            in Medicine 27, 2008.
+        """
+        truth = float(self.simulated.mean)
+        reach = np.nan_to_num(float(self.simulated.high) - truth)  # nothing varies: no error
+        mean = estimate.mean - truth
+        below = math.hypot(estimate.mean - estimate.low, reach)
+        return mean, mean - below, mean + math.hypot(estimate.high - estimate.mean, reach)
 
     @property
     def agrees(self) -> bool:
-        """Whether the intervals of the adjusted and of the simulated effect meet."""
-        _, low, high = self.adjusted
-        return bool(low <= float(self.simulated.high) and float(self.simulated.low) <= high)
+        """Whether both effects are equivalent: their difference is within the margin for sure."""
+        _, low, high = self.difference(self.adjusted)
+        return -self.margin <= low and high <= self.margin
 
     @property
     def is_confounded(self) -> bool:
-        """Whether the interval without adjustment misses that of the simulated effect."""
-        _, low, high = self.naive
-        return bool(high < float(self.simulated.low) or float(self.simulated.high) < low)
+        """Whether the estimate without adjustment differs from the simulated effect for sure."""
+        _, low, high = self.difference(self.naive)
+        return low > 0.0 or high < 0.0
 
     def __str__(self) -> str:
-        def show(numbers: tuple[float, float, float]) -> str:
-            return "{:.4g} [{:.4g}, {:.4g}]".format(*numbers)
-
-        acted = tuple(
-            float(x) for x in (self.simulated.mean, self.simulated.low, self.simulated.high)
-        )
+        acted = (float(x) for x in (self.simulated.mean, self.simulated.low, self.simulated.high))
         found = self.identification
+        mean, low, high = self.difference(self.adjusted)
         return (
-            f"{found.treatment} → {found.outcome}: watching {show(self.adjusted)} adjusted for "
-            f"{', '.join(found.backdoor or ()) or 'nothing'}; {show(self.naive)} unadjusted; "
-            f"acting {show((acted[0], acted[1], acted[2]))}"
+            f"{found.treatment} → {found.outcome}: observational {self.adjusted} adjusted for "
+            f"{', '.join(found.backdoor or ()) or 'nothing'}; {self.naive} unadjusted; "
+            "interventional {:.4g} [{:.4g}, {:.4g}]; ".format(*acted)
+            + f"difference {mean:.4g} [{low:.4g}, {high:.4g}], margin {self.margin:.4g}"
         )
 
 
@@ -213,12 +412,10 @@ def check_backdoor(
     observed: Iterable[str] | None = None,
     n: int = 200,
     units: int = 50,
+    margin: float | None = None,
     **setting: Any,
 ) -> AdjustmentCheck:
-    """Estimate an effect from episodes that are only watched, and check it by acting.
-
-    The estimate is standardised: a quadratic model of the outcome, given the treatment and the
-    variables of the back door, is averaged over these variables with the treatment at both values.
+    """Estimate an effect from observational episodes, and compare it with interventions.
 
     Args:
         world: A ``scm_world.queries.World``.
@@ -226,13 +423,14 @@ def check_backdoor(
         outcome: The name of a variable or an ``Outcome``, one number.
         values: Of the treatment: the effect is that of the second against the first.
         nature: What varies by itself.
-        observed: What is watched; everything if None.
-        n: How many episodes are watched.
+        observed: The observed variables; all if None.
+        n: How many episodes are observed.
         units: In how many units the effect is simulated.
+        margin: Differences up to here count as none; a fifth of the simulated effect if None.
         setting: See ``World.sample``.
 
     Raises:
-        ModelError: The effect cannot be told from watching.
+        ModelError: The effect is not identified, or there are too few episodes.
         UnknownOption: The outcome is no variable.
     """
     wanted = as_outcome(outcome)
@@ -244,12 +442,12 @@ def check_backdoor(
     found = identify(graph, treatment, wanted.name, observed=observed)
     if found.backdoor is None:
         raise ModelError(
-            [f"the effect of {treatment!r} cannot be told by watching {sorted(observed or graph)}"]
+            [f"the effect of {treatment!r} is not identified from {sorted(observed or graph)}"]
         )
     names = (treatment, *(name.removesuffix("@0") for name in found.backdoor))
     read = [Outcome(name, "first") for name in names]
     seen = world.see(n, outcomes=[*read, wanted], nature=nature, **setting)
-    *causes, effect = (np.asarray(column, float).reshape(n, -1) for column in seen.values())
+    cause, *rest, effect = (np.asarray(column, float).reshape(n, -1) for column in seen.values())
     if effect.shape[1] != 1:
         raise UnknownOption("outcome", outcome, ("one number: Outcome(name, how, component)",))
     simulated = world.effect(
@@ -260,53 +458,8 @@ def check_backdoor(
         nature={name: act for name, act in nature.items() if name != treatment},
         **setting,
     )
-    adjusted = _standardised(np.hstack(causes), effect[:, 0], values)
-    return AdjustmentCheck(
-        found, adjusted, _standardised(causes[0], effect[:, 0], values), simulated, n
-    )
-
-
-def _standardised(
-    causes: Floats, effect: Floats, values: tuple[float, float]
-) -> tuple[float, float, float]:
-    """Estimate an effect by standardisation over a quadratic model, with its interval.
-
-    Args:
-        causes: The treatment in the first column, shape (n, k).
-        effect: Shape (n,).
-        values: Of the treatment.
-
-    Source:
-        Hernán and Robins, *Causal inference: what if*, 13; the interval is that of a linear
-        combination of ordinary least squares coefficients.
-    """
-    terms = (causes.shape[1] + 1) * (causes.shape[1] + 2) // 2
-    if len(effect) < 2 * terms:
-        raise ModelError(
-            [f"{len(effect)} episodes are too few for {terms} coefficients; watch {2 * terms}"]
-        )
-    if not causes[:, 0].std() > 0.0:
-        raise ModelError(["the treatment does not vary: let nature draw it, or give it a cause"])
-    middle, scale = causes.mean(axis=0), causes.std(axis=0) + 1e-300
-
-    def design(rows: Floats) -> Floats:
-        z = (rows - middle) / scale
-        pairs = [z[:, i] * z[:, j] for i in range(z.shape[1]) for j in range(i + 1)]
-        return np.column_stack([np.ones(len(z)), z, *pairs])
-
-    from scipy.special import stdtrit
-
-    table = design(causes)
-    inverse = np.linalg.pinv(table.T @ table)
-    slopes = inverse @ table.T @ effect
-    degrees = max(len(effect) - int(np.linalg.matrix_rank(table)), 1)
-    spread = float(((effect - table @ slopes) ** 2).sum()) / degrees
-    sides = [causes.copy(), causes.copy()]
-    for side, value in zip(sides, values, strict=True):
-        side[:, 0] = value
-    each = design(sides[1]) - design(sides[0])
-    apart = each.mean(axis=0)
-    mean, variance = float(apart @ slopes), spread * float(apart @ inverse @ apart)
-    variance += float((each @ slopes).var(ddof=1)) / len(effect)  # units are a sample, too
-    half = float(stdtrit(degrees, 0.5 + 0.5 * CONFIDENCE)) * float(np.sqrt(variance))
-    return mean, mean - half, mean + half
+    covariates = np.hstack(rest) if rest else np.empty((n, 0))
+    adjusted = adjusted_effect(cause[:, 0], covariates, effect[:, 0], values)
+    naive = adjusted_effect(cause[:, 0], np.empty((n, 0)), effect[:, 0], values)
+    within = 0.2 * abs(float(simulated.mean)) if margin is None else float(margin)
+    return AdjustmentCheck(found, adjusted, naive, simulated, within)
