@@ -263,3 +263,28 @@ def test_a_family_of_null_variables_is_rarely_called_a_cause() -> None:
         found = find_causes(drawn, scores, permutations=999, seed=seed)
         named += bool(found.found())
     assert 5 <= named <= 38  # 20 expected; four standard errors
+
+
+def test_variables_that_depend_on_one_another_are_listed() -> None:
+    """With the share of the variance that may be the effect of either."""
+    rng = np.random.default_rng(0)
+    mass, color = rng.random((2, 300))
+    size = mass + 0.3 * rng.random(300)
+    found = find_causes({"mass": mass, "size": size, "color": color}, mass + 0.1 * rng.random(300))
+    (only,) = found.dependent
+    assert only.variables == ("mass", "size")
+    assert only.shared > 0.7
+    assert "mass and size depend on one another" in str(found)
+    curved = find_causes({"x": mass, "y": (mass - 0.5) ** 2}, color)
+    assert [pair.variables for pair in curved.dependent] == [("x", "y")]
+    assert curved.dependent[0].shared < 0.1
+
+
+def test_independent_draws_are_rarely_called_dependent() -> None:
+    """At most one set of six independent variables in twenty is."""
+    wrong = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        drawn = {f"v{k}": rng.random((100, 1 + k % 2)) for k in range(6)}
+        wrong += bool(find_causes(drawn, rng.random(100), permutations=1).dependent)
+    assert wrong <= 3

@@ -2,7 +2,9 @@
 
 A protocol draws its variables at random, each on its own. So nothing but the variable itself can
 make the score depend on it, and what is associated with the score in the very episodes of the
-evaluation is an effect (Fisher, *The Design of Experiments*, 1935).
+evaluation is an effect (Fisher, *The Design of Experiments*, 1935). Where variables depend on one
+another in the episodes at hand, because draws were refused or the user drew them together, this
+does not hold: such pairs are found and listed, with the share that cannot be told apart.
 
 A column's values are parted into pieces, with a line in each of them; its share is R² of that
 regression: the first-order Sobol index, or correlation ratio, of the column. The share of several
@@ -19,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, final
 
 import numpy as np
@@ -38,6 +41,8 @@ PERMUTATIONS = 1000
 FEWEST = 12
 """Fewer episodes than these say nothing about a column."""
 PIECES = 5
+DEPENDENT = 0.01
+"""Below this corrected p-value two variables count as dependent."""
 
 
 @final
@@ -106,16 +111,42 @@ class Cause:
 
 @final
 @dataclass(frozen=True)
+class Dependence:
+    """Two varied variables that depend on one another in the episodes at hand.
+
+    Attributes:
+        variables: Their names.
+        shared: Share of the score's variance that either of them explains, so that it cannot be
+            told whose effect it is, in [0, 1].
+        p: Probability of such a dependence if there were none, corrected for all pairs.
+    """
+
+    variables: tuple[str, str]
+    shared: float
+    p: float
+
+    def __str__(self) -> str:
+        one, other = self.variables
+        return (
+            f"{one} and {other} depend on one another (p = {self.p:.2g}): {self.shared:.2f} of the "
+            "variance cannot be told apart"
+        )
+
+
+@final
+@dataclass(frozen=True)
 class Causes:
     """The effects of all varied variables on the score.
 
     Attributes:
         causes: In the order in which the variables were given.
         left_out: Why the data say nothing about a column or variable, by its name.
+        dependent: Pairs of variables that were not drawn independently.
     """
 
     causes: tuple[Cause, ...]
     left_out: Mapping[str, str]
+    dependent: tuple[Dependence, ...] = ()
 
     def ranked(self) -> tuple[Cause, ...]:
         """Return the variables, the one that explains most of the score first."""
@@ -141,6 +172,7 @@ class Causes:
         lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in (head, *rows)]
         lines = lines if rows else []
         lines += [f"{name}: left out, {reason}" for name, reason in self.left_out.items()]
+        lines += map(str, self.dependent)
         return "\n".join(lines)
 
 
@@ -168,7 +200,7 @@ def find_causes(
 
     Returns:
         An effect for each variable. Columns that never change and columns that too few episodes
-        varied are in ``left_out``.
+        varied are in ``left_out``, variables that depend on one another in ``dependent``.
 
     Raises:
         UnknownOption: No scores; values of another shape, or not real numbers; or a level or
@@ -180,6 +212,7 @@ def find_causes(
     how: Any = {"level": level, "proportion": proportion}
     left_out: dict[str, str] = {}
     found: list[Cause] = []
+    tables: dict[str, Floats] = {}
     for variable, values in drawn.items():
         names, table = _table(variable, values, given.size)
         left_out |= {
@@ -189,6 +222,8 @@ def find_causes(
         }
         kept = [k for k, name in enumerate(names) if name not in left_out]
         table = table[:, kept]
+        if kept:
+            tables[variable] = table
         columns = []
         for name, column in zip((names[k] for k in kept), table.T, strict=True):
             rows = ~np.isnan(column)
@@ -210,7 +245,62 @@ def find_causes(
             found.append(Cause(variable, share, p, p, n, tuple(columns)))
     corrected = holm([cause.p for cause in found])
     causes = (replace(cause, p_holm=p) for cause, p in zip(found, corrected, strict=True))
-    return Causes(tuple(causes), left_out)
+    return Causes(tuple(causes), left_out, _dependent(tables, given))
+
+
+def _dependent(tables: Mapping[str, Floats], scores: Floats) -> tuple[Dependence, ...]:
+    """List the pairs of variables of which one explains a part of the other.
+
+    Each column of one is regressed on the pieces of the other, with an F test; p-values are
+    corrected for the columns by Bonferroni's rule, and for the pairs by Holm's.
+    """
+    from scipy.stats import f
+
+    pairs, ps, shared = list(combinations(tables, 2)), [], []
+    for one, other in pairs:
+        rows = ~np.isnan(np.hstack([tables[one], tables[other]])).any(axis=1)
+        sides = [list(tables[name][rows].T) for name in (one, other)]
+        n, p = int(rows.sum()), 1.0
+        for causes, effects in (sides, sides[::-1]):
+            if n < FEWEST:
+                continue
+            for column in effects:
+                fitted, r = _fitted(causes, column)
+                rest = n - r - 1
+                total = float(np.square(column - column.mean()).sum())
+                if total <= 0.0 or rest < 1 or r == 0:
+                    continue
+                left = max(total - float(np.square(fitted).sum()), 1e-12 * total)
+                p = min(p, float(f.sf((total - left) / r / (left / rest), r, rest)))
+        parts = []
+        for columns in (*sides, [*sides[0], *sides[1]]):
+            fitted, r = _fitted(columns, scores[rows])
+            variance = float(np.square(scores[rows] - scores[rows].mean()).sum())
+            raw = float(np.square(fitted).sum()) / variance if variance > 0.0 else 0.0
+            parts.append(max(1.0 - (1.0 - raw) * (n - 1.0) / max(n - r - 1.0, 1.0), 0.0))
+        ps.append(min(1.0, p * sum(map(len, sides))))
+        shared.append(max(parts[0] + parts[1] - parts[2], 0.0))
+    return tuple(
+        Dependence(pair, both, p)
+        for pair, both, p in zip(pairs, shared, holm(ps), strict=True)
+        if p < DEPENDENT
+    )
+
+
+def _fitted(columns: Sequence[Floats], values: Floats) -> tuple[Floats, int]:
+    """Regress centered values on the pieces of columns; give the fit, and its rank."""
+    regressors = _regressors(columns, values.size)
+    return regressors @ (regressors.T @ (values - values.mean())) / values.size, regressors.shape[1]
+
+
+def _regressors(columns: Sequence[Floats], n: int) -> Floats:
+    """Span the functions of columns, uncorrelated, of mean 0 and variance 1, shape (n, r)."""
+    count = max(1, min(round(math.cbrt(n)), 1 + n // (20 * len(columns)), PIECES))
+    spanned = np.concatenate([_pieces(column, count) for column in columns], axis=1)
+    left, sizes, _ = np.linalg.svd(spanned - spanned.mean(axis=0), full_matrices=False)
+    r = int(np.count_nonzero(sizes > 1e-9 * sizes[0]))
+    found: Floats = left[:, :r] * math.sqrt(n)
+    return found
 
 
 def _table(variable: str, values: ArrayLike, n: int) -> tuple[list[str], Floats]:
@@ -268,11 +358,8 @@ def _share(
     variance = float(np.square(centered).mean())
     if variance <= 1e-24 * max(1.0, float(np.square(scores).max())):  # nothing but rounding
         return Interval(0.0, 0.0, 0.0, level, n), 1.0
-    count = max(1, min(round(math.cbrt(n)), 1 + n // (20 * len(columns)), PIECES))
-    spanned = np.concatenate([_pieces(column, count) for column in columns], axis=1)
-    left, sizes, _ = np.linalg.svd(spanned - spanned.mean(axis=0), full_matrices=False)
-    r = int(np.count_nonzero(sizes > 1e-9 * sizes[0]))
-    regressors = left[:, :r] * math.sqrt(n)  # uncorrelated, of mean 0 and variance 1
+    regressors = _regressors(columns, n)
+    r = regressors.shape[1]
     fitted = regressors @ (regressors.T @ centered) / n
     raw = float(np.square(fitted).mean()) / variance
 
