@@ -226,6 +226,11 @@ def _causes(evaluation: Evaluation, line: Line, metric: str) -> tuple[Line, dict
         "verdicts": {protocol: verdict(one) for protocol, one in found.items()},
         "effects": [(protocol, one) for protocol, f in found.items() for one in f.ranked()],
         "left_out": [[p, *one] for p, f in found.items() for one in f.left_out.items()],
+        "dependent": [
+            [protocol, " and ".join(pair.variables), f"{pair.shared:.2f}"]
+            for protocol, one in found.items()
+            for pair in one.dependent
+        ],
     }
     return line, shown, figure
 
