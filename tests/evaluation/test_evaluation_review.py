@@ -13,7 +13,6 @@ from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation, Protocol, WorldPolicy, check, evaluate, why
 from scm_world.evaluation.files import false_scores
 from scm_world.evaluation.outputs.report import write_outputs
-from scm_world.evaluation.statistics import mean_interval
 from scm_world.policies import OnnxPolicy
 from scm_world.tasks import Pushing
 
@@ -114,13 +113,12 @@ def test_episodes_without_noise_have_no_interval() -> None:
     assert drawn.width > 0.0
 
 
-def test_fractions_are_no_rates_by_chance() -> None:
-    """All zero is treated as nearly all zero is."""
+def test_fractions_that_never_vary_have_an_interval() -> None:
+    """Eight times nothing may be followed by something."""
     found = tiny(protocols="P2", n=8)
     score = found.score("P2", "last_fractional_success")
-    nearly = mean_interval([0.0] * 7 + [1e-6])
-    assert (score.low, nearly.low) == pytest.approx((0.0, 0.0), abs=1e-6)
-    assert 0.3 < score.high < nearly.high < 0.4  # eight zeros may be followed by another number
+    assert (score.value, score.low) == (0.0, 0.0)
+    assert score.high == pytest.approx(3.8415 / (8 + 3.8415), abs=1e-4)  # Wilson
 
 
 def test_a_list_is_one_agent() -> None:

@@ -137,7 +137,8 @@ def mean_interval(
 
     found = binomtest(int(scores.sum()), scores.size).proportion_ci(level, method="wilson")
     mean = float(scores.mean())
-    return Interval(mean, min(found.low, mean), max(found.high, mean), level, scores.size)
+    low, high = min(float(found.low), mean), max(float(found.high), mean)
+    return Interval(mean, low, high, level, scores.size)
 
 
 def difference_interval(
