@@ -603,7 +603,7 @@ class _Runner:
             if not self._held_out:
                 self._held_out.append(made.held_out(run.seed))
             test = self._held_out[0]
-            scores["effect_rmse"] = None if test is None else effect_rmse(found, table, test).rmse
+            scores["effect_rmse"] = None if test is None else effect_rmse(found, table, test)
         return replace(
             run,
             found=found.restricted(truth.names),

@@ -342,25 +342,7 @@ CONSTANT = 1e-12
 """A column that varies less than this, relative to its mean, is constant."""
 
 
-@final
-@dataclass(frozen=True)
-class Prediction:
-    """How far predicted means are from the true ones, under held-out interventions.
-
-    Attributes:
-        rmse: Root of the mean square over regimes and columns that were not set, each difference
-            divided by the standard deviation of the column where nothing is done. None if it
-            cannot be computed.
-        unmoved: The same for the prediction that nothing moves; a graph is worth something below.
-        note: Why ``rmse`` is None.
-    """
-
-    rmse: float | None
-    unmoved: float | None = None
-    note: str = ""
-
-
-def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> Prediction:
+def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float | None:
     """Predict the mean of every column under interventions that were not learned from.
 
     The mechanism of each column is linear in its estimated parents, fitted by least squares on the
@@ -375,6 +357,12 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> Predict
         train: With rows in which nothing was done.
         test: With rows in which something was done.
 
+    Returns:
+        Root of the mean square of what is predicted wrong, over regimes and columns that were not
+        set, each difference divided by the standard deviation of the column where nothing is done.
+        None where the graph has edges through time, a cycle or no extension, or where no column
+        varies that was not set.
+
     Raises:
         UnknownVariable: The graph is about something that is no column and no variable.
         ModelError: ``train`` has no row in which nothing was done, or ``test`` none in which
@@ -388,18 +376,15 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> Predict
         raise ModelError(["train has no row in which nothing was done"])
     if not any(test.regimes[number].targets for number in np.unique(test.regime)):
         raise ModelError(["test has no row in which something was done"])
-    if found.edges[1:].any():
-        return Prediction(None, note="the graph has edges through time")
-    dag = extension(found.edges[0])
+    dag = None if found.edges[1:].any() else extension(found.edges[0])
     if dag is None:
-        return Prediction(None, note="the graph has a cycle, or no extension")
+        return None
     where, graph = _over_columns(found.names, dag, train)
     seen = train.observational.values[:, where]
     middle, spread = seen.mean(axis=0), seen.std(axis=0)
     spread[spread <= CONSTANT * (1.0 + np.abs(middle))] = np.nan
     weight, offset = _fitted(train.values[:, where], train.targeted[:, where], graph)
     errors: list[Floats] = []
-    moves: list[Floats] = []
     for number in np.unique(test.regime):
         rows = test.regime == number
         fixed = test.targeted[rows][0, where]
@@ -411,11 +396,7 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> Predict
                 if not fixed[node]:
                     predicted[node] = offset[node] + predicted @ weight[:, node]
             errors.append(((predicted - came_out) / spread)[known])
-            moves.append(((middle - came_out) / spread)[known])
-    if not moves:
-        return Prediction(None, note="no column varies that was not set")
-    rmse, unmoved = (float(np.sqrt((np.concatenate(p) ** 2).mean())) for p in (errors, moves))
-    return Prediction(rmse, unmoved)
+    return float(np.sqrt((np.concatenate(errors) ** 2).mean())) if errors else None
 
 
 def _fitted(values: Floats, targeted: Bools, graph: Bools) -> tuple[Floats, Floats]:

@@ -15,7 +15,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world.errors import UnknownOption
-from scm_world.variables.kinds import SPACES, SpaceName, Variable
+from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Box, Frozen, Space
 
 Region = SpaceName | Space
@@ -100,11 +100,6 @@ class Subset(Frozen):
         for pattern, _ in self.parts:
             if not any(fnmatchcase(name, pattern) for name in known):
                 yield pattern
-
-    def space_of(self, variable: Variable) -> Space | None:
-        """Give the set in which a variable may lie; None where it is not to be set."""
-        region = self.region(variable.name)
-        return variable.space(region) if isinstance(region, str) else region
 
     def __str__(self) -> str:
         return " × ".join(f"{_region(region)}[{pattern}]" for pattern, region in self.parts)

@@ -243,8 +243,8 @@ def rmse(edges: list[tuple[str, str, int]], data: Dataset, *held_out: tuple[str,
     """Predict held-out interventions with these edges."""
     train, test = hold_out(data, held_out)
     found = effect_rmse(EstimatedGraph.of_edges(("x", "y", "z"), edges), train, test)
-    assert found.rmse is not None
-    return found.rmse
+    assert found is not None
+    return found
 
 
 def test_the_true_graph_predicts_interventions() -> None:
@@ -256,7 +256,8 @@ def test_the_true_graph_predicts_interventions() -> None:
     assert rmse([("x", "y", 0), ("z", "y", 0)], data, ("y",)) > 0.3
     train, test = hold_out(data, [("x",)])
     nothing = effect_rmse(EstimatedGraph.of_edges(("x", "y", "z"), []), train.observational, test)
-    assert nothing.rmse == pytest.approx(nothing.unmoved)
+    assert nothing is not None
+    assert nothing > 0.3
 
 
 def test_prediction_does_not_depend_on_scale() -> None:
@@ -266,13 +267,13 @@ def test_prediction_does_not_depend_on_scale() -> None:
 
 
 def test_prediction_says_when_it_does_not_apply() -> None:
-    """Cycles and lags give None with a reason; missing rows and unknown names are errors."""
+    """Cycles and lags give None; missing rows and unknown names are errors."""
     data = chain_data()
     train, test = hold_out(data, [("x",)])
     ring = EstimatedGraph.of_edges(("x", "y", "z"), [("x", "y", 0), ("y", "z", 0), ("z", "x", 0)])
     late = EstimatedGraph.of_edges(("x", "y", "z"), [("x", "y", 1)])
-    assert effect_rmse(ring, train, test).note == "the graph has a cycle, or no extension"
-    assert effect_rmse(late, train, test).note == "the graph has edges through time"
+    assert effect_rmse(ring, train, test) is None
+    assert effect_rmse(late, train, test) is None
     with pytest.raises(ModelError, match="something was done"):
         effect_rmse(ring, train, data.observational)
     with pytest.raises(ModelError, match="nothing was done"):
@@ -298,11 +299,12 @@ def test_prediction_over_vectors_constants_and_undirected_edges() -> None:
     regimes = tuple(Regime(r.plan, ("a",) if r.targets else ()) for r in data.regimes)
     train, test = hold_out(replace(data, regimes=regimes), [("a",)])
     found = effect_rmse(EstimatedGraph.of_edges(("a", "b", "c"), [("a", "b", 0)]), train, test)
-    assert found.rmse is not None
-    assert found.unmoved is not None
-    assert found.rmse < 0.1 < 2.0 < found.unmoved
+    nothing = effect_rmse(EstimatedGraph.of_edges(("a", "b", "c"), []), train, test)
+    assert found is not None
+    assert nothing is not None
+    assert found < 0.1 < 2.0 < nothing
     both = EstimatedGraph.of(("a", "b", "c"), [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
     way = effect_rmse(EstimatedGraph.of(("a", "b", "c"), extension(both.edges[0])), train, test)
-    assert effect_rmse(both, train, test).rmse == way.rmse
+    assert effect_rmse(both, train, test) == way
     alone = effect_rmse(EstimatedGraph.of_edges(("c",), []), train, test)
-    assert alone.note == "no column varies that was not set"
+    assert alone is None

@@ -74,6 +74,10 @@ class Regime:
         return cls(plan, tuple(map(str, data["targets"])))
 
 
+Row = tuple[int, int, Regime, Floats]
+"""Episode, control step, regime and values, shape (p,)."""
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Dataset:
@@ -172,6 +176,17 @@ class Dataset:
             step=np.zeros(n, np.int64) if step is None else np.array(step, dtype=np.int64),
             about=dict(about),
         )
+
+    @classmethod
+    def stacked(
+        cls, columns: tuple[Column, ...], rows: Sequence[Row], about: dict[str, Any]
+    ) -> Dataset:
+        """Put rows below one another; regimes are numbered as they occur."""
+        regimes: dict[Regime, int] = {}
+        numbers = [(e, s, regimes.setdefault(regime, len(regimes))) for e, s, regime, _ in rows]
+        episode, step, regime = np.array(numbers, dtype=np.int64).reshape(-1, 3).T.copy()
+        values = np.array([row for *_, row in rows], dtype=np.float64).reshape(-1, len(columns))
+        return cls(values, columns, tuple(regimes), regime, episode, step, about)
 
     # --- looking ------------------------------------------------------------------------------
 

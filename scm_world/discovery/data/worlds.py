@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Column, Dataset, Regime, columns_of
+from scm_world.discovery.data.dataset import Column, Dataset, Regime, Row, columns_of
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.recorded import (
     columns_of_outcome,
@@ -169,28 +169,16 @@ class WorldSource:
             plan = self._setting.plan(self._world, given)
             units.append(self._setting.unit(self._world, plan, number, written))
         found = run_units(self._twins, units, finish, self._setting.workers)
-        numbered: dict[Regime, int] = {}
-        values, regime, episode, step, refused = [np.empty((0, len(self.columns)))], [], [], [], []
-        for number, done, rows in zip(numbers, regimes, found, strict=True):
-            if isinstance(rows, str):
-                refused.append((number, rows))
+        rows: list[Row] = []
+        refused: list[tuple[int, str]] = []
+        for number, done, values in zip(numbers, regimes, found, strict=True):
+            if isinstance(values, str):
+                refused.append((number, values))
                 continue
-            values.append(rows)
-            for index in range(len(rows)):
-                named = replace(done, targets=self._targets(done.targets, index))
-                regime.append(numbered.setdefault(named, len(numbered)))
-                episode.append(number)
-                step.append(index)
-        table = Dataset(
-            values=np.concatenate(values),
-            columns=self.columns,
-            regimes=tuple(numbered),
-            regime=np.array(regime, dtype=np.int64),
-            episode=np.array(episode, dtype=np.int64),
-            step=np.array(step, dtype=np.int64),
-            about=self.about,
-        )
-        return SourceRows(table, tuple(refused))
+            for step, row in enumerate(values):
+                named = replace(done, targets=self._targets(done.targets, step))
+                rows.append((number, step, named, row))
+        return SourceRows(Dataset.stacked(self.columns, rows, self.about), tuple(refused))
 
     def _targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
         """Name the columns' variables that are set in a row; a state is at the first step only."""
@@ -347,9 +335,7 @@ class Experiments:
 
     def part(self, numbers: range, tell: Tell) -> SourceRows:
         """Carry out some experiments; those that are refused cost their episode."""
-        rows: list[Floats] = []
-        regimes: list[Regime] = []
-        units: list[int] = []
+        rows: list[Row] = []
         refused: list[tuple[int, str]] = []
         for number in numbers:
             regime = self._design.regime(number, seed=self._seed)
@@ -360,21 +346,10 @@ class Experiments:
             except InterventionError as problem:
                 refused.append((number, str(problem)))
             else:
-                rows.append(found.matrix()[0])
-                regimes.append(self._named(regime))
-                units += found.numbers
+                (row,) = found.matrix()[0]
+                rows.append((found.numbers[0], 0, self._named(regime), row))
             tell(1)
-        kinds = tuple(dict.fromkeys(regimes))
-        table = Dataset(
-            values=np.concatenate([np.empty((0, len(self.columns))), *rows]),
-            columns=self.columns,
-            regimes=kinds,
-            regime=np.array([kinds.index(regime) for regime in regimes], dtype=np.int64),
-            episode=np.array(units, dtype=np.int64),
-            step=np.zeros(len(rows), dtype=np.int64),
-            about=self.about,
-        )
-        return SourceRows(table, tuple(refused))
+        return SourceRows(Dataset.stacked(self.columns, rows, self.about), tuple(refused))
 
     def _named(self, regime: Regime) -> Regime:
         model = self._model
