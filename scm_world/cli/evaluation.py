@@ -66,24 +66,20 @@ def evaluate(
     """
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
-    from scm_world.evaluation.files import CODECS, false_scores
+    from scm_world.evaluation.files import CODECS
     from scm_world.evaluation.outputs.report import write_outputs
     from scm_world.evaluation.setups import task_of
 
     if trust or policy is not None:
         sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     if check is not None:
-        results = evaluation.Evaluation.load(check)
-        wrong = list(false_scores(check, results))
         again = None if policy is None else policies_of(policy)
         with console.progress("episodes") as tell:
             repeated = evaluation.check(
-                results, episodes=part, policy=again, trusted=tuple(trust or ()), progress=tell
+                check, episodes=part, policy=again, trusted=tuple(trust or ()), progress=tell
             )
-        said = "the same bits in all of them" if repeated else f"{len(repeated.wrong)} differ"
-        chosen = f"{repeated.episodes} of {len(results)} episodes, chosen with seed {repeated.seed}"
-        console.say(*wrong, *repeated.wrong, f"played again: {chosen}: {said}")
-        raise typer.Exit(0 if repeated and not wrong else 1)
+        console.say(repeated)
+        raise typer.Exit(0 if repeated else 1)
 
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
@@ -93,9 +89,6 @@ def evaluate(
     if videos and find_spec("moviepy") is None:
         needed = ("none, or after: pip install 'scm-world[video]'",)
         raise UnknownOption("videos", "--videos", needed)
-    words = [word.strip() for word in seeds.split(",")]
-    if not all(word.isdecimal() for word in words):
-        raise UnknownOption("seeds", seeds, ("whole numbers with commas between them",))
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)
@@ -115,7 +108,7 @@ def evaluate(
             protocols,
             task=task,
             n=n,
-            seeds=tuple(map(int, words)),
+            seeds=seeds,
             backend=backend or made.backend,
             env=settings,
             engine=pool,

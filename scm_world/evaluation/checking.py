@@ -22,11 +22,13 @@ from scm_world.errors import (
 )
 from scm_world.evaluation.agents import AgentRun, listed
 from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.evaluation.files import false_scores
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.players import as_player, player_from
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import KEYS, Evaluation
 from scm_world.evaluation.setups import EvaluationPlace, Setup
+from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task, tasks
@@ -47,15 +49,24 @@ class Check:
         episodes: How many were run again.
         seed: With which they were chosen.
         wrong: Each difference, in words.
+        of: How many episodes there are.
+        scores: Of a file: each score that is another one by its table, in words.
     """
 
     episodes: int
     seed: int
     wrong: tuple[str, ...]
+    of: int
+    scores: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         """Whether there was no difference."""
-        return not self.wrong
+        return not (self.wrong or self.scores)
+
+    def __str__(self) -> str:
+        said = f"{len(self.wrong)} differ" if self.wrong else "the same bits in all of them"
+        chosen = f"{self.episodes} of {self.of} episodes, chosen with seed {self.seed}"
+        return "\n".join((*self.scores, *self.wrong, f"played again: {chosen}: {said}"))
 
 
 def shard_runner_of(
@@ -201,7 +212,7 @@ def _same_versions(place: EvaluationPlace, made: Mapping[str, Mapping[str, str]]
 
 
 def check(
-    evaluation: Evaluation,
+    evaluation: Evaluation | Location | str,
     *,
     episodes: int = 12,
     seed: int | None = None,
@@ -213,7 +224,8 @@ def check(
     """Run a random part of an evaluation again, and compare it bit for bit.
 
     Args:
-        evaluation: That was run, here or elsewhere.
+        evaluation: That was run, here or elsewhere; or where it was saved: then the scores in the
+            file are compared with its table, too.
         episodes: How many.
         seed: Chooses them; None: a random one.
         policy: As it was given to ``evaluate``; only needed in another process, for a policy that
@@ -226,6 +238,10 @@ def check(
         SnapshotMismatch: It was made with other versions.
         UnknownOption: A policy cannot be made again.
     """
+    scores: list[str] = []
+    if not isinstance(evaluation, Evaluation):
+        path, evaluation = located(evaluation), Evaluation.load(evaluation)
+        scores = false_scores(path, evaluation)
     count = min(whole_number("episodes", episodes, least=1), len(evaluation))
     drawn = secrets.randbits(32) if seed is None else whole_number("seed", seed, least=0)
     places = np.random.default_rng(drawn).choice(len(evaluation), count, replace=False)
@@ -238,7 +254,7 @@ def check(
                 progress(done + 1, count)
     finally:
         shard_runner.close()
-    return Check(count, drawn, tuple(wrong))
+    return Check(count, drawn, tuple(wrong), len(evaluation), tuple(scores))
 
 
 def _compared(shard_runner: ShardRunner, evaluation: Evaluation, place: int) -> list[str]:

@@ -231,7 +231,7 @@ def prepare(
         protocols: See ``chosen``.
         task: Name, or a task; if None the one that the policies were trained for, else pushing.
         n: Episodes of each protocol, for each seed.
-        seeds: One or several.
+        seeds: One or several; also as a text with commas.
         backend: One engine or several.
         env: Options of the environment.
         trusted: Packages whose functions may be policies, if named by a text.
@@ -258,7 +258,10 @@ def prepare(
     known = protocols_of(place.made if place.name not in tasks() else place.name, engines[0])
     wanted = chosen(protocols, known)
     count = whole_number("n", n, least=1)
-    noises = tuple(whole_number("seed", seed, least=0) for seed in _several("seeds", seeds))
+    given = (
+        int(s) if isinstance(s, str) and s.isdecimal() else s for s in _several("seeds", seeds)
+    )
+    noises = tuple(whole_number("seed", seed, least=0) for seed in given)
     for noise in noises:
         if noise >= 2**63:
             raise UnknownOption("seed", noise, ("any whole number below 2**63",))

@@ -170,7 +170,7 @@ def test_an_agent_of_another_task_is_told() -> None:
         (("evaluate", "still", "pushng"), "pushing"),
         (("evaluate", "still", "--protocols", "P13"), "P13"),
         (("evaluate", "still", "--protocols", "P1@x"), "P1@100"),
-        (("evaluate", "still", "--seeds", "a"), "seeds"),
+        (("evaluate", "still", "--seeds", "a"), "seed cannot be 'a'"),
         (("evaluate", "still", "--backend", "physx"), "physx"),
         (("evaluate", "still", "--env", "frame_skp=3"), "frame_skip"),
         (("evaluate", "still", "--env", "frame_skip"), "frame_skip"),
