@@ -30,7 +30,7 @@ from scm_world.variables import (
     Shift,
     Variable,
 )
-from scm_world.world import World
+from scm_world.world import Simulation
 
 BAD: tuple[Any, ...] = (
     None,
@@ -66,7 +66,7 @@ def spread(variable: Variable, generator: np.random.Generator) -> Any:
 
 
 def random_request(
-    world: World, generator: np.random.Generator, *, most: int = 3
+    world: Simulation, generator: np.random.Generator, *, most: int = 3
 ) -> dict[str, Any]:
     """Draw a request to a world.
 
@@ -89,7 +89,7 @@ def random_request(
     return request | {str(name): _value(world, str(name), generator) for name in chosen}
 
 
-def _value(world: World, name: str, generator: np.random.Generator) -> Any:
+def _value(world: Simulation, name: str, generator: np.random.Generator) -> Any:
     variable = world.model.declared(name)
     match generator.integers(8):
         case 0:
@@ -127,7 +127,7 @@ def expect(kept: bool, about: Any) -> None:
         raise RuntimeError(f"broken promise: {about}")
 
 
-def fuzz(world: World, count: int, seed: int) -> dict[str, Any]:
+def fuzz(world: Simulation, count: int, seed: int) -> dict[str, Any]:
     """Do random things to one world.
 
     Raises:
@@ -176,14 +176,14 @@ def main() -> None:
     for backend in options.backends:
         for task in options.tasks:
             started = time.perf_counter()
-            world = World(task, backend=backend)
+            world = Simulation(task, backend=backend)
             row = {"task": task, "backend": backend, **fuzz(world, share, options.seed)}
             world.close()
             row["seconds"] = round(time.perf_counter() - started, 1)
             row["memory"] = round(memory(), 1)
             found.append(row)
             print(row, flush=True)
-        world = World("pushing", backend=backend)
+        world = Simulation("pushing", backend=backend)
         for index in range(200):
             world.reset(seed=index)
         before = memory()

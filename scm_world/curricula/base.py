@@ -20,7 +20,7 @@ from scm_world.queries.timed import as_act
 from scm_world.variables import Draw, Function, Intervention, Noise
 from scm_world.variables.mechanisms import check_trusted
 from scm_world.variables.spaces import Frozen
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 
 STREAM = "curriculum"
@@ -99,7 +99,7 @@ class Situation:
             ask for.
     """
 
-    world: World
+    world: Simulation
     episode: int
     step: int
     memory: Memory

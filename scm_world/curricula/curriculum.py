@@ -18,7 +18,7 @@ from scm_world.variables import Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.mechanisms import check_portable
 from scm_world.variables.spaces import Frozen
-from scm_world.world import World
+from scm_world.world import Simulation
 
 FORMAT = "scm_world/curriculum/1"
 
@@ -98,7 +98,7 @@ class Curriculum(Frozen):
         except DAMAGED as error:
             raise UnreadableFile(str(path), str(error), advice) from None
 
-    def check(self, world: World) -> None:
+    def check(self, world: Simulation) -> None:
         """Look for names that do not exist and regions that are impossible.
 
         Where it decides which bodies there are, names are looked up when it acts: they may be
@@ -125,7 +125,7 @@ class Curriculum(Frozen):
         if self.space is not None:
             check_subset(self.space, world.model.variables, may_come=may_come)
 
-    def _may_restructure(self, world: World) -> bool:
+    def _may_restructure(self, world: Simulation) -> bool:
         head = tuple(world.structures.head)
         goals = world.task.goal_causes
         return any(

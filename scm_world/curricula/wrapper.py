@@ -19,7 +19,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import flatten
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 @final
@@ -120,7 +120,7 @@ class CurriculumRunner:
 
     def _asked(
         self,
-        world: World,
+        world: Simulation,
         step: int,
         besides: frozenset[str],
         first: frozenset[str] | None = None,
@@ -321,7 +321,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return seen, {**info, **known}
 
 
-def is_checked(curriculum: Curriculum, world: World) -> bool:
+def is_checked(curriculum: Curriculum, world: Simulation) -> bool:
     """Look for what is wrong; tell whether all names are known already.
 
     Raises:

@@ -37,7 +37,7 @@ from scm_world.tasks.factories import load_factory
 from scm_world.tasks.model import FILES
 from scm_world.variables import Box, Derived, Draw, Exogenous, Function, Linear, Parent
 from scm_world.variables.distributions import Normal
-from scm_world.world import World
+from scm_world.world import Simulation
 
 # --- random models --------------------------------------------------------------------------------
 
@@ -320,7 +320,7 @@ class WorldProblem:
 
     def __init__(self, name: str, view: TaskView) -> None:
         self._view, self._by_step = view, view.view == "step"
-        self._world = World(make_task(name, **view.arguments), **view.options)
+        self._world = Simulation(make_task(name, **view.arguments), **view.options)
         try:
             robot = isinstance(self._world.task, TriFingerTask)
             usual = "sweep" if robot and not self._by_step else "random"

@@ -21,7 +21,7 @@ from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.world import World
+from scm_world.world import Simulation
 
 REPORT = "scm_world/discovery/1"
 CHECKPOINT = "scm_world/discovery-progress/2"
@@ -122,7 +122,7 @@ class DiscoveryReport:
 
 
 def discover(
-    system: World | SCM | str,
+    system: Simulation | SCM | str,
     *,
     probes: int = 32,
     seed: int = 0,
@@ -164,7 +164,7 @@ def discover(
         series = Series(PairedEquations(system, seed), probes, progress)
         series.run(range(probes))
         return _report(system, series, seed, ("model", "none", "none", ""), started)
-    world = World(system, **options) if isinstance(system, str) else system
+    world = Simulation(system, **options) if isinstance(system, str) else system
     try:
         series = _experiments(world, probes, seed, progress, checkpoint)
         backend = world.backend
@@ -177,7 +177,11 @@ def discover(
 
 
 def _experiments(
-    world: World, probes: int, seed: int, progress: Progress | None, path: Location | str | None
+    world: Simulation,
+    probes: int,
+    seed: int,
+    progress: Progress | None,
+    path: Location | str | None,
 ) -> Series:
     paired = Paired(world, seed)
     saved = None if path is None else Checkpoint(path, _terms(world, seed))
@@ -195,7 +199,7 @@ def _experiments(
     return series
 
 
-def _terms(world: World, seed: int) -> dict[str, Any]:
+def _terms(world: Simulation, seed: int) -> dict[str, Any]:
     backend, usual = world.backend, world.resolution == world.task.resolutions[0]
     return {
         **({} if usual else {"resolution": world.resolution}),

@@ -13,7 +13,7 @@ from scm_world.graph import flatten
 from scm_world.tasks import Task, make_task
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.structures import StructureCache
 
@@ -39,7 +39,7 @@ def doubles(action: Any, size: int) -> Floats:
         raise ActionError(f"an action is {finite(size)}, got {action!r}", action) from None
 
 
-def action_scale(world: World) -> tuple[Floats, Floats]:
+def action_scale(world: Simulation) -> tuple[Floats, Floats]:
     """Give what normalized actions stand for: ``middle + half * action``, shape (n_actions,) each.
 
     What has no two bounds keeps its unit.
@@ -99,7 +99,7 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def begin(
-    world: World,
+    world: Simulation,
     seed: int | None,
     acts: Mapping[str, Any],
     attempts: int,
@@ -131,7 +131,7 @@ def begin(
             return
 
 
-def beginning_structure(world: World, acts: Mapping[str, Any]) -> CompiledTask:
+def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Give the structure in which an episode begins after an intervention at its reset."""
     family = world.structures
     mine: dict[str, Any] = {}

@@ -8,7 +8,7 @@ from typing import Any, Self, final
 from gymnasium.utils import EzPickle
 
 from scm_world.errors import NotReset
-from scm_world.world import World, WorldSnapshot
+from scm_world.world import Simulation, WorldSnapshot
 
 
 @final
@@ -32,7 +32,7 @@ class Copied(EzPickle):
         world: That is simulated.
     """
 
-    world: World
+    world: Simulation
     _done: list[tuple[int, dict[str, Any]]]
 
     @property

@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.env.vector import box
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Task
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.structures import StructureCache
 
 PREFIX = "delta_"
@@ -65,7 +65,7 @@ class Delta:
 
     def __init__(
         self,
-        world: World,
+        world: Simulation,
         middle: Floats,
         half: Floats,
         *,

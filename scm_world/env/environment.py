@@ -43,7 +43,7 @@ from scm_world.tasks import Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world import Audit, World
+from scm_world.world import Audit, Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.plan import merged
 
@@ -174,7 +174,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         )
         made = made_task(task, task_options)
         mode = checked_mode(action_mode, made)
-        self.world = World(
+        self.world = Simulation(
             made,
             backend=backend,
             preset=preset,

@@ -28,7 +28,7 @@ from scm_world.models.camera import Camera
 from scm_world.tasks import TIME, Observed, Task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Linear
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import places
 
@@ -68,18 +68,18 @@ class Goals:
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
 
-    def read(self, world: World) -> tuple[Floats, Floats]:
+    def read(self, world: Simulation) -> tuple[Floats, Floats]:
         """Give what is achieved and what is desired."""
         row, (achieved, desired) = world.numbers[0], self._sides
         return row.take(achieved), row.take(desired)
 
-    def observe(self, world: World) -> dict[str, Floats]:
+    def observe(self, world: Simulation) -> dict[str, Floats]:
         """Give both vectors, by name."""
         pair = zip(self.spaces, self.read(world), strict=True)
         return {name: np.clip(goal, -self.bound, self.bound) for name, goal in pair}
 
 
-def goal_reward(world: World) -> Callable[[ArrayLike, ArrayLike, Any], Any]:
+def goal_reward(world: Simulation) -> Callable[[ArrayLike, ArrayLike, Any], Any]:
     """Return what computes the part of the reward that goals alone decide.
 
     With ``weights="sparse"``, or where only ``fractional_success`` and ``success`` have weights,
@@ -129,7 +129,7 @@ def goal_reward(world: World) -> Callable[[ArrayLike, ArrayLike, Any], Any]:
     return compute_reward
 
 
-def reward_scale(world: World) -> float:
+def reward_scale(world: Simulation) -> float:
     """Give what rewards are multiplied by."""
     return world.control_period if world.conventions.reward_times_dt else 1.0
 
@@ -202,7 +202,7 @@ class DictObserver:
         goals: What is achieved and what is desired, if that is asked for.
     """
 
-    def __init__(self, world: World, parts: dict[str, Observer], goals: Goals | None) -> None:
+    def __init__(self, world: Simulation, parts: dict[str, Observer], goals: Goals | None) -> None:
         self._world, self._parts, self._goals = world, parts, goals
         self.names = tuple(name for part in parts.values() for name in part.names)
         self.layouts: Layouts = {
@@ -220,7 +220,7 @@ class DictObserver:
 
 
 def observer(
-    world: World, declaration: CompiledTask, how: Observing, goals: Goals | None
+    world: Simulation, declaration: CompiledTask, how: Observing, goals: Goals | None
 ) -> Observer:
     """Put together what is asked for.
 
@@ -260,7 +260,7 @@ def context(declaration: CompiledTask) -> tuple[str, ...]:
     return tuple(name for name in declaration.static_names if model.declared(name).settable)
 
 
-def published(world: World, declaration: CompiledTask) -> dict[str, Observed]:
+def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observed]:
     """List the parts of the structured observation, by variable."""
     parts = list(declaration.task.observed())
     if declaration.task.head:
@@ -270,7 +270,7 @@ def published(world: World, declaration: CompiledTask) -> dict[str, Observed]:
     return {part.variable: part for part in parts}
 
 
-def _vector(world: World, declaration: CompiledTask, how: Observing) -> Vector:
+def _vector(world: Simulation, declaration: CompiledTask, how: Observing) -> Vector:
     names = list(how.names if how.mode == "custom" else published(world, declaration))
     if how.mode == "full":
         names += [name for name in declaration.model if name not in declaration.parts]
@@ -285,7 +285,9 @@ def _vector(world: World, declaration: CompiledTask, how: Observing) -> Vector:
     return Vector(world, declaration, parts, normalize=how.normalize, keypoints=corners)
 
 
-def _parts(world: World, declaration: CompiledTask, names: Iterable[str]) -> list[ObservedPart]:
+def _parts(
+    world: Simulation, declaration: CompiledTask, names: Iterable[str]
+) -> list[ObservedPart]:
     """Give variables the bounds of the structured observation, or those they declare.
 
     States of a model scale by the bounds they declare, and do not saturate: joint limits are soft.

@@ -24,7 +24,7 @@ from scm_world.env.vector import Layouts
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
 from scm_world.models.camera import Camera
-from scm_world.world import World
+from scm_world.world import Simulation
 
 Size = int | tuple[int, int]
 
@@ -100,7 +100,7 @@ class Pixels:
     names: tuple[str, ...] = ()
 
     def __init__(
-        self, world: World, cameras: Sequence[str | Camera] | None, size: Size | None
+        self, world: Simulation, cameras: Sequence[str | Camera] | None, size: Size | None
     ) -> None:
         drawing, published = drawing_of(world.structure), world.conventions.published_observation
         self._world, self._shows_goals = world, drawing.overview is not None

@@ -14,7 +14,7 @@ from scm_world.env.observer import Observer
 from scm_world.errors import EngineError
 from scm_world.models import Scene
 from scm_world.models.camera import Camera
-from scm_world.world import World
+from scm_world.world import Simulation
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.opengl import Viewer
@@ -65,7 +65,7 @@ class Looks:
         world: That is observed.
     """
 
-    world: World
+    world: Simulation
     _observer: Observer
     _modes: tuple[str, str]
     _automatic: Camera | None = None

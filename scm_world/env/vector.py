@@ -20,7 +20,7 @@ from scm_world.variables import Box, Categories, Normal, Rotations
 from scm_world.variables import Integers as WholeNumbers
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.spaces import Affine, Switch
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import places
 
@@ -204,7 +204,7 @@ class Vector:
 
     def __init__(
         self,
-        world: World,
+        world: Simulation,
         declaration: CompiledTask,
         parts: Sequence[ObservedPart],
         *,

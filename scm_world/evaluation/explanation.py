@@ -21,7 +21,7 @@ from scm_world.evaluation.results import Evaluation
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 VERSUS = ("A", "default")
 SAME = "it would have been the same"
@@ -235,7 +235,7 @@ def why(
 
 
 def _no_answer(
-    one: Otherwise, row: EpisodeRow, then: EpisodeRow, found: set[str], world: World
+    one: Otherwise, row: EpisodeRow, then: EpisodeRow, found: set[str], world: Simulation
 ) -> str:
     """Say why what would have been says nothing about a variable; empty if it does."""
     name, model = one.variable, world.model

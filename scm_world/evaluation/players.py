@@ -29,7 +29,7 @@ from scm_world.queries.episodes import Episode
 from scm_world.queries.twins import Twins
 from scm_world.tasks.base import Blind
 from scm_world.variables import Function
-from scm_world.world import World
+from scm_world.world import Simulation
 
 Actions = NDArray[Any]
 About = dict[str, Any]
@@ -44,7 +44,7 @@ _ADVICE = "give the path of a policy"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
 
-def still(world: World) -> Any:
+def still(world: Simulation) -> Any:
     """Return the idle action of the task, shape (n_actions,)."""
     return world.task.idle(world)
 

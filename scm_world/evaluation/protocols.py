@@ -25,7 +25,7 @@ from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.structures import as_task
 
 FORMAT = "scm_world/protocol/1"
@@ -305,7 +305,7 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
         task: Of a model or a step function.
         backend: Whose parameters count; that of the task if None.
     """
-    declaration = World(task, backend=backend).compiled
+    declaration = Simulation(task, backend=backend).compiled
     found = [Protocol("P0", doc="nothing varies")]
     spaces: tuple[SpaceName, ...] = ("A", "B")
     for space in spaces:

@@ -15,7 +15,7 @@ from scm_world.errors import ActionError, UnknownOption
 from scm_world.policies.planning import CrossEntropy
 from scm_world.tasks import TASKS
 from scm_world.tasks.base import Blind, action_range, kept_rows
-from scm_world.world import World
+from scm_world.world import Simulation
 
 Policy = Callable[[Any], Any]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
@@ -113,7 +113,7 @@ def as_policy(given: Any, world: Any = None) -> Policy:
         return _Idle()
     if isinstance(given, str):
         known = NAMED if world is None else {"random": Random}
-        if isinstance(world, World):
+        if isinstance(world, Simulation):
             known = {**ANY, **world.task.policies}
         if given in known:
             return known[given]()
@@ -130,6 +130,6 @@ class _Idle(Blind):
     def ahead(self, world: Any, first: int, count: int) -> Floats:
         """Give the action of the first step, again and again."""
         if self._action is None:
-            idle = world.task.idle(world) if isinstance(world, World) else world.idle()
+            idle = world.task.idle(world) if isinstance(world, Simulation) else world.idle()
             self._action = idle
         return np.tile(self._action, (count, 1))

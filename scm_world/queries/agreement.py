@@ -29,7 +29,7 @@ from scm_world.queries.verification import (
 )
 from scm_world.tasks import Task
 from scm_world.variables import Measured
-from scm_world.world import World
+from scm_world.world import Simulation
 
 SAME = 0.95
 """Share of the comparable edges whose sign must be the same."""
@@ -270,7 +270,7 @@ def compare_signs(
     found: list[Responses] = []
     for number, backend in enumerate(backends):
         told = part(progress, number * probes, len(backends) * probes)
-        world = World(task, backend=backend, **options)
+        world = Simulation(task, backend=backend, **options)
         try:
             series = Series(Paired(world, seed, responses=True), probes, told)
             series.run(probe_states(world, probes, seed, settled=False))

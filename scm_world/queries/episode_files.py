@@ -31,7 +31,7 @@ from scm_world.queries.rollouts import Trace, Unit
 from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, twins_of
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
-from scm_world.world import World
+from scm_world.world import Simulation
 
 FORMAT = "scm_world/episode/1"
 _ADVICE = "give a file that save_episode wrote"
@@ -166,7 +166,7 @@ def _plain(value: Any) -> Any:
 
 
 def load_episode(
-    path: Path | str, *, world: World | SCM | None = None, trusted: Sequence[str] = ()
+    path: Path | str, *, world: Simulation | SCM | None = None, trusted: Sequence[str] = ()
 ) -> Episode:
     """Read an episode and run it again.
 
@@ -226,7 +226,7 @@ def _read(file: Path) -> tuple[dict[str, Any], Any, Any, Any]:
 
 
 def _twins(
-    about: dict[str, Any], world: World | SCM | None, file: Path, trusted: Sequence[str]
+    about: dict[str, Any], world: Simulation | SCM | None, file: Path, trusted: Sequence[str]
 ) -> AnyTwins:
     """Return where the episode is run again.
 
@@ -252,7 +252,7 @@ def _twins(
     return twins
 
 
-def _made(about: dict[str, Any]) -> World:
+def _made(about: dict[str, Any]) -> Simulation:
     given = about["arguments"] or {}
     if about["task"] in tasks():
         task = make_task(about["task"], **given)
@@ -260,7 +260,7 @@ def _made(about: dict[str, Any]) -> World:
         task = ModelTask(**given)
     else:
         raise UnknownOption("task", about["task"], (*tasks(), "any, with world=World(your task)"))
-    return World(task, **about["options"])
+    return Simulation(task, **about["options"])
 
 
 def _compare(trace: Trace, states: list[Any], file: Path, made: dict[str, str]) -> None:

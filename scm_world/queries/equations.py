@@ -15,7 +15,7 @@ from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.variables import Noise
-from scm_world.world import Audit, World
+from scm_world.world import Audit, Simulation
 from scm_world.world.audit import Applied
 from scm_world.world.compiled_task import ActionVector, slices_of
 from scm_world.world.solver import same
@@ -351,5 +351,5 @@ class Equations:
         return self._order
 
 
-System = World | Equations
+System = Simulation | Equations
 """What runs an episode."""

@@ -30,7 +30,7 @@ from scm_world.queries.samples import Samples, Setting, sample
 from scm_world.queries.timed import Contact, Reaches
 from scm_world.queries.twins import Twins, twins_of
 from scm_world.variables import Fixed
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.plan import merged
 
 FORMAT = "scm_world/laboratory/1"
@@ -207,7 +207,7 @@ class Laboratory:
 
     def __init__(
         self,
-        world: World,
+        world: Simulation,
         *,
         allow: Iterable[str] = QUESTIONS,
         visible: Iterable[str] = ("*",),
@@ -222,7 +222,7 @@ class Laboratory:
         for question in self.allow:
             if question not in QUESTIONS:
                 raise UnknownOption("question", question, QUESTIONS)
-        self._world: World = world
+        self._world: Simulation = world
         self._twins: Twins = twins_of(world)
         self._setting = Setting(**setting)
         self._given: Plan = getattr(world, "plan", Plan())

@@ -18,7 +18,7 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import Contact
 from scm_world.errors import UnknownOption
 from scm_world.models import ControlMode
-from scm_world.world import World
+from scm_world.world import Simulation
 
 __all__ = ["local_graph"]
 
@@ -26,7 +26,7 @@ Touching = Sequence[Sequence[Contact]]
 """The contacts of each physics step of a control step."""
 
 
-def local_graph(world: World, action: ArrayLike | None = None) -> nx.DiGraph:
+def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.DiGraph:
     """Read off from contacts which body acts on which other body in a control step.
 
     Contacts in which nothing presses do not count.
@@ -46,7 +46,7 @@ def local_graph(world: World, action: ArrayLike | None = None) -> nx.DiGraph:
         UnknownOption: It is a world of something other than fingers and blocks.
 
     Example:
-        >>> world = World("pushing")
+        >>> world = Simulation("pushing")
         >>> world.reset(seed=0)
         >>> world.step(world["joint_positions"])
         >>> list(local_graph(world, world["joint_positions"]).edges)
@@ -128,7 +128,7 @@ class _Listener:
             self.contacts.append(self._backend.contacts())
 
 
-def _contacts_of(world: World, action: ArrayLike) -> Touching:
+def _contacts_of(world: Simulation, action: ArrayLike) -> Touching:
     """Take a control step, and return the contacts of each of its physics steps."""
     engine: Any = world.backend
     listener: Any = _Listener(engine)

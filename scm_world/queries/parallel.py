@@ -34,7 +34,7 @@ from scm_world.queries.twins import AnyTwins, EquationTwins, Twins, threaded
 from scm_world.tasks.base import Blind
 from scm_world.work.executors import Executor
 from scm_world.work.processes import cores
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.batch import Batch
 
 R = TypeVar("R")
@@ -291,7 +291,7 @@ def _packed(result: Any) -> Any:
     return replace(result, declarations=[(step, d.plan) for step, d in result.declarations])
 
 
-def _unpacked(result: Any, world: World) -> Any:
+def _unpacked(result: Any, world: Simulation) -> Any:
     if not isinstance(result, Trace):
         return result
     found = [(step, world.structures.compiled(plan)) for step, plan in result.declarations]

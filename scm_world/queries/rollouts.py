@@ -15,7 +15,7 @@ from scm_world.errors import ActionError
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.plans import GroupedSchedules, Key, Layer, Schedule
-from scm_world.world import Audit, World
+from scm_world.world import Audit, Simulation
 from scm_world.world.batch import Batch, Table
 
 EVERY = 10
@@ -219,7 +219,7 @@ class Running:
         world, trace = self.world, self.trace
         if world.version != self._version:
             self._version = world.version
-            now = world.current()[0] if isinstance(world, World) else {}
+            now = world.current()[0] if isinstance(world, Simulation) else {}
             values = {name: np.array(now[name]) for name in world.static_names}
             trace.statics.append((step, values))
             if not trace.declarations or trace.declarations[-1][1].plan != world.compiled.plan:
@@ -231,7 +231,7 @@ class Running:
             found = world.values() if names == (ALL,) else world.evaluate(there)
             for name in found if names == (ALL,) else there:
                 trace.values.setdefault(name, []).append(np.array(found[name]))
-        if self.unit.contacts and isinstance(world, World):
+        if self.unit.contacts and isinstance(world, Simulation):
             pairs = (tuple(sorted(c.bodies)) for c in world.backend.contacts() if c.force > 0.0)
             trace.touching.append(frozenset((one, other) for one, other in pairs))
 

@@ -14,7 +14,7 @@ from scm_world.queries.equations import System
 from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Null, Scale, Shift
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
-from scm_world.world import World
+from scm_world.world import Simulation
 
 ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural, Null)
 
@@ -118,7 +118,7 @@ class Contact(Frozen):
         Raises:
             UnknownOption: The model has no such body; equations have none at all.
         """
-        if not isinstance(world, World):
+        if not isinstance(world, Simulation):
             raise UnknownOption("event of equations", self, ("Reaches(name, above=…)",))
         known = world.structure.body_names if isinstance(world.structure, Model) else ()
         for body in self.bodies if known else ():

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, Layout
 from scm_world.work.executors import Executor, Processes
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.batch import Batch
 from scm_world.world.structures import StructureCache
 
@@ -35,15 +35,15 @@ class Twins:
         batches: Whether the engine steps many worlds in one call.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: Simulation) -> None:
         self._build, (self._kind, self.task, self.options, _), *_ = world.__reduce__()
         self.batches = world.backend.capabilities.batch
         self._clear()
 
     def _clear(self) -> None:
-        self._free: list[World] = []
+        self._free: list[Simulation] = []
         self._lock = threading.Lock()
-        self._members: list[World] = []  # of batches
+        self._members: list[Simulation] = []  # of batches
         self._batching = threading.RLock()
         self._executor: Executor | None = None
 
@@ -58,7 +58,7 @@ class Twins:
         self._clear()
 
     @contextmanager
-    def twin(self) -> Iterator[World]:
+    def twin(self) -> Iterator[Simulation]:
         """Lend a twin; it is given back afterwards, in whatever state."""
         with self._lock:
             world = self._free.pop() if self._free else self._make()
@@ -110,9 +110,9 @@ class Twins:
                 weakref.finalize(self, self._executor.close)
             return self._executor
 
-    def _make(self, family: StructureCache | None = None) -> World:
+    def _make(self, family: StructureCache | None = None) -> Simulation:
         task = copy.copy(self.task) if family is None else family
-        made: World = self._build(self._kind, task, dict(self.options), None)
+        made: Simulation = self._build(self._kind, task, dict(self.options), None)
         return made
 
 
@@ -149,18 +149,18 @@ class EquationTwins:
 AnyTwins = Twins | EquationTwins
 
 
-def asked(system: World | SCM) -> tuple[AnyTwins, World | Equations]:
+def asked(system: Simulation | SCM) -> tuple[AnyTwins, Simulation | Equations]:
     """Return where episodes of a system are run, and a system that knows what is declared."""
-    if isinstance(system, World):
+    if isinstance(system, Simulation):
         return twins_of(system), system
     twins = EquationTwins(system)
     return twins, Equations(twins.layout)
 
 
-_TWINS: WeakKeyDictionary[World, Twins] = WeakKeyDictionary()
+_TWINS: WeakKeyDictionary[Simulation, Twins] = WeakKeyDictionary()
 
 
-def twins_of(world: World) -> Twins:
+def twins_of(world: Simulation) -> Twins:
     """Give the twins of a world; it lives as long as the world."""
     found = _TWINS.get(world)
     if found is None:

@@ -25,7 +25,7 @@ from scm_world.queries.verification import (
 )
 from scm_world.tasks import Task
 from scm_world.variables import Measured
-from scm_world.world import World
+from scm_world.world import Simulation
 
 MOST, LEAST = 200, 16
 """How many probe states there are at most, and how many even if every edge was seen before."""
@@ -41,7 +41,7 @@ OTHER = 1_000_003
 
 
 def verify(
-    system: World | SCM | Task | str,
+    system: Simulation | SCM | Task | str,
     *,
     probes: int = MOST,
     least: int = LEAST,
@@ -83,11 +83,11 @@ def verify(
     """
     whole_number("number of probes", probes, least=1)
     whole_number("least number of probes", least, least=1)
-    if isinstance(system, World | SCM):
+    if isinstance(system, Simulation | SCM):
         if options:
             raise UnknownOption("option for a world that is made", next(iter(options)), ())
         return _verified(system, probes, least, seed, progress)
-    world = World(system, **options)
+    world = Simulation(system, **options)
     try:
         return _verified(world, probes, least, seed, progress)
     finally:
@@ -181,11 +181,11 @@ class _Watch:
 
 
 def _verified(
-    system: World | SCM, probes: int, least: int, seed: int, progress: Progress | None
+    system: Simulation | SCM, probes: int, least: int, seed: int, progress: Progress | None
 ) -> Verification:
     started = time.perf_counter()
-    world = system if isinstance(system, World) else None
-    model: SCM = system.model if isinstance(system, World) else system
+    world = system if isinstance(system, Simulation) else None
+    model: SCM = system.model if isinstance(system, Simulation) else system
     generated = world is not None and world.task.generated_graph
     declared = tuple(edge.key for edge in model.edges)
     measured = {v.name for v in model.variables if isinstance(v, Measured)}

@@ -16,18 +16,17 @@ from scm_world.queries.questions import Questions
 from scm_world.queries.twins import AnyTwins, twins_of
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world import Audit, WorldSnapshot
-from scm_world.world import World as Simulated
+from scm_world.world import Audit, Simulation, WorldSnapshot
 from scm_world.world.plan import merged
 
 
 @final
-class World(Simulated, Questions):
-    """A causal model and an engine, to step, to intervene on, and to ask.
+class World(Simulation, Questions):
+    """A simulation that also answers questions.
 
-    What steps and intervenes is that of ``scm_world.world.World``: it changes this world. What
-    asks (``given``, ``rollout``, ``sample``, ``effect``, …; see ``Questions``) works on twins and
-    leaves this world as it is.
+    The methods of ``Simulation`` (``reset``, ``step``, ``do``, …) change this world. The methods of
+    ``Questions`` (``rollout``, ``sample``, ``effect``, …) run on twins, and ``given`` returns
+    another world; they leave this one as it is.
 
     Example:
         >>> world = World("pushing", backend="fake")
@@ -57,7 +56,7 @@ class World(Simulated, Questions):
             backend: ``"mujoco"``, or ``"bullet"`` for the portable subset.
             frame_skip: Length of a control step in physics steps.
             max_episode_length: In control steps.
-            variables_space: See ``scm_world.world.World``.
+            variables_space: See ``scm_world.world.Simulation``.
             options: Of ``ModelTask``: ``control_dt``, ``expose``, ``spaces``, ``ties``,
                 ``outcomes``, ``reward``, ``success``, ``start``, ``seconds``, ….
 
@@ -110,7 +109,7 @@ class World(Simulated, Questions):
             step: The function, of four dicts by name; it gives a dict. See ``StepTask``.
             backend: One that wraps ``"step"``; that itself if None.
             max_episode_length: In control steps.
-            variables_space: See ``scm_world.world.World``.
+            variables_space: See ``scm_world.world.Simulation``.
             options: Of ``StepTask``: ``parameters``, ``states``, ``actions``, ``control_dt``,
                 ``noise``, ``outcomes``, ``reward``, ``start``, ``vectorized``, ….
 
@@ -199,7 +198,7 @@ class World(Simulated, Questions):
     def reset(
         self, *, seed: int | None = None, episode: int = 0, do: Mapping[str, Any] | None = None
     ) -> Audit | None:
-        """Begin an episode, with what is given; see ``scm_world.world.World.reset``."""
+        """Begin an episode, with what is given; see ``Simulation.reset``."""
         plan = self._with(do)
         if not len(self._standing) and not any(True for _ in plan.timed()):
             self._schedule, self._fired = Schedule(()), {}

@@ -4,8 +4,8 @@ Subclass ``TaskConformance`` in a test file, say how to make a world of the task
 the rest::
 
     class TestMyTask(TaskConformance):
-        def make(self) -> World:
-            return World(MyTask(), backend="fake")
+        def make(self) -> Simulation:
+            return Simulation(MyTask(), backend="fake")
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.kinds import SpaceName
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
-from scm_world.world import Audit, World, WorldSnapshot
+from scm_world.world import Audit, Simulation, WorldSnapshot
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
 _SPACES: tuple[SpaceName, ...] = ("A", "B")
@@ -60,29 +60,29 @@ class WorldConformance(ABC):
     awake: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
 
     @abstractmethod
-    def make(self) -> World:
+    def make(self) -> Simulation:
         """Create a world of the task."""
 
     @pytest.fixture
-    def world(self) -> Iterator[World]:
+    def world(self) -> Iterator[Simulation]:
         """Provide a world at the start of an episode."""
         world = self.make()
         world.reset(seed=SEED)
         yield world
         world.close()
 
-    def prepare(self, world: World, name: str) -> None:
+    def prepare(self, world: Simulation, name: str) -> None:
         """Begin an episode in which a variable matters."""
         world.reset(seed=SEED, do=self.awake.get(name))
 
-    def test_one_seed_has_one_future(self, world: World) -> None:
+    def test_one_seed_has_one_future(self, world: Simulation) -> None:
         """Same seed, actions and interventions give the same bits, here and in another process."""
         first = story(world)
         elsewhere = _pool().submit(_future, type(self), dict(vars(self)))
         assert story(world) == first
         assert elsewhere.result(timeout=120) == first
 
-    def test_do_and_undo_leave_no_trace(self, world: World) -> None:
+    def test_do_and_undo_leave_no_trace(self, world: Simulation) -> None:
         """Each quantity is set and set back; the next steps are bit-identical."""
         for name in quantities(world):
             self.prepare(world, name)
@@ -98,7 +98,7 @@ class WorldConformance(ABC):
             assert same(world.values(), values), name
             assert play(world, 3) == future, name
 
-    def test_a_snapshot_goes_on_bit_for_bit(self, world: World) -> None:
+    def test_a_snapshot_goes_on_bit_for_bit(self, world: Simulation) -> None:
         """After it was pickled, and after other episodes."""
         play(world, 4)
         saved, values = pickle.dumps(world.snapshot()), world.values()
@@ -109,7 +109,7 @@ class WorldConformance(ABC):
         assert same(world.values(), values)
         assert play(world, 6) == future
 
-    def test_what_is_refused_leaves_no_trace(self, world: World) -> None:
+    def test_what_is_refused_leaves_no_trace(self, world: Simulation) -> None:
         """A request of which one part is wrong changes nothing at all."""
         play(world, 2)
         start, values = world.snapshot(), world.values()
@@ -121,7 +121,7 @@ class WorldConformance(ABC):
             assert same(world.values(), values)
         assert play(world, 4) == future
 
-    def test_a_reset_leaves_nothing_behind(self, world: World) -> None:
+    def test_a_reset_leaves_nothing_behind(self, world: Simulation) -> None:
         """After an episode with interventions the next one is as if there had been none."""
         values, future = world.values(), play(world, 5)
         story(world)
@@ -145,7 +145,7 @@ class TaskConformance(WorldConformance):
 
     # --- declarations ---------------------------------------------------------------------------
 
-    def test_names_are_unique_and_published(self, world: World) -> None:
+    def test_names_are_unique_and_published(self, world: Simulation) -> None:
         """Names are ``entity.quantity``, and none stands for two things."""
         options = world.options
         mode, period = options.action_mode, options.control_period
@@ -154,13 +154,13 @@ class TaskConformance(WorldConformance):
         assert len(set(declared)) == len(declared)
         assert not [name for name in declared if not _NAME.fullmatch(name)]
 
-    def test_every_variable_is_documented(self, world: World) -> None:
+    def test_every_variable_is_documented(self, world: Simulation) -> None:
         """Each has a unit, and a sentence that begins with a capital and ends with a full stop."""
         for variable in world.model.variables:
             assert variable.unit, variable.name
             assert re.fullmatch(r"[A-Z0-9].*\.", variable.doc, re.DOTALL), variable.name
 
-    def test_what_can_be_set_is_bounded(self, world: World) -> None:
+    def test_what_can_be_set_is_bounded(self, world: Simulation) -> None:
         """Each quantity that ``do`` accepts says what is physically possible."""
         model = world.model
         unbounded = [
@@ -172,12 +172,12 @@ class TaskConformance(WorldConformance):
         ]
         assert not unbounded
 
-    def test_the_start_lies_within_bounds(self, world: World) -> None:
+    def test_the_start_lies_within_bounds(self, world: Simulation) -> None:
         """Every default is possible."""
         assert not out_of_bounds(world)
 
     @pytest.mark.parametrize("space", _SPACES)
-    def test_spaces_lie_within_bounds(self, world: World, space: SpaceName) -> None:
+    def test_spaces_lie_within_bounds(self, world: Simulation, space: SpaceName) -> None:
         """Whatever is drawn from A or B, in any coordinates, is possible."""
         values, noise = world.values(), Noise(SEED)
         for variable in world.model.variables:
@@ -192,13 +192,13 @@ class TaskConformance(WorldConformance):
                     bounds = world.model.declared(target).bounds
                     assert bounds is None or bounds.contains(value, values), variable.name
 
-    def test_the_model_survives_json(self, world: World) -> None:
+    def test_the_model_survives_json(self, world: Simulation) -> None:
         """Written and read again it is the same model."""
         assert from_json(to_json(world.model), trusted=(type(world.task).__module__,)) == (
             world.model
         )
 
-    def test_what_is_observed_is_declared(self, world: World) -> None:
+    def test_what_is_observed_is_declared(self, world: Simulation) -> None:
         """The observation consists of variables, and low ends lie below high ones."""
         for part in world.task.observed():
             assert part.variable in world.model
@@ -209,7 +209,7 @@ class TaskConformance(WorldConformance):
 
     # --- physics --------------------------------------------------------------------------------
 
-    def test_every_quantity_is_realised(self, world: World) -> None:
+    def test_every_quantity_is_realised(self, world: Simulation) -> None:
         """Setting any parameter or state changes what stands there, a picture, or the next step.
 
         Only the noise of sensors does not: it acts where observations are made.
@@ -223,7 +223,7 @@ class TaskConformance(WorldConformance):
             differ = _differ(before[0], world.scene()) or before[1] != world.cameras()
             assert differ or _moves_differently(world, before[2]), name
 
-    def test_every_quantity_is_read_back(self, world: World) -> None:
+    def test_every_quantity_is_read_back(self, world: Simulation) -> None:
         """What the engine knows it reports as it was given, and the model agrees."""
         for name in quantities(world):
             self.prepare(world, name)
@@ -236,7 +236,7 @@ class TaskConformance(WorldConformance):
                 assert entry.read_back is not None, name
                 np.testing.assert_allclose(entry.read_back, wanted, rtol=1e-6, atol=1e-9)
 
-    def test_random_episodes_are_sound(self, world: World) -> None:
+    def test_random_episodes_are_sound(self, world: Simulation) -> None:
         """No value is impossible or undefined, the reward sums its terms, success is a fraction.
 
         Each episode begins with interventions drawn from A.
@@ -260,20 +260,20 @@ class TaskConformance(WorldConformance):
 
     # --- what counts ----------------------------------------------------------------------------
 
-    def test_standing_still_is_not_success(self, world: World) -> None:
+    def test_standing_still_is_not_success(self, world: Simulation) -> None:
         """At the start there is something left to do, and nothing has been earned."""
         assert world["success"] == 0
         assert world["reward"] == pytest.approx(
             world.task.weights["fractional_success"] * world["fractional_success"]
         )
 
-    def test_the_solution_fulfils_the_task(self, world: World) -> None:
+    def test_the_solution_fulfils_the_task(self, world: Simulation) -> None:
         """After the intervention that the task calls its solution, it is solved."""
         world.do(world.task.solution(world.values()))
         assert float(world["fractional_success"]) >= self.fulfilled
         assert world["success"] == 1
 
-    def test_achieved_and_desired_are_alike(self, world: World) -> None:
+    def test_achieved_and_desired_are_alike(self, world: Simulation) -> None:
         """Both are arrays of one shape, of finite numbers, equal once the task is solved."""
         achieved, desired = world.task.goals(world.values())
         assert achieved.shape == desired.shape
@@ -283,7 +283,7 @@ class TaskConformance(WorldConformance):
         np.testing.assert_allclose(*world.task.goals(world.values()), atol=0.02)
 
 
-def out_of_bounds(world: World) -> list[str]:
+def out_of_bounds(world: Simulation) -> list[str]:
     """Name the variables whose present value is impossible, or not a number."""
     values = world.values()
     return [
@@ -309,7 +309,7 @@ def _differ(one: Scene, other: Scene) -> bool:
     return parameters or goals or one.state != other.state or one.light != other.light
 
 
-def _holding(world: World) -> Floats:
+def _holding(world: Simulation) -> Floats:
     """Give the action that keeps the robot where it is."""
     joints = world["joint_positions"]
     match world.action_mode:
@@ -321,7 +321,7 @@ def _holding(world: World) -> Floats:
             return world["end_effector_positions"]
 
 
-def _moves_differently(world: World, before: WorldSnapshot) -> bool:
+def _moves_differently(world: Simulation, before: WorldSnapshot) -> bool:
     """Tell whether the next control step differs from the one that was to be taken before."""
     ends = []
     for instant in (world.snapshot(), before):
@@ -345,7 +345,7 @@ def _meant(variable: Variable, value: Value) -> tuple[Value, ...]:
 # --- values and actions -------------------------------------------------------------------------
 
 
-def quantities(world: World) -> list[str]:
+def quantities(world: Simulation) -> list[str]:
     """Name every parameter and state that can be set, each in its own coordinates."""
     model = world.model
     return [
@@ -358,7 +358,7 @@ def quantities(world: World) -> list[str]:
     ]
 
 
-def nearby(world: World, name: str) -> Iterator[Value]:
+def nearby(world: Simulation, name: str) -> Iterator[Value]:
     """Give other possible values of a variable, near the present one."""
     variable, value = world.model.declared(name), world[name]
     match variable.bounds:
@@ -381,7 +381,7 @@ def nearby(world: World, name: str) -> Iterator[Value]:
             raise ValueError(f"{name} has no bounds to choose from")
 
 
-def moved(world: World, name: str) -> tuple[Value, Audit]:
+def moved(world: Simulation, name: str) -> tuple[Value, Audit]:
     """Give a variable the first nearby value that is feasible: blocks may touch one another.
 
     Returns:
@@ -396,7 +396,7 @@ def moved(world: World, name: str) -> tuple[Value, Audit]:
     return last, world.do({name: last})
 
 
-def command(world: World, generator: np.random.Generator) -> Floats:
+def command(world: Simulation, generator: np.random.Generator) -> Floats:
     """Draw an action: anywhere in its range, now and then at its ends, or near the rest pose."""
     low, high = world.action_low, world.action_high
     match generator.integers(4):
@@ -415,7 +415,7 @@ def same(first: Mapping[str, Value], second: Mapping[str, Value]) -> bool:
     )
 
 
-def play(world: World, steps: int) -> list[bytes]:
+def play(world: Simulation, steps: int) -> list[bytes]:
     """Take random actions, always the same ones; give states and rewards."""
     generator, seen = np.random.default_rng(SEED), []
     for _ in range(steps):
@@ -426,7 +426,7 @@ def play(world: World, steps: int) -> list[bytes]:
     return seen
 
 
-def story(world: World) -> list[bytes]:
+def story(world: Simulation) -> list[bytes]:
     """Play two episodes with all kinds of interventions; give everything that there was."""
     seen = []
     for episode in range(2):

@@ -1,8 +1,8 @@
-"""The world: a causal model and an engine, one thing to reset, step and intervene on."""
+"""A causal model with a physics backend: reset, step, intervene, restore."""
 
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.batch import Batch
+from scm_world.world.simulation import Simulation
 from scm_world.world.snapshot import WorldSnapshot
-from scm_world.world.world import World
 
-__all__ = ["Applied", "Audit", "Batch", "World", "WorldSnapshot"]
+__all__ = ["Applied", "Audit", "Batch", "Simulation", "WorldSnapshot"]

@@ -14,7 +14,7 @@ from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.work.processes import cores
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.world import World
+from scm_world.world.simulation import Simulation
 
 KEPT = 4
 """Tables of structures that are kept for when these come again."""
@@ -73,7 +73,7 @@ class Batch:
         UnknownOption: The worlds are not alike, or the number of threads is none.
 
     Example:
-        >>> worlds = [World("pushing", backend="fake") for _ in range(3)]
+        >>> worlds = [Simulation("pushing", backend="fake") for _ in range(3)]
         >>> for seed, world in enumerate(worlds):
         ...     world.reset(seed=seed)
         >>> batch = Batch(worlds, names=["reward"])
@@ -83,7 +83,7 @@ class Batch:
     """
 
     def __init__(
-        self, worlds: Sequence[World], *, threads: int | None = None, names: Iterable[str] = ()
+        self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:
         self._worlds = tuple(worlds)
         if not self._worlds:
@@ -111,7 +111,7 @@ class Batch:
         """Count the worlds."""
         return len(self._worlds)
 
-    def world(self, index: int) -> World:
+    def world(self, index: int) -> Simulation:
         """Give a world as it is now."""
         world = self._worlds[index]
         if self._stepped[index]:
@@ -144,7 +144,7 @@ class Batch:
     def advance(
         self, commands: Floats, which: NDArray[np.bool_] | None = None, *, evaluate: bool = True
     ) -> None:
-        """Advance worlds one control step; see ``World.advance``.
+        """Advance worlds one control step; see ``Simulation.advance``.
 
         Args:
             commands: For each world finite numbers in their range, shape (n, n_actions).

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 
 import scm_world  # noqa: F401 # registers the environments
-from scm_world.world import World
+from scm_world.world import Simulation
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -19,7 +19,7 @@ BACKENDS = ["fake", *ENGINES]
 
 def begin(task: Any = "pushing", backend: str = "fake", **options: Any) -> Any:
     """Give a world at the start of an episode."""
-    world = World(task, backend=backend, **options)
+    world = Simulation(task, backend=backend, **options)
     world.reset(seed=0)
     return world
 

@@ -13,7 +13,7 @@ from scm_world.errors import Infeasible, SeveralProblems, UnknownVariable
 from scm_world.tasks import TASKS, General, PickAndPlace, Picking, Pushing, StackedBlocks
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Box, Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 REST = np.array(hardware.REST)
 TIPS = "end_effector_positions"
@@ -67,7 +67,7 @@ def test_d22_d59_spaces_have_no_memory(task: Any) -> None:
     assert corners(world) == corners(begin(task()))
 
 
-def corners(world: World) -> dict[str, Any]:
+def corners(world: Simulation) -> dict[str, Any]:
     """Give the corners of all boxes A and B as they are now."""
     values = world.values()
     variables = [world.model.declared(name) for name in world.model]
@@ -98,7 +98,7 @@ def test_d27_d50_nothing_is_put_into_something_else(backend: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_d50_the_predecessor_takes_blocks_up_to_3_cm_in_one_another(backend: str) -> None:
     """Under its conventions 2 cm are taken, 3.5 cm are not; of a link of the robot, 9.5 mm."""
-    world = World("stacking2", backend=backend, conventions="causal_world")
+    world = Simulation("stacking2", backend=backend, conventions="causal_world")
     world.reset(seed=0)
     block = "tool_block_2.cartesian_position"
     world.do({"tool_block_1.cartesian_position": [0.0, 0.0, 0.0325], block: [0.045, 0.0, 0.0325]})
@@ -141,7 +141,7 @@ def test_d29_a_reset_restores_what_generates_the_scene(backend: str) -> None:
 @pytest.mark.parametrize("task", [General, StackedBlocks])
 def test_d31_random_scenes_can_be_replayed(task: Any, backend: str) -> None:
     """The same seed, or a pickled snapshot, gives the same scene and the same future."""
-    one, other = World(task(), backend=backend), World(task(), backend=backend)
+    one, other = Simulation(task(), backend=backend), Simulation(task(), backend=backend)
     goal = {"nums_objects": 3} if task is General else {"stack_levels": 2}
     for world in (one, other):
         world.reset(seed=4, do={**world.task.sample_goal("A"), **goal})
@@ -155,7 +155,7 @@ def test_d31_random_scenes_can_be_replayed(task: Any, backend: str) -> None:
         world.close()
 
 
-def future(world: World) -> list[Any]:
+def future(world: Simulation) -> list[Any]:
     """Take three steps, and give the goal and all states."""
     taken = [world.task.goals(world.values())[1].tolist()]
     for _ in range(3):
@@ -196,7 +196,7 @@ def test_d33_a_block_that_grows_flies_on(backend: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_d38_an_engine_is_built_once(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Resets, after whatever interventions, load nothing again."""
-    world, built = World("pushing", backend=backend), []
+    world, built = Simulation("pushing", backend=backend), []
     build = type(world.backend).build
 
     def counted(self: Any, scene: Any) -> None:
@@ -226,7 +226,7 @@ def test_d53_defaults_outside_of_a_are_listed() -> None:
     assert found == OUTSIDE
 
 
-def outside(world: World) -> list[str]:
+def outside(world: Simulation) -> list[str]:
     """Name the published variables whose default is not in A."""
     values, model = world.values(), world.model
     spaced = [name for name in model if model.declared(name).a is not None]

@@ -139,8 +139,8 @@ def test_graph_as_table_names_every_kind_of_column() -> None:
 
 def test_graph_as_json_is_the_model() -> None:
     """What is printed as JSON can be read back."""
+    from scm_world import World
     from scm_world.graph import from_json
-    from scm_world.world import World
 
     result = call("graph", "reaching", "--format", "json", "--action-mode", "joint_torques")
 

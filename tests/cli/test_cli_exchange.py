@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 from scm_world.cli.app import app
 from scm_world.cli.inspection import Format
 from scm_world.graph.exchange import FORMATS, to_digraph
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 def call(*arguments: str) -> Result:
@@ -28,7 +28,7 @@ def test_what_is_printed_can_be_read() -> None:
     result = call("pushing", "--format", "graphml")
     assert result.exit_code == 0, result.output
     found = nx.parse_graphml(result.stdout, force_multigraph=True)
-    pushing = to_digraph(World("pushing", backend="fake").model)
+    pushing = to_digraph(Simulation("pushing", backend="fake").model)
     assert dict(found.nodes(data=True)) == dict(pushing.nodes(data=True))
     assert set(found.edges()) == set(pushing.edges())
 

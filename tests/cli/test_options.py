@@ -14,7 +14,7 @@ from scm_world.cli.arguments import load_task
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.evaluation import Evaluation
 from scm_world.graph import from_json
-from scm_world.world import World
+from scm_world.world import Simulation
 
 SMALL = ("--option", "nums_objects=2")
 STEP = """
@@ -45,7 +45,7 @@ def call(*arguments: str) -> Result:
 def test_graph_takes_options() -> None:
     """The declared graph is that of the variant, and so are the tables."""
     shown = call("graph", "general", "--format", "json", *SMALL).stdout
-    small = World(load_task("general", ["nums_objects=2"]), backend="fake").model
+    small = Simulation(load_task("general", ["nums_objects=2"]), backend="fake").model
     assert from_json(shown) == small
     tables = [call("graph", "general", *given).stdout for given in (SMALL, ())]
     assert tables[0] != tables[1]

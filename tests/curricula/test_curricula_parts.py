@@ -49,7 +49,7 @@ from scm_world.errors import (
 from scm_world.geometry.rotations import angle_between, from_rotation_vector
 from scm_world.tasks import TASKS
 from scm_world.variables import Box, Categories, Cylinder, Integers, Normal
-from scm_world.world import World
+from scm_world.world import Simulation
 
 MASS, FRICTION = "tool_block.mass", "floor_friction"
 
@@ -81,7 +81,7 @@ def test_resample_draws_from_the_space_that_is_named() -> None:
 
 def test_resample_knows_patterns_groups_and_exceptions() -> None:
     """Patterns and groups name variables; ``besides`` takes some out."""
-    world = World("pushing", backend="fake")
+    world = Simulation("pushing", backend="fake")
     found = resample(["*.mass", FRICTION], besides="robot_*").targets(world.compiled)
     assert found == {MASS: "A", FRICTION: "A"}
     assert MASS in physics().targets(world.compiled)
@@ -96,7 +96,7 @@ def test_resample_knows_patterns_groups_and_exceptions() -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_groups_fit_every_task(task: str) -> None:
     """No group is refused anywhere; what is a look is no physics, and everything has all."""
-    world = World(task, backend="fake")
+    world = Simulation(task, backend="fake")
     found = {group: set(matching(world.compiled, [f"@{group}"])) for group in GROUPS}
     assert not found["looks"] & found["physics"]
     assert not (found["looks"] | found["poses"]) - found["everything"]
@@ -124,7 +124,7 @@ def test_interpolate_goes_in_equal_steps() -> None:
     """From the default or a given start to the end, and there it stays."""
     env = under(interpolate({MASS: 0.1}, start={MASS: 0.02}, episodes=4, first=1))
     np.testing.assert_allclose(series(env, MASS, 7), [0.02, 0.02, 0.04, 0.06, 0.08, 0.1, 0.1])
-    world = World("pushing", backend="fake")
+    world = Simulation("pushing", backend="fake")
     world.reset(seed=0)
     default = float(world[FRICTION])
     found = series(under(interpolate({FRICTION: 1.0}, episodes=2)), FRICTION, 3)
@@ -166,7 +166,7 @@ def test_follow_asks_a_function() -> None:
 
 def value_of_default(name: str) -> Any:
     """Give what a variable is without intervention."""
-    world = World("pushing", backend="fake")
+    world = Simulation("pushing", backend="fake")
     world.reset(seed=0)
     return world[name].tolist()
 

@@ -21,7 +21,7 @@ from scm_world.errors import UnknownOption
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.variables.checks import check_space
-from scm_world.world import World
+from scm_world.world import Simulation
 
 CONVENTIONS = ["scm_world", "causal_world"]
 MASS = "tool_block.mass"
@@ -168,6 +168,6 @@ def test_wrong_actors_are_refused(make: Any) -> None:
 
 def test_every_name_of_an_actor_is_one() -> None:
     """All published names make a part that fits a task."""
-    world = World("pushing", backend="fake", conventions="causal_world")
+    world = Simulation("pushing", backend="fake", conventions="causal_world")
     for name in ACTORS:
         as_curriculum(published_actor(name)).check(world)

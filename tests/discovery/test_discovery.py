@@ -16,7 +16,7 @@ from scm_world.graph import SCM
 from scm_world.tasks import Pushing, TriFingerTask
 from scm_world.tasks.base import Observed
 from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Variable
-from scm_world.world import World
+from scm_world.world import Simulation
 
 ENGINES = ["mujoco"] + (["bullet"] if importlib.util.find_spec("pybullet") else [])
 
@@ -81,13 +81,13 @@ class Tampered:
         return changed
 
 
-def tampered_world(monkeypatch: pytest.MonkeyPatch, tamper: Tampered) -> World:
+def tampered_world(monkeypatch: pytest.MonkeyPatch, tamper: Tampered) -> Simulation:
     """Build a pushing world that declares something false about its physics."""
     from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 
     honest = BlockWorld.variables
     monkeypatch.setattr(BlockWorld, "variables", lambda self: tuple(tamper(honest(self))))
-    return World("pushing")
+    return Simulation("pushing")
 
 
 def test_an_edge_that_is_not_declared_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,6 +207,6 @@ def test_custom_tasks_can_be_discovered() -> None:
         def solution(self, values):  # type: ignore[no-untyped-def]
             return self._pushing.solution(values)
 
-    report = discover(World(Heavy(), backend="fake"), probes=1)
+    report = discover(Simulation(Heavy(), backend="fake"), probes=1)
     assert report.task == "heavy"
     assert report.score.undeclared == ()

@@ -17,7 +17,7 @@ from scm_world.discovery.plots import EXTRA, MATCHED, MISSING, draw_graphs
 from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.variables import Derived, Exogenous, Linear, Parent
-from scm_world.world import World
+from scm_world.world import Simulation
 
 MODEL = SCM(
     [
@@ -93,7 +93,7 @@ def test_models_are_drawn(tmp_path: Path, model: SCM) -> None:
 @pytest.mark.parametrize("task", ["pushing", "towers"])
 def test_causes_stand_left_of_their_effects_and_boxes_apart(task: str) -> None:
     """In the drawing of a task arrows go right, and no two boxes overlap."""
-    drawing = lay_out(World(task, backend="fake").model)
+    drawing = lay_out(Simulation(task, backend="fake").model)
 
     assert all(points[0][0] < points[-1][0] for _, _, points, _, _ in drawing.arrows)
     width, height = drawing.box
@@ -168,7 +168,7 @@ def test_families_have_the_same_edges() -> None:
 
 def test_blocks_of_one_kind_are_one_family() -> None:
     """What each block has of its own is one node, under a name that fits into a box."""
-    model = World("towers", backend="fake").model
+    model = Simulation("towers", backend="fake").model
     families = Families(model, (edge.key for edge in model.edges))
 
     assert len(families.members["tool_{…}.mass (5)"]) == 5

@@ -10,7 +10,7 @@ import pytest
 from scm_world.discovery import DiscoveryReport, discover
 from scm_world.tasks import TASKS, make_task
 from scm_world.variables import Function, Parent
-from scm_world.world import World
+from scm_world.world import Simulation
 
 ENGINES = ["mujoco"] + (["bullet"] if importlib.util.find_spec("pybullet") else [])
 
@@ -44,7 +44,7 @@ DECLARED = {
 
 def found(task: str, backend: str, probes: int, options: dict[str, Any]) -> DiscoveryReport:
     """Discover a task."""
-    return discover(World(make_task(task, **options), backend=backend), probes=probes)
+    return discover(Simulation(make_task(task, **options), backend=backend), probes=probes)
 
 
 def first(value: Any, *_: Any) -> Any:

@@ -13,7 +13,7 @@ from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownO
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.feasibility import overlaps
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.plan import merged
 
 
@@ -44,7 +44,7 @@ def test_what_is_done_at_a_reset_counts_more_than_the_start() -> None:
 
 def test_names_of_one_quantity_replace_each_other() -> None:
     """Of two coordinates of one pose the later one counts."""
-    model = World("pushing", backend="fake").model
+    model = Simulation("pushing", backend="fake").model
     polar, cartesian = "tool_block.cylindrical_position", "tool_block.cartesian_position"
     found = merged(model, {polar: "A", "gravity": 1.0}, {cartesian: 2.0}, {"unheard_of": 3})
     assert found == {"gravity": 1.0, cartesian: 2.0, "unheard_of": 3}

@@ -19,7 +19,7 @@ from scm_world.graph import exchange as ex
 from scm_world.graph.exchange import space_lines, to_digraph, write_graph
 from scm_world.tasks import TASKS, make_task
 from scm_world.variables import Affine, Box, Either, Exogenous, Measured, Parent, Switch
-from scm_world.world import World
+from scm_world.world import Simulation
 
 SMALL: dict[str, dict[str, Any]] = {
     "stacked_blocks": {"num_of_levels": 2},
@@ -54,7 +54,7 @@ def graph(request: pytest.FixtureRequest) -> nx.MultiDiGraph:
         case "nothing":
             return to_digraph(nx.DiGraph())
     task = make_task(request.param, **SMALL.get(request.param, {}))
-    return to_digraph(World(task, backend="fake").model)
+    return to_digraph(Simulation(task, backend="fake").model)
 
 
 # --- networkx ------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ def graph(request: pytest.FixtureRequest) -> nx.MultiDiGraph:
 
 def test_a_graph_says_what_the_model_says() -> None:
     """Kind, role, unit, spaces and edges are those of the model."""
-    model = World("pushing", backend="fake").model
+    model = Simulation("pushing", backend="fake").model
     found = to_digraph(model)
     assert found.nodes["tool_block.mass"] == {
         "kind": "exogenous",

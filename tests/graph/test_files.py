@@ -34,7 +34,7 @@ from scm_world.variables import (
     Scale,
     Shift,
 )
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 def double(x: Any, noise: Any = 0.0) -> Any:
@@ -91,7 +91,7 @@ def test_json_is_json() -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_the_model_of_every_task_survives_json(task: str) -> None:
     """The declared models can be sent, and solve to the same values."""
-    first = World(task, backend="fake").model
+    first = Simulation(task, backend="fake").model
     again = from_json(to_json(first))
     assert again == first
     static = [

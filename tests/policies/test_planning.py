@@ -22,7 +22,7 @@ from scm_world.queries import World
 from scm_world.tasks import Pushing, Reaching
 from scm_world.tasks.trifinger.building import corners
 from scm_world.variables import Noise
-from scm_world.world import World as Simulated
+from scm_world.world import Simulation
 
 SMALL: dict[str, Any] = {"samples": 6, "elites": 2, "horizon": 3, "iterations": 2, "threads": 1}
 HEAVY = {"tool_block.mass": 0.09}
@@ -159,7 +159,7 @@ def test_one_instance_serves_all_episodes() -> None:
     assert first[1].tobytes() != first[0].tobytes()
 
 
-def policy_of(policy: CrossEntropy, world: Simulated, seed: int) -> Any:
+def policy_of(policy: CrossEntropy, world: Simulation, seed: int) -> Any:
     """Give the first actions of an episode."""
     world.reset(seed=seed)
     actions = []

@@ -15,7 +15,7 @@ from scm_world.queries.local import islands, local_graph, reached
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FINGERS as NAMES
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.world import World
+from scm_world.world import Simulation
 
 FINGERS = tuple(f"robot_finger_{name}" for name in NAMES)
 NEEDS_BULLET = pytest.mark.skipif(
@@ -26,19 +26,19 @@ FINGER, ONE, TWO = FINGERS[0], "tool_block_1", "tool_block_2"
 TIP = hardware.COLLISION["tip"].radius  # [m]
 HALF = 0.0325  # [m] of a block's edge
 
-_WORLDS: dict[str, World] = {}
+_WORLDS: dict[str, Simulation] = {}
 
 
-def begin(engine: str) -> World:
+def begin(engine: str) -> Simulation:
     """Give a world with two blocks at the start of an episode."""
     if engine not in _WORLDS:
         mode = "end_effector_positions"
-        _WORLDS[engine] = World("stacking2", backend=engine, action_mode=mode)
+        _WORLDS[engine] = Simulation("stacking2", backend=engine, action_mode=mode)
     _WORLDS[engine].reset(seed=0)
     return _WORLDS[engine]
 
 
-def place(world: World, tip: np.ndarray, one: list[float], two: list[float]) -> np.ndarray:
+def place(world: Simulation, tip: np.ndarray, one: list[float], two: list[float]) -> np.ndarray:
     """Put the first fingertip and both blocks somewhere, the other fingers out of the way.
 
     Returns:
@@ -62,27 +62,27 @@ def among(*bodies: str) -> set[tuple[str, str]]:
     return set(itertools.permutations(bodies, 2))
 
 
-def pushed(world: World) -> np.ndarray:
+def pushed(world: Simulation) -> np.ndarray:
     """Let the first finger push the first block; the other lies elsewhere."""
     near = np.array([0.0, HALF + TIP + 3e-4, HALF])
     return place(world, near, [0.0, 0.0, HALF], [0.0, -0.16, HALF])
 
 
-def stacked(world: World) -> np.ndarray:
+def stacked(world: Simulation) -> np.ndarray:
     """Stand one block on the other."""
     world.do({f"{ONE}.cartesian_position": [0, 0, HALF]})
     world.do({f"{TWO}.cartesian_position": [0, 0, 3 * HALF]})
     return world["end_effector_positions"]
 
 
-def alone(world: World) -> np.ndarray:
+def alone(world: Simulation) -> np.ndarray:
     """Let one block fall, while the other stands far from it."""
     away = {f"{ONE}.cartesian_position": [0.0, -0.14, HALF]}
     world.do({f"{TWO}.cartesian_position": [0.0, 0.0, 0.2], **away})
     return world["end_effector_positions"]
 
 
-def chained(world: World) -> np.ndarray:
+def chained(world: Simulation) -> np.ndarray:
     """Let the first finger push the first block, and that one the second."""
     near = np.array([0.0, HALF + TIP + 3e-4, HALF])
     return place(world, near, [0.0, 0.0, HALF], [0.0, -2 * HALF - 3e-4, HALF])
@@ -103,7 +103,7 @@ SCENES = {
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
-def test_hand_made_scenes(engine: str, scene: Callable[[World], np.ndarray]) -> None:
+def test_hand_made_scenes(engine: str, scene: Callable[[Simulation], np.ndarray]) -> None:
     """Contacts say what anyone sees; what stands still is told apart."""
     world = begin(engine)
     *actions, action = onward(scene(world), 4)
@@ -172,4 +172,4 @@ def test_asking_changes_nothing(engine: str) -> None:
 def test_what_cannot_be_asked() -> None:
     """There must be an episode."""
     with pytest.raises(NotReset):
-        local_graph(World("pushing"))
+        local_graph(Simulation("pushing"))

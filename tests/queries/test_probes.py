@@ -9,7 +9,7 @@ import pytest
 
 from scm_world.queries.experiments.probes import probes
 from scm_world.tasks import TASKS, make_task
-from scm_world.world import World
+from scm_world.world import Simulation
 
 SMALL: dict[str, dict[str, Any]] = {
     "towers": {"number_of_blocks_in_tower": (1, 1, 2), "tower_dims": (0.035, 0.035, 0.07)},
@@ -26,7 +26,7 @@ NO_ROOM = {"pick_and_place": {"touch", "block_in_air"}}
 @pytest.mark.parametrize("task", TASKS)
 def test_every_scenario_is_feasible(task: str) -> None:
     """Of each kind of probe that there is room for, one can be prepared in two rounds."""
-    world = World(make_task(task, **SMALL.get(task, {})), backend="fake")
+    world = Simulation(make_task(task, **SMALL.get(task, {})), backend="fake")
     world.reset(seed=0)
     kinds = [scenario.name for scenario in world.task.scenarios(world)]
     seen = {probe.kind for probe in probes(world, 2 * len(kinds), 0)}
@@ -35,7 +35,7 @@ def test_every_scenario_is_feasible(task: str) -> None:
 
 def test_probe_states_do_not_depend_on_how_many() -> None:
     """Probe i of a seed is the same in a longer run."""
-    world = World("pushing", backend="fake")
+    world = Simulation("pushing", backend="fake")
     short = [p.action for p in probes(world, 3, 0)]
     long = [p.action for p in probes(world, 6, 0)][:3]
     assert all(np.array_equal(a, b) for a, b in zip(short, long, strict=True))

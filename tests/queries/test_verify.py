@@ -24,7 +24,7 @@ from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
 from scm_world.variables import Parent
 from scm_world.variables.kinds import Variable
-from scm_world.world import World
+from scm_world.world import Simulation
 
 HAS_BULLET = importlib.util.find_spec("pybullet") is not None
 ENGINES = ["mujoco"] + (["bullet"] if HAS_BULLET else [])
@@ -77,7 +77,7 @@ def test_pushing_on_one_engine_is_verified() -> None:
     assert 16 <= found.probes < 40
 
 
-def tampered(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., Any]) -> World:
+def tampered(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., Any]) -> Simulation:
     """Build a pushing world that declares other parents of one variable."""
     honest = BlockWorld.variables
 
@@ -88,7 +88,7 @@ def tampered(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., A
         )
 
     monkeypatch.setattr(BlockWorld, "variables", variables)
-    return World("pushing")
+    return Simulation("pushing")
 
 
 def test_a_missing_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,7 +161,7 @@ def test_numbers_must_be_positive(wrong: dict[str, Any]) -> None:
 def test_a_world_takes_no_options() -> None:
     """Options of a world that is made already would be ignored, so they are refused."""
     with pytest.raises(UnknownOption, match="world that is made"):
-        verify(World("reaching", backend="fake"), backend="mujoco", probes=1)
+        verify(Simulation("reaching", backend="fake"), backend="mujoco", probes=1)
 
 
 # --- two engines ---------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from scm_world.testing.task import TaskConformance
-from scm_world.world import World
+from scm_world.world import Simulation
 
 ROOT = Path(__file__).parent.parent.parent
 EXAMPLE = ROOT / "examples" / "new_family.py"
@@ -33,9 +33,9 @@ family = _load("new_family")
 class TestPyramid(TaskConformance):
     """The pyramid of the documents."""
 
-    def make(self) -> World:
+    def make(self) -> Simulation:
         """Create a world."""
-        return World(family.Pyramid(), backend="fake")
+        return Simulation(family.Pyramid(), backend="fake")
 
 
 def test_the_document_shows_the_example() -> None:
@@ -46,7 +46,7 @@ def test_the_document_shows_the_example() -> None:
 @pytest.mark.parametrize("backend", ["fake", "mujoco"])
 def test_levels_come_and_go(backend: str) -> None:
     """A level more is as many blocks more, in mid-episode too, and they do not collide."""
-    world = World(family.Pyramid(), backend=backend)
+    world = Simulation(family.Pyramid(), backend=backend)
     world.reset(seed=0)
     world.step(np.array(world.task.start))
     assert world.do({"pyramid_levels": 3}).came == ("tool_0_2", "tool_1_1", "tool_2_0")

@@ -12,15 +12,15 @@ from scm_world.tasks import General
 from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.tasks.trifinger.piles import MOST, pile
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 ABSENT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
-def general(backend: str = "fake", **options: Any) -> World:
+def general(backend: str = "fake", **options: Any) -> Simulation:
     """Give a world at the start of an episode."""
-    world = World(General(**options), backend=backend)
+    world = Simulation(General(**options), backend=backend)
     world.reset(seed=0)
     return world
 

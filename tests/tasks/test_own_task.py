@@ -12,7 +12,7 @@ from scm_world.evaluation.checking import check
 from scm_world.tasks import TASKS, Building, Reaching, Task, register, tasks
 from scm_world.training.loop import identity_of
 from scm_world.training.recipe import Recipe, recipe
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 class Mine(Reaching):  # type: ignore[misc] # a twin of it is enough here
@@ -35,7 +35,7 @@ def test_what_is_registered_is_known_by_its_name(registry: dict[str, type[Task]]
     assert register(Mine) is Mine  # a second time, as when a module is run again
     assert tasks() == {**TASKS, "mine": Mine}
     assert "mine" not in TASKS
-    assert isinstance(World("mine", backend="fake").task, Mine)
+    assert isinstance(Simulation("mine", backend="fake").task, Mine)
     assert [protocol.name for protocol in protocols_of("mine")] == ["P0"]
     found = evaluate("still", task="mine", n=1, backend="fake", env={"max_episode_length": 2})
     assert "Mine" in found.about["class"]

@@ -23,15 +23,15 @@ from scm_world.errors import Infeasible, InterventionError, OutOfSpace, UnknownO
 from scm_world.tasks import PickAndPlace
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 BLOCK, GOAL = "tool_block.cartesian_position", "goal_block.cartesian_position"
 TURN = "goal_block.orientation"
 
 
-def crossing(**options: Any) -> World:
+def crossing(**options: Any) -> Simulation:
     """Give a world without physics."""
-    world = World(PickAndPlace(**options), backend="fake")
+    world = Simulation(PickAndPlace(**options), backend="fake")
     world.reset(seed=0)
     return world
 
@@ -82,7 +82,7 @@ def test_the_observation_is_the_published_one() -> None:
 def test_the_wall_counts_for_the_predecessor_only() -> None:
     """Ten seconds for the block; the predecessor's episodes have ten more for the wall."""
     lengths = {
-        name: World("pick_and_place", backend="fake", conventions=name).max_episode_length
+        name: Simulation("pick_and_place", backend="fake", conventions=name).max_episode_length
         for name in ("scm_world", "causal_world")
     }
     assert lengths == {"scm_world": 250, "causal_world": 500}

@@ -21,7 +21,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Picking
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 BLOCK, GOAL, SIZE = (
     "tool_block.cartesian_position",
@@ -30,9 +30,9 @@ BLOCK, GOAL, SIZE = (
 )
 
 
-def picking(convention: str = "scm_world", **options: Any) -> World:
+def picking(convention: str = "scm_world", **options: Any) -> Simulation:
     """Give a world without physics."""
-    world = World(Picking(**options), backend="fake", conventions=convention)
+    world = Simulation(Picking(**options), backend="fake", conventions=convention)
     world.reset(seed=0)
     return world
 

@@ -12,21 +12,21 @@ from scm_world.tasks import CONVENTIONS, Pushing, Reaching, conventions, make_ta
 from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.variables import Shift
-from scm_world.world import World
+from scm_world.world import Simulation
 
 REST = np.array(hardware.REST)
 TIPS = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.2, 0.3, 0.4, 0.0])
 
 
-def pushing(convention: str = "scm_world", **options: Any) -> World:
+def pushing(convention: str = "scm_world", **options: Any) -> Simulation:
     """Give a pushing world without physics, with the fingers out of the way."""
-    world = World(Pushing(**options), backend="fake", conventions=convention)
+    world = Simulation(Pushing(**options), backend="fake", conventions=convention)
     world.reset(seed=0)
     world.do({"joint_positions": hardware.RAISED})
     return world
 
 
-def place(world: World, offset: tuple[float, float, float], yaw: float = 0.0) -> None:
+def place(world: Simulation, offset: tuple[float, float, float], yaw: float = 0.0) -> None:
     """Put the block near the goal."""
     position = world["goal_block.cartesian_position"] + np.array(offset)
     tool = {"cartesian_position": position, "euler_orientation": [0.0, 0.0, yaw]}
@@ -159,7 +159,7 @@ def test_the_predecessor_measured_the_hull() -> None:
 
 def test_reaching_rewards_tips_that_come_nearer() -> None:
     """The joints jump, and the reward is the difference of two distances, times 100,000."""
-    world = World("reaching", backend="fake")
+    world = Simulation("reaching", backend="fake")
     world.reset(seed=0)
     goals = np.array([0.0, 0.0, 0.10, 0.0, 0.0, 0.13, 0.0, 0.0, 0.16])
     target = REST + np.tile([0.05, -0.1, 0.05], 3)
@@ -191,7 +191,7 @@ def test_reaching_succeeds_within_a_centimeter(error: float, fraction: float, su
 
 def test_the_predecessor_added_the_distance() -> None:
     """In reaching its reward grew with the error; under its conventions ours does too."""
-    world = World("reaching", backend="fake", conventions="causal_world")
+    world = Simulation("reaching", backend="fake", conventions="causal_world")
     world.reset(seed=0)
     assert "reach_error" in world.model.parents("reward")
     assert "fractional_success" not in world.model.parents("reward")
@@ -210,7 +210,7 @@ def test_weights_can_be_chosen() -> None:
 
 def test_velocities_that_change_cost_smoothness() -> None:
     """The term is minus the norm of the difference of two steps."""
-    world = World(Reaching(weights={"reward.smoothness": 2.0}), backend="mujoco")
+    world = Simulation(Reaching(weights={"reward.smoothness": 2.0}), backend="mujoco")
     world.reset(seed=0)
     world.step(REST + 0.1)
     before = world["joint_velocities"]

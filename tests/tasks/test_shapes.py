@@ -18,7 +18,7 @@ from scm_world.geometry.hulls import Hull, box_hull, hull_of
 from scm_world.tasks import PickAndPlace, Picking, Pushing
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 TASKS = (Pushing, Picking, PickAndPlace)
 BLOCK, GOAL = "tool_block.cartesian_position", "goal_block.cartesian_position"
@@ -29,14 +29,14 @@ def wedge() -> Hull:
     return hull_of([(x, y, z) for y in (0.0, 0.06) for x, z in ((0, 0), (0.07, 0), (0, 0.06))])
 
 
-def world_of(task: Any, backend: str = "fake", **options: Any) -> World:
+def world_of(task: Any, backend: str = "fake", **options: Any) -> Simulation:
     """Give a world at the start of an episode."""
-    world = World(task(**options), backend=backend)
+    world = Simulation(task(**options), backend=backend)
     world.reset(seed=0)
     return world
 
 
-def lowest(world: World, name: str) -> float:
+def lowest(world: Simulation, name: str) -> float:
     """Find the height of the lowest corner of block or goal."""
     turned = world[f"{name}.vertices"] @ rotation_matrix(world[f"{name}.orientation"]).T
     return float((turned + world[f"{name}.cartesian_position"])[:, 2].min())
@@ -97,7 +97,7 @@ def test_the_predecessor_measures_the_boxes_around() -> None:
     offset = middle - (turned.max(0) + turned.min(0)) / 2.0
     for name in ("scm_world", "causal_world"):
         task = Picking(shape=shape, goal_block_orientation=flat)
-        world = World(task, backend="fake", conventions=name)
+        world = Simulation(task, backend="fake", conventions=name)
         world.reset(seed=0)
         world.do({BLOCK: world[GOAL] + offset, "tool_block.orientation": [1.0, 0.0, 0.0, 0.0]})
         fractions[name] = float(world["fractional_success"])

@@ -13,7 +13,7 @@ from scm_world.env import ScmWorldEnv
 from scm_world.geometry import angle_between
 from scm_world.tasks import Stacking2
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 FIRST, SECOND, GOAL, TOP = (
     f"{name}.cartesian_position"
@@ -22,9 +22,9 @@ FIRST, SECOND, GOAL, TOP = (
 TOWER = "goal_tower.cylindrical_position"
 
 
-def stacking(**options: Any) -> World:
+def stacking(**options: Any) -> Simulation:
     """Give a world without physics."""
-    world = World(Stacking2(**options), backend="fake")
+    world = Simulation(Stacking2(**options), backend="fake")
     world.reset(seed=0)
     return world
 

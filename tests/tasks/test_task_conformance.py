@@ -11,7 +11,7 @@ import pytest
 from scm_world.geometry.hulls import Hull, hull_of
 from scm_world.tasks import TASKS, Task
 from scm_world.testing.task import TaskConformance
-from scm_world.world import World
+from scm_world.world import Simulation
 
 SMALLER: Mapping[str, Mapping[str, Any]] = {
     "towers": {"number_of_blocks_in_tower": (1, 2, 2)},
@@ -55,9 +55,9 @@ class OnEveryTask(TaskConformance):
     def _choose(self, request: pytest.FixtureRequest) -> None:
         self.task = request.param
 
-    def make(self) -> World:
+    def make(self) -> Simulation:
         """Create a world."""
-        return World(make_case(self.task), backend=self.backend)
+        return Simulation(make_case(self.task), backend=self.backend)
 
 
 class TestFake(OnEveryTask):

@@ -13,7 +13,7 @@ from scm_world.tasks import TASKS, term
 from scm_world.tasks.trifinger.feasibility import buried_goals
 from scm_world.variables import Box, Draw, Function, Measured
 from scm_world.variables.kinds import SpaceName
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -130,7 +130,7 @@ def test_a_term_of_ones_own_is_a_number_with_a_name(term: Any, words: str) -> No
 
 def test_a_wall_of_no_blocks_is_one_problem() -> None:
     """The wall stays as it was."""
-    world = World("stacked_blocks", backend="fake")
+    world = Simulation("stacked_blocks", backend="fake")
     world.reset(seed=0)
     before = world["wall.layout"]
     with pytest.raises(InterventionError, match="at least one block"):
@@ -142,7 +142,7 @@ def test_a_wall_of_no_blocks_is_one_problem() -> None:
 @pytest.mark.parametrize("space", ["A", "B"])
 def test_a_random_goal_can_be_fulfilled(task: str, space: SpaceName) -> None:
     """Fingers that would be in the way make room, and no goal lies in an obstacle."""
-    world = World(task, backend="fake")
+    world = Simulation(task, backend="fake")
     for seed in range(3 if task == "towers" else 15):
         world.reset(seed=seed, do=world.task.sample_goal(space))
         world.do(world.task.solution(world.values()))
@@ -151,7 +151,7 @@ def test_a_random_goal_can_be_fulfilled(task: str, space: SpaceName) -> None:
 
 def test_goals_are_drawn_outside_of_obstacles() -> None:
     """By hand they may be put anywhere; what is drawn can be filled."""
-    world = World(TASKS["pick_and_place"](), backend="fake")
+    world = Simulation(TASKS["pick_and_place"](), backend="fake")
     world.reset(seed=0, do={"goal_block.cartesian_position": [0.0, 0.0, 0.0325]})
     inside = Draw(Box((0.0, 0.0), (0.15, 1.5)))
     for seed in range(30):
@@ -163,7 +163,7 @@ def test_goals_are_drawn_outside_of_obstacles() -> None:
 
 def test_a_tilted_goal_rests_on_the_floor() -> None:
     """A box on its edge is higher than one on its side."""
-    world = World("pushing", backend="fake")
+    world = Simulation("pushing", backend="fake")
     world.reset(seed=0, do={"goal_block.euler_orientation": [np.pi / 4, 0.0, 0.3]})
     height = world["goal_block.cartesian_position"][2]
     turned = rotation_matrix(world["goal_block.orientation"])[2]

@@ -13,7 +13,7 @@ from scm_world.tasks import Towers
 from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.tasks.trifinger.towers import start
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 DEEP = 1e-6  # [m]
 COUNTS = (1, 1, 5)
@@ -22,14 +22,14 @@ UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
 def tower(
     number: tuple[int, int, int] = COUNTS, dims: tuple[float, float, float] = (0.035, 0.035, 0.175)
-) -> World:
+) -> Simulation:
     """Give a world at the start of an episode, without physics."""
-    world = World(Towers(number_of_blocks_in_tower=number, tower_dims=dims), backend="fake")
+    world = Simulation(Towers(number_of_blocks_in_tower=number, tower_dims=dims), backend="fake")
     world.reset(seed=0)
     return world
 
 
-def centers(world: World, names: Iterable[str]) -> Floats:
+def centers(world: Simulation, names: Iterable[str]) -> Floats:
     """Gather the centers of some bodies, shape (n, 3) [m]."""
     return np.array([world[f"{name}.cartesian_position"] for name in names])
 
@@ -96,7 +96,7 @@ def test_blocks_rise_by_their_height_where_the_floor_is_full() -> None:
 @pytest.mark.parametrize("backend", ["fake", "mujoco"])
 def test_another_tower_begins_again(backend: str) -> None:
     """In mid-episode, too, blocks that change their size are put where they would begin."""
-    world = World(Towers(), backend=backend)
+    world = Simulation(Towers(), backend=backend)
     world.reset(seed=0)
     for _ in range(3):
         world.step(np.array(world.task.start))

@@ -12,7 +12,7 @@ from scm_world.tasks.trifinger.feasibility import overlaps
 from scm_world.tasks.trifinger.layouts import MAX_LEVELS, SHAPE, layout
 from scm_world.tasks.trifinger.walls import Walls
 from scm_world.variables import Draw
-from scm_world.world import World
+from scm_world.world import Simulation
 
 DEEP = 1e-6  # [m]
 ARENA = 0.15  # [m]
@@ -20,14 +20,14 @@ RANDOM = {"wall_pattern": 1, "wall_noise": Draw("A")}
 NOISE = np.random.default_rng(0).random((200, MAX_LEVELS, 3))
 
 
-def begin(task: Walls, *, conventions: str = "scm_world", backend: str = "fake") -> World:
+def begin(task: Walls, *, conventions: str = "scm_world", backend: str = "fake") -> Simulation:
     """Give a world at the start of an episode."""
-    world = World(task, backend=backend, conventions=conventions)
+    world = Simulation(task, backend=backend, conventions=conventions)
     world.reset(seed=0)
     return world
 
 
-def place(world: World, name: str) -> Floats:
+def place(world: Simulation, name: str) -> Floats:
     """Give the center of a body [m]."""
     return np.asarray(world[f"{name}.cartesian_position"])
 

@@ -19,7 +19,7 @@ from scm_world.errors import (
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.kinematics import forward
 from scm_world.variables import Box, Draw, Hard, Scale, Shift
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 @pytest.mark.parametrize(("backend", "task"), PARAMS)
@@ -73,7 +73,7 @@ def test_the_action_is_not_changed_nor_kept() -> None:
 
 def test_torques_can_be_commanded() -> None:
     """In torque mode the joints accelerate with the torque; the range is that of the motors."""
-    world = World("reaching", backend="mujoco", action_mode="joint_torques")
+    world = Simulation("reaching", backend="mujoco", action_mode="joint_torques")
     assert world.model["action"].unit == "N m"
     np.testing.assert_array_equal(world.action_high, 0.36)
     moved = []
@@ -88,7 +88,7 @@ def test_torques_can_be_commanded() -> None:
 @pytest.mark.parametrize("backend", ["fake", "mujoco"])
 def test_fingertips_can_be_commanded(backend: str) -> None:
     """In end-effector mode the tips go to the points that are asked for."""
-    world = World("reaching", backend=backend, action_mode="end_effector_positions")
+    world = Simulation("reaching", backend=backend, action_mode="end_effector_positions")
     assert world.model["action"].unit == "m"
     world.reset(seed=0)
     wanted = forward(REST + np.tile([0.1, -0.1, -0.1], 3), float(world["robot_height"]))
@@ -105,7 +105,7 @@ def test_a_control_step_takes_the_same_time_under_every_preset(
     preset: str, frame_skip: int
 ) -> None:
     """Frame skip counts units of 4 ms, so a block flies equally far."""
-    world = World("pushing", backend="fake", preset=preset, frame_skip=frame_skip)
+    world = Simulation("pushing", backend="fake", preset=preset, frame_skip=frame_skip)
     world.reset(seed=0)
     world.do({"tool_block.linear_velocity": [0.0, 0.0, 1.0]})
     world.step(REST)
@@ -115,10 +115,10 @@ def test_a_control_step_takes_the_same_time_under_every_preset(
 
 def test_episodes_have_the_published_lengths() -> None:
     """Ten seconds of pushing are 250 steps, five of reaching 125; a length can be given."""
-    assert World("pushing", backend="fake").max_episode_length == 250
-    assert World("reaching", backend="fake").max_episode_length == 125
-    assert World("pushing", backend="fake", frame_skip=5).max_episode_length == 500
-    assert World("pushing", backend="fake", max_episode_length=7).max_episode_length == 7
+    assert Simulation("pushing", backend="fake").max_episode_length == 250
+    assert Simulation("reaching", backend="fake").max_episode_length == 125
+    assert Simulation("pushing", backend="fake", frame_skip=5).max_episode_length == 500
+    assert Simulation("pushing", backend="fake", max_episode_length=7).max_episode_length == 7
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_episodes_have_the_published_lengths() -> None:
 def test_an_option_that_does_not_exist_is_refused(options: dict[str, Any], suggestion: str) -> None:
     """The error lists the choices and suggests the nearest."""
     with pytest.raises(UnknownOption, match=suggestion) as caught:
-        World(**{"backend": "fake", **options})
+        Simulation(**{"backend": "fake", **options})
     assert caught.value.option in options
     assert caught.value.choices
 
@@ -152,7 +152,7 @@ def test_a_missing_engine_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(importlib, "import_module", absent)
     with pytest.raises(MissingEngine, match="pip install") as caught:
-        World("pushing", backend="bullet")
+        Simulation("pushing", backend="bullet")
     assert caught.value.engine == "bullet"
 
 
@@ -228,7 +228,7 @@ def test_actions_that_are_changed_at_every_step_have_no_value_yet() -> None:
 def test_what_is_no_task_and_no_backend_is_refused(options: dict[str, Any], words: str) -> None:
     """With what there is."""
     with pytest.raises(UnknownOption, match=words):
-        World(**{"backend": "fake", **options})
+        Simulation(**{"backend": "fake", **options})
 
 
 @pytest.mark.parametrize(

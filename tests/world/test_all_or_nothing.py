@@ -22,7 +22,7 @@ from scm_world.errors import (
 )
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables import Exogenous, Hard, Measured, Mechanism
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 def test_the_log_keeps_what_was_asked_for() -> None:
@@ -73,10 +73,10 @@ def _scaled(factor: float) -> Any:
     return move
 
 
-def _growing(default: float, step: Any = _grow) -> World:
+def _growing(default: float, step: Any = _grow) -> Simulation:
     rate = Exogenous(name="rate", default=default)
     x = Measured(name="x", settable_state=True, default=0.0, parents=("rate",))
-    return World(StepTask(step, name="grow", parameters=[rate], states=[x], control_dt=0.1))
+    return Simulation(StepTask(step, name="grow", parameters=[rate], states=[x], control_dt=0.1))
 
 
 _POLE = (
@@ -90,7 +90,9 @@ def test_a_snapshot_of_other_arguments_is_refused() -> None:
     pairs = [(_growing(0.1), _growing(0.2))]
     pairs.append((_growing(0.1), _growing(0.1, _shrink)))
     pairs.append((_growing(0.1, _scaled(1.0)), _growing(0.1, _scaled(2.0))))
-    pairs.append((World(ModelTask(_POLE.format(0.02))), World(ModelTask(_POLE.format(0.03)))))
+    pairs.append(
+        (Simulation(ModelTask(_POLE.format(0.02))), Simulation(ModelTask(_POLE.format(0.03))))
+    )
     for first, second in pairs:
         first.reset(seed=0)
         second.reset(seed=1)
@@ -161,7 +163,7 @@ class _Failing(BackendWrapper):
 def test_what_fails_after_the_engine_went_back_is_undone(fails: type[BaseException]) -> None:
     """A snapshot that is met for the first time is restored as a whole, or not at all."""
     backend = _Failing(make_backend("fake"))
-    world = World("pushing", backend=backend)
+    world = Simulation("pushing", backend=backend)
     world.reset(seed=0)
     written = pickle.dumps(world.snapshot())
     world.do({"tool_block.mass": 0.1, "gravity": [0.0, 0.0, -5.0]})
@@ -178,7 +180,7 @@ def test_what_fails_after_the_engine_went_back_is_undone(fails: type[BaseExcepti
 def test_a_world_that_was_left_between_two_instants_says_so() -> None:
     """Where an engine fails on the way to a snapshot of this process, the world is lost."""
     backend = _Failing(make_backend("fake"))
-    world = World("pushing", backend=backend)
+    world = Simulation("pushing", backend=backend)
     world.reset(seed=0)
     start, values = world.snapshot(), world.values()
     world.step(REST)
@@ -226,7 +228,7 @@ def test_mechanisms_give_numbers(given: Any) -> None:
 @pytest.mark.parametrize("resolution", ["vector", "joint"])
 def test_mechanisms_of_actions_give_actions(given: Any, resolution: str) -> None:
     """What would fail at every step is refused, with the other problems of the request."""
-    world = World("pushing", backend="fake", resolution=resolution)
+    world = Simulation("pushing", backend="fake", resolution=resolution)
     world.reset(seed=0)
     wrong = Mechanism(lambda joints: given, ["joint_positions"])
     with pytest.raises(SeveralProblems, match=r"(?s)2 problems.*do\(action\).*do\(gravity\)"):

@@ -14,7 +14,7 @@ from scm_world.errors import NotReset, UnknownOption
 from scm_world.tasks import TASKS, Pushing
 from scm_world.tasks.rewards import term
 from scm_world.variables import Function, Measured, Mechanism
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.batch import Batch
 
 COUNT = 4
@@ -22,22 +22,22 @@ ENGINES = [pytest.param(b, marks=NEEDS_BULLET if b == "bullet" else ()) for b in
 NAMES = ("reward", "success", "fractional_success", "end_effector_positions")
 
 
-def worlds(task: Any = "pushing", count: int = COUNT, **options: Any) -> list[World]:
+def worlds(task: Any = "pushing", count: int = COUNT, **options: Any) -> list[Simulation]:
     """Make worlds that share what is declared, each at the beginning of another episode."""
-    first = World(task, **options)
-    found = [first, *(World(first.structures, **options) for _ in range(count - 1))]
+    first = Simulation(task, **options)
+    found = [first, *(Simulation(first.structures, **options) for _ in range(count - 1))]
     for seed, world in enumerate(found):
         world.reset(seed=seed)
     return found
 
 
-def commands(world: World, steps: int) -> Any:
+def commands(world: Simulation, steps: int) -> Any:
     """Draw commands for all worlds, shape (steps, n, 9)."""
     generator = np.random.default_rng(0)
     return generator.uniform(world.action_low, world.action_high, (steps, COUNT, 9))
 
 
-def check(batch: Batch, alone: list[World], rows: Any) -> None:
+def check(batch: Batch, alone: list[Simulation], rows: Any) -> None:
     """Compare what a table has with what worlds say."""
     for row in rows:
         now = alone[row].evaluate(NAMES)
@@ -46,7 +46,7 @@ def check(batch: Batch, alone: list[World], rows: Any) -> None:
             np.testing.assert_array_equal(found, np.ravel(now[name]), err_msg=f"{name}, {row}")
 
 
-def check_whole(batch: Batch, alone: list[World]) -> None:
+def check_whole(batch: Batch, alone: list[Simulation]) -> None:
     """Compare worlds that were handed back with others, value by value and bit by bit."""
     for index, world in enumerate(alone):
         handed = batch.world(index)
@@ -60,7 +60,9 @@ def check_whole(batch: Batch, alone: list[World]) -> None:
                 assert other[name].dtype == value.dtype
 
 
-def compare(alone: list[World], many: list[World], *, steps: int = 10, threads: int = 2) -> None:
+def compare(
+    alone: list[Simulation], many: list[Simulation], *, steps: int = 10, threads: int = 2
+) -> None:
     """Go on with both kinds, and compare."""
     batch = Batch(many, threads=threads, names=NAMES)
     for step, asked in enumerate(commands(alone[0], steps)):
@@ -103,7 +105,7 @@ def _lean(joints: Any) -> Any:
     return joints + 0.05
 
 
-MEDDLING: dict[int, Callable[[Callable[[int], World]], Any]] = {
+MEDDLING: dict[int, Callable[[Callable[[int], Simulation]], Any]] = {
     1: lambda world: world(0).do({"tool_block.mass": 0.08, "floor_friction": 0.4}),
     2: lambda world: world(1).do({"actuator_noise": 0.1}),
     3: lambda world: world(2).do({"tool_block.linear_velocity": [0.05, 0.02, 0.1]}),
@@ -188,7 +190,7 @@ def _own(kind: Any, index: Any, tips: Any) -> float:
 def test_worlds_must_be_alike() -> None:
     """Worlds of two tasks, no world and no thread are refused with the reason."""
     with pytest.raises(UnknownOption, match="one task"):
-        Batch([World("pushing", backend="fake"), World("picking", backend="fake")])
+        Batch([Simulation("pushing", backend="fake"), Simulation("picking", backend="fake")])
     with pytest.raises(UnknownOption, match="one or more"):
         Batch([])
     with pytest.raises(UnknownOption, match="threads"):
@@ -197,16 +199,16 @@ def test_worlds_must_be_alike() -> None:
 
 def test_a_world_without_episode() -> None:
     """Advancing worlds that were never reset is an error."""
-    batch = Batch([World("pushing", backend="fake")])
+    batch = Batch([Simulation("pushing", backend="fake")])
     with pytest.raises(NotReset):
         batch.advance(np.zeros((1, 9)))
 
 
 def test_a_family_of_other_options() -> None:
     """A world cannot share what is declared for other options."""
-    family = World("pushing", backend="fake").structures
+    family = Simulation("pushing", backend="fake").structures
     with pytest.raises(UnknownOption, match="structures"):
-        World(family, backend="fake", frame_skip=3)
+        Simulation(family, backend="fake", frame_skip=3)
 
 
 def test_a_copy_of_a_sibling_is_whole() -> None:

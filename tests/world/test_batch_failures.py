@@ -12,21 +12,21 @@ import pytest
 
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.errors import EngineFailure
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.batch import Batch
 
 COUNT = 3
 
 
-def _worlds() -> list[World]:
-    first = World("pushing")
-    found = [first, *(World(first.structures) for _ in range(COUNT - 1))]
+def _worlds() -> list[Simulation]:
+    first = Simulation("pushing")
+    found = [first, *(Simulation(first.structures) for _ in range(COUNT - 1))]
     for seed, world in enumerate(found):
         world.reset(seed=seed)
     return found
 
 
-def _commands(world: World, steps: int) -> Any:
+def _commands(world: Simulation, steps: int) -> Any:
     generator = np.random.default_rng(0)
     return generator.uniform(world.action_low, world.action_high, (steps, COUNT, 9))
 

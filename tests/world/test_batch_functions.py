@@ -12,7 +12,7 @@ from numba import njit
 from scm_world.tasks import Pushing
 from scm_world.tasks.rewards import term
 from scm_world.variables import Measured, Parent
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.batch import Batch
 
 COUNT, STEPS = 3, 10
@@ -111,9 +111,9 @@ def _nothing() -> float:
     return 1.5
 
 
-def _worlds(terms: Terms) -> list[World]:
-    first = World(Pushing(terms=terms(), weights={ONE: 1.0, OTHER: 1.0}))
-    found = [first, *(World(first.structures) for _ in range(COUNT - 1))]
+def _worlds(terms: Terms) -> list[Simulation]:
+    first = Simulation(Pushing(terms=terms(), weights={ONE: 1.0, OTHER: 1.0}))
+    found = [first, *(Simulation(first.structures) for _ in range(COUNT - 1))]
     for seed, world in enumerate(found):
         world.reset(seed=seed, do=FLOWN if seed else None)
     return found
@@ -149,7 +149,7 @@ def test_what_is_remembered_is_not_cut_to_a_whole_number() -> None:
 def test_what_compiled_functions_raise_is_raised() -> None:
     """An error in compiled code is one in a batch too, and no number."""
     own = _own(ONE, (TIME, CLOCK), njit(lambda time, clock: time / (2.0 - clock)))
-    worlds = [World(Pushing(terms=[own], weights={ONE: 1.0})) for _ in range(2)]
+    worlds = [Simulation(Pushing(terms=[own], weights={ONE: 1.0})) for _ in range(2)]
     for world in worlds:
         world.reset(seed=0)
     batch = Batch(worlds, names=("reward",))

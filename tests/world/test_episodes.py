@@ -15,7 +15,7 @@ from worlds import PARAMS, PHYSICS, PUSHING, actions, begin, play, same, shared,
 
 from scm_world.errors import InterventionError, NotReset, SnapshotMismatch, UnknownOption
 from scm_world.variables import Draw, Shift
-from scm_world.world import World, WorldSnapshot
+from scm_world.world import Simulation, WorldSnapshot
 
 HERE = Path(__file__).parent
 
@@ -30,10 +30,10 @@ CONTINUE = """
 import hashlib, json, pickle, sys
 sys.path.insert(0, sys.argv[1])
 from worlds import actions, play
-from scm_world.world import World
+from scm_world.world import Simulation
 digests = []
 for backend, task, path in json.loads(sys.argv[2]):
-    world = World(task, backend=backend)
+    world = Simulation(task, backend=backend)
     world.restore(pickle.load(open(path, "rb")))
     digests.append(hashlib.sha256(play(world, actions(20, seed=3)).tobytes()).hexdigest())
 print(json.dumps(digests))
@@ -61,7 +61,7 @@ def test_the_same_seed_actions_and_interventions_give_the_same_everywhere() -> N
 @pytest.mark.parametrize(("backend", "task"), PARAMS)
 def test_reset_leaves_no_trace(backend: str, task: str) -> None:
     """An episode after a wild one equals the first episode of a new world."""
-    world = World(task, backend=backend)
+    world = Simulation(task, backend=backend)
     world.reset(seed=1)
     fresh, first = world.values(), play(world, actions(20))
     do = {"gravity": [0.5, 0.0, -4.0], "robot_finger_60_link_3.mass": 0.1, "control_index": 7}
@@ -150,7 +150,7 @@ def test_worlds_without_a_seed_differ() -> None:
     """Without a seed, noise is fresh."""
     masses = []
     for _ in range(2):
-        world = World("pushing", backend="fake")
+        world = Simulation("pushing", backend="fake")
         world.reset(do={"tool_block.mass": Draw("A")})
         masses.append(float(world["tool_block.mass"]))
     assert masses[0] != masses[1]
@@ -158,7 +158,7 @@ def test_worlds_without_a_seed_differ() -> None:
 
 def test_a_world_needs_a_reset() -> None:
     """Before the first one there is nothing to ask, step, save or intervene on."""
-    world = World("pushing", backend="fake")
+    world = Simulation("pushing", backend="fake")
     for attempt in (
         world.values,
         world.previous,
@@ -254,7 +254,7 @@ def test_a_snapshot_of_the_beginning_is_a_beginning(backend: str, task: str) -> 
 def test_a_snapshot_of_another_world_is_refused(options: dict[str, Any]) -> None:
     """Task, engine and options have to agree; the world stays as it is."""
     start = begin("fake", "pushing").snapshot()
-    world = World(**{"task": "pushing", "backend": "fake", **options})
+    world = Simulation(**{"task": "pushing", "backend": "fake", **options})
     world.reset(seed=0)
     values = world.values()
     with pytest.raises(SnapshotMismatch):
@@ -271,7 +271,7 @@ def test_two_worlds_do_not_disturb_each_other(backend: str, task: str) -> None:
     """Interleaved with another world, an episode is the same as alone."""
     alone = begin(backend, task)
     expected = play(alone, actions(15, seed=1))
-    one, other = (World(task, backend=backend) for _ in range(2))
+    one, other = (Simulation(task, backend=backend) for _ in range(2))
     one.reset(seed=0)
     other.reset(seed=0, do={"gravity": [0.0, 0.0, -5.0], "robot_height": 0.35})
     rows = []
@@ -289,7 +289,7 @@ def test_two_worlds_do_not_disturb_each_other(backend: str, task: str) -> None:
 @pytest.mark.parametrize(("backend", "task"), PHYSICS)
 def test_one_seed_gives_a_counterfactual_pair(backend: str, task: str) -> None:
     """A heavier block in a world with the same seed changes nothing else at the start."""
-    one, other = (World(task, backend=backend) for _ in range(2))
+    one, other = (Simulation(task, backend=backend) for _ in range(2))
     one.reset(seed=4, do={"floor_friction": Draw("A")})
     other.reset(seed=4, do={"floor_friction": Draw("A"), "tool_block.mass": 0.09})
     assert one["floor_friction"] == other["floor_friction"]

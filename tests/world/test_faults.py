@@ -14,7 +14,7 @@ from scm_world.backends.fake import FakeBackend
 from scm_world.errors import EngineError, EngineFailure
 from scm_world.models import ControlMode, Difference, ParameterKey, Parameters
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 class Faulty(FakeBackend):  # type: ignore[misc] # final for users; a double of it is a test
@@ -112,7 +112,7 @@ def test_a_do_that_the_engine_fails_is_rolled_back(
 ) -> None:
     """Wherever the engine fails, everything is bit-identical to before, and can be done again."""
     backend = Faulty()
-    world = World("pushing", backend=backend)
+    world = Simulation("pushing", backend=backend)
     world.reset(seed=0, do={"tool_block.linear_velocity": [0.01, 0.0, 0.0]})
     if not at_start:
         play(world, actions(3))
@@ -143,7 +143,7 @@ def test_a_do_that_the_engine_fails_is_rolled_back(
 def test_the_error_says_what_was_not_taken_over() -> None:
     """Parameters by name, and the state."""
     backend = Faulty()
-    world = World("pushing", backend=backend)
+    world = Simulation("pushing", backend=backend)
     world.reset(seed=0)
     backend.fault = "parameters lie"
     with pytest.raises(EngineFailure, match=r"did not take over tool_block\.mass"):
@@ -156,7 +156,7 @@ def test_the_error_says_what_was_not_taken_over() -> None:
 def test_a_world_survives_a_step_that_fails() -> None:
     """After a reset it is as good as new."""
     backend = Faulty()
-    world = World("pushing", backend=backend)
+    world = Simulation("pushing", backend=backend)
     world.reset(seed=0)
     fresh, future = world.values(), play(world, actions(5))
     backend.fault = "step loses it"

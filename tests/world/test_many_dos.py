@@ -8,12 +8,12 @@ from worlds import NEEDS_BULLET, actions, play, same, settable
 
 from benchmarks.fuzz import random_request
 from scm_world.errors import InterventionError
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 def check(backend: str, count: int) -> None:
     """Do many things, and compare the world with a new one."""
-    world = World("pushing", backend=backend)
+    world = Simulation("pushing", backend=backend)
     world.reset(seed=1)
     fresh, future = world.values(), play(world, actions(20))
     generator = np.random.default_rng(8)
@@ -62,7 +62,7 @@ def test_ten_thousand_dos_leave_no_nan_and_no_drift(backend: str) -> None:
 
 def test_taking_everything_back_at_one_instant_leaves_no_trace() -> None:
     """After hundreds of dos at one instant, setting all values back is as if nothing had been."""
-    world = World("pushing", backend="mujoco")
+    world = Simulation("pushing", backend="mujoco")
     world.reset(seed=1)
     play(world, actions(4))
     start, values = world.snapshot(), world.values()

@@ -30,7 +30,7 @@ from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.variables import Affine, Box, Draw, Scale, Shift
-from scm_world.world import World
+from scm_world.world import Simulation
 
 # --- what is moved, and what is not --------------------------------------------------------------
 
@@ -339,6 +339,6 @@ def test_worlds_of_other_sizes_are_other_worlds() -> None:
     """A task can be made with its own defaults."""
     from scm_world.tasks import make_task
 
-    world = World(make_task("pushing", tool_block_mass=0.05), backend="fake")
+    world = Simulation(make_task("pushing", tool_block_mass=0.05), backend="fake")
     world.reset(seed=0)
     assert world["tool_block.mass"] == 0.05

@@ -11,7 +11,7 @@ from worlds import PARAMS, actions, begin, play, same, shared
 from scm_world.errors import InterventionError, UnknownVariable
 from scm_world.tasks import Reaching
 from scm_world.variables import Box, Derived, Draw, Exogenous, Normal, Shift, Variable
-from scm_world.world import World
+from scm_world.world import Simulation
 
 REACHING = [p for p in PARAMS if "reaching" in str(p.id)]
 
@@ -135,7 +135,7 @@ def _blur(dice: float, *, noise: float = 0.0) -> float:
 
 def test_nature_draws_at_the_start_of_an_episode() -> None:
     """What is random by declaration differs between episodes and is the same for one seed."""
-    world = World(_Random(), backend="fake")
+    world = Simulation(_Random(), backend="fake")
     drawn = []
     for seed in (1, 1, 2):
         world.reset(seed=seed)
@@ -148,7 +148,7 @@ def test_nature_draws_at_the_start_of_an_episode() -> None:
 
 def test_an_intervention_keeps_the_noise_of_nature() -> None:
     """Setting the cause, at any time, leaves the noise of the effect as it was drawn."""
-    world = World(_Random(), backend="fake")
+    world = Simulation(_Random(), backend="fake")
     world.reset(seed=1)
     noise = float(world["blurred"] - world["dice"])
     for _ in range(3):
@@ -163,7 +163,7 @@ def test_an_intervention_keeps_the_noise_of_nature() -> None:
 
 
 def _natural_dice() -> float:
-    world = World(_Random(), backend="fake")
+    world = Simulation(_Random(), backend="fake")
     world.reset(seed=1)
     return float(world["dice"])
 
@@ -178,7 +178,7 @@ def test_a_draw_needs_a_space() -> None:
 
 def test_what_is_partly_impossible_is_refused_as_a_whole() -> None:
     """A layout that fits no longer beside a number that is impossible: an error, no crash."""
-    world = World("stacked_blocks", backend="fake")
+    world = Simulation("stacked_blocks", backend="fake")
     world.reset(seed=0)
     values = world.values()
     fewer = np.zeros_like(values["wall.layout"])

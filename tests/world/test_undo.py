@@ -26,7 +26,7 @@ from worlds import (
 from scm_world.errors import InterventionError
 from scm_world.tasks import tasks
 from scm_world.variables import Draw, Natural, Scale, Shift
-from scm_world.world import World
+from scm_world.world import Simulation
 
 
 @pytest.mark.parametrize("horizon", [1, 250])
@@ -135,7 +135,7 @@ def test_what_physics_did_can_always_be_restored(backend: str, task: str) -> Non
         assert same(world.values(), values)
 
 
-def _undo_at_random(world: World, groups: list[list[str]], seed: int) -> None:
+def _undo_at_random(world: Simulation, groups: list[list[str]], seed: int) -> None:
     """Compare futures without interventions and with some that are undone, at random instants.
 
     Every other group is written back only; every third looks 50 steps ahead instead of one. A

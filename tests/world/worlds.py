@@ -12,7 +12,7 @@ import pytest
 
 from scm_world.tasks.trifinger import hardware
 from scm_world.variables import Categories, Draw, Integers, Scale, Shift
-from scm_world.world import World
+from scm_world.world import Simulation
 
 TASKS = ("reaching", "pushing")
 BACKENDS = ("fake", "mujoco", "bullet")
@@ -31,14 +31,14 @@ PHYSICS = [p for p in PUSHING if p.id != "fake"]
 
 REST = np.array(hardware.REST)
 
-_WORLDS: dict[tuple[str, str], World] = {}
+_WORLDS: dict[tuple[str, str], Simulation] = {}
 
 
-def shared(backend: str, task: str) -> World:
+def shared(backend: str, task: str) -> Simulation:
     """Give the one world of this kind; resetting it leaves no trace, as a test shows."""
     key = (backend, task)
     if key not in _WORLDS:
-        _WORLDS[key] = World(task, backend=backend)
+        _WORLDS[key] = Simulation(task, backend=backend)
     return _WORLDS[key]
 
 
@@ -47,7 +47,7 @@ def actions(n: int, seed: int = 0, spread: float = 0.4) -> np.ndarray:
     return REST + np.random.default_rng(seed).uniform(-spread, spread, (n, 9))
 
 
-def begin(backend: str, task: str, steps: int = 3) -> World:
+def begin(backend: str, task: str, steps: int = 3) -> Simulation:
     """Give a world in the middle of an episode."""
     world = shared(backend, task)
     world.reset(seed=0)
@@ -55,7 +55,7 @@ def begin(backend: str, task: str, steps: int = 3) -> World:
     return world
 
 
-def play(world: World, commands: Iterable[Any]) -> np.ndarray:
+def play(world: Simulation, commands: Iterable[Any]) -> np.ndarray:
     """Take actions.
 
     Returns:
@@ -101,7 +101,7 @@ _PLACES = {
 }
 
 
-def other(world: World, name: str) -> np.ndarray:
+def other(world: Simulation, name: str) -> np.ndarray:
     """Give another value of a variable, not far from the present one."""
     quantity = name.rpartition(".")[2]
     if quantity in _PLACES:
@@ -119,7 +119,7 @@ def other(world: World, name: str) -> np.ndarray:
     return 0.8 * present
 
 
-def settable(world: World) -> list[str]:
+def settable(world: Simulation) -> list[str]:
     """Name everything that do accepts, but for the action."""
     model = world.model
     quantities = ((name, model.declared(model.target(name))) for name in model)
@@ -128,7 +128,7 @@ def settable(world: World) -> list[str]:
 
 def story(backend: str, task: str) -> str:
     """Play an episode with all kinds of interventions, and hash everything in it."""
-    world = World(task, backend=backend)
+    world = Simulation(task, backend=backend)
     digest = hashlib.sha256()
 
     def note() -> None:

@@ -23,7 +23,7 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.queries.twins import asked
 from scm_world.work.executors import Executor, Serial, opened
-from scm_world.world import World
+from scm_world.world import Simulation
 
 ENOUGH = 20
 """After so many episodes it is told whether most of them are refused."""
@@ -41,7 +41,7 @@ class Circumstances(TypedDict, total=False):
 
 
 def collect(
-    source: SCM | World | Laboratory | DataSource,
+    source: SCM | Simulation | Laboratory | DataSource,
     design: Design,
     n: int,
     *,
@@ -129,7 +129,7 @@ def collect(
 
 
 def source_of(
-    source: SCM | World | Laboratory | DataSource,
+    source: SCM | Simulation | Laboratory | DataSource,
     design: Design,
     n: int,
     *,
@@ -148,7 +148,7 @@ def source_of(
         case Laboratory():
             _refuse_others(given, (), "a laboratory, which has its own")
             return Experiments(source, design, n, seed=seed)
-        case World():
+        case Simulation():
             setting = Setting(
                 policy=given.get("policy", "random"),
                 nature=given.get("nature"),

@@ -15,7 +15,7 @@ from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Exogenous, Variable
 from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
-from scm_world.world import World
+from scm_world.world import Simulation
 
 NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRESET)
 """What looks, or disturbs the measurement, but moves nothing; patterns of names."""
@@ -36,7 +36,7 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
     """
     model = world if isinstance(world, SCM) else world.model
     colors, structure = set[str](), set[str]()
-    if isinstance(world, World):
+    if isinstance(world, Simulation):
         colors = {f"{block}.color" for block in world.compiled.task.tools()}
         structure = set(world.structures.head)
     return tuple(
@@ -81,7 +81,7 @@ def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
         UnknownVariable: A pattern names nothing that can be set.
     """
     model = world if isinstance(world, SCM) else world.model
-    actions = world.compiled.commanded if isinstance(world, World) else ()
+    actions = world.compiled.commanded if isinstance(world, Simulation) else ()
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
     for pattern in given:

@@ -36,7 +36,7 @@ from scm_world.queries.twins import AnyTwins, asked
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
 from scm_world.work.executors import Executor
-from scm_world.world import World
+from scm_world.world import Simulation
 
 FORMAT = "scm_world/sweep/1"
 TABLE, SUMMARY = "sweep.csv", "sweep.json"
@@ -271,7 +271,7 @@ def _mean(name: str, values: Floats, base: Floats) -> dict[str, float | None]:
 
 
 def sweep(
-    system: World | SCM,
+    system: Simulation | SCM,
     over: Mapping[str, Any],
     outcomes: Iterable[Any] | None = None,
     *,
@@ -323,7 +323,7 @@ def sweep(
         >>> [(row["tool_block.mass"], row["n"]) for row in found.rows()]
         [(0.02, 3), (0.08, 3)]
     """
-    if not isinstance(system, World | SCM):
+    if not isinstance(system, Simulation | SCM):
         raise UnknownOption("system", system, ("a World: World('pushing')", "an SCM"))
     count = whole_number("n", n, least=1)
     twins, world = asked(system)

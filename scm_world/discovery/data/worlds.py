@@ -41,7 +41,7 @@ from scm_world.queries.samples import Setting
 from scm_world.queries.twins import AnyTwins, EquationTwins
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
-from scm_world.world import World
+from scm_world.world import Simulation
 from scm_world.world.plan import merged
 
 STREAM = "sensor of"
@@ -124,7 +124,7 @@ class WorldSource:
             allowed = ("what is no cause: those have a column already",)
             raise UnknownOption("outcomes", ", ".join(twice), allowed)
         self._half: dict[str, Floats] = {}
-        if isinstance(world, World) and SENSOR_NOISE in model:
+        if isinstance(world, Simulation) and SENSOR_NOISE in model:
             self._half = {name: half_range(world, name) for name in self._watched}
         self.edges: tuple[Edge, ...] | None = model.edges
         self.about: dict[str, Any] = {
@@ -232,7 +232,7 @@ def _system(world: System, twins: AnyTwins) -> dict[str, Any]:
     }
 
 
-def half_range(world: World, name: str) -> Floats:
+def half_range(world: Simulation, name: str) -> Floats:
     """Give half the range of each number of a variable that a sensor measures, shape (k,).
 
     It is that of the environment's observations. 0 where there is none, or no sensor.

@@ -25,7 +25,7 @@ from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous, Noise
-from scm_world.world import World
+from scm_world.world import Simulation
 
 SMALL = 1e-6  # of the size of a variable: so little that everything answers in proportion
 MOST = 10_000  # probe states, where the budget is what counts
@@ -157,7 +157,7 @@ class StepSimulator:
         seed: Of states and values.
     """
 
-    def __init__(self, world: World, seed: int = 0) -> None:
+    def __init__(self, world: Simulation, seed: int = 0) -> None:
         self._world, self._seed = world, seed
         self.names = tuple(world.model)
 
@@ -187,7 +187,7 @@ class EpisodeSimulator:
 
     def __init__(
         self,
-        world: World,
+        world: Simulation,
         causes: Sequence[str],
         outcomes: Iterable[Outcome],
         settings: Sequence[Setting],

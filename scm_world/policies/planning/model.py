@@ -15,7 +15,7 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.tasks import Task
 from scm_world.work.processes import cores
-from scm_world.world import World, WorldSnapshot
+from scm_world.world import Simulation, WorldSnapshot
 from scm_world.world.batch import Batch
 
 STREAM = "what a planner expects"
@@ -41,7 +41,7 @@ class Model:
         UnknownVariable: A name does not exist.
 
     Example:
-        >>> world = World("pushing", backend="fake")
+        >>> world = Simulation("pushing", backend="fake")
         >>> world.reset(seed=0)
         >>> model = Model(world, 2, ["reward"])
         >>> values = model.rollouts(model.present(world), np.zeros((2, 5, 9)))
@@ -51,7 +51,7 @@ class Model:
 
     def __init__(
         self,
-        world: World,
+        world: Simulation,
         n: int,
         names: Iterable[str],
         *,
@@ -64,8 +64,8 @@ class Model:
         _, (_, task, given, _), *_ = world.__reduce__()
         options = {**given, "backend": backend or world.backend.name}
         options["variables_space"] = None  # what is believed may lie anywhere
-        first = World(copy.copy(task), **options)
-        self._copies = [first, *(World(first.structures, **options) for _ in range(count - 1))]
+        first = Simulation(copy.copy(task), **options)
+        self._copies = [first, *(Simulation(first.structures, **options) for _ in range(count - 1))]
         self._is_foreign = first.engine != world.engine
         self._do, self._foresees = dict(do or {}), foresees
         self.names = tuple(dict.fromkeys(names))
@@ -77,7 +77,7 @@ class Model:
         """Count the copies."""
         return len(self._copies)
 
-    def present(self, world: World) -> WorldSnapshot:
+    def present(self, world: Simulation) -> WorldSnapshot:
         """Say where the rollouts begin, if a world is as it is now.
 
         Args:

@@ -25,7 +25,7 @@ from scm_world.graph import flatten
 from scm_world.policies.planning.model import Model, as_score, nearness
 from scm_world.tasks.base import action_range
 from scm_world.variables import Noise, Normal
-from scm_world.world import World
+from scm_world.world import Simulation
 
 KEPT = 0.3
 """Share of the elites that take part in the next round again."""
@@ -166,7 +166,7 @@ class CrossEntropy:
         self.do, self.backend, self.foresees = flatten(do or {}), backend, foresees
         self.seed = whole_number("seed", seed, least=0)
         self.threads = None if threads is None else whole_number("threads", threads, least=1)
-        self._programs: WeakKeyDictionary[World, _WorldPlans] = WeakKeyDictionary()
+        self._programs: WeakKeyDictionary[Simulation, _WorldPlans] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy and pickle without what is going on."""
@@ -176,7 +176,7 @@ class CrossEntropy:
         """Begin anew."""
         self.__dict__.update(state, _programs=WeakKeyDictionary())
 
-    def __call__(self, world: World) -> Floats:
+    def __call__(self, world: Simulation) -> Floats:
         """Give the action of the present step.
 
         Raises:
@@ -198,7 +198,7 @@ class _WorldPlans:
         plan: Of the structure of the world.
     """
 
-    def __init__(self, policy: CrossEntropy, world: World) -> None:
+    def __init__(self, policy: CrossEntropy, world: Simulation) -> None:
         self._policy, self.plan = policy, world.compiled.plan
         self._objective = policy.objective or nearness(world.task)
         self._terminal = policy.terminal
@@ -217,7 +217,7 @@ class _WorldPlans:
         self._ahead: list[Floats] = []
         self._mean = self._kept = np.empty(0)
 
-    def action(self, world: World) -> Floats:
+    def action(self, world: Simulation) -> Floats:
         """Give the action of the present step; search where no plan is followed any more."""
         seed, episode, index = world.noise.seed, world.episode, world.index
         goes_on = self._at == (seed, episode, index)
@@ -233,7 +233,7 @@ class _WorldPlans:
         self._at, self._version = (seed, episode, index + 1), world.version
         return self._ahead.pop(0).copy()
 
-    def _searched(self, world: World, mean: Floats, kept: Floats) -> Floats:
+    def _searched(self, world: Simulation, mean: Floats, kept: Floats) -> Floats:
         """Return the best sequence that was tried, shape (horizon, n_actions).
 
         The last mean is tried, too; it and the elites are where a search that goes on begins.

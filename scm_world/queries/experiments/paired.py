@@ -40,7 +40,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.kinds import SpaceName
 from scm_world.variables.reserved import CONTROL_INDEX
-from scm_world.world import World
+from scm_world.world import Simulation
 
 STEPS = (0.05, -0.05, 0.02, -0.02, 0.005, -0.005, 0.001, -0.001)
 """How far to move a variable, as a fraction of its bounds; smaller until it is feasible."""
@@ -69,7 +69,7 @@ class _Kept:
         values: Copies.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: Simulation) -> None:
         self.values = world.values()
         now, state = world.current()
         self._vector = state.vector.copy()
@@ -78,7 +78,7 @@ class _Kept:
         moving = {*world.compiled.slices, *self._compared}
         self._rest = {name: now[name] for name in world.model if name not in moving}
 
-    def differing(self, world: World) -> list[str]:
+    def differing(self, world: Simulation) -> list[str]:
         """Name what differs in a world of the same structure, in the order of the model."""
         now = world.evaluate(world.computed)
         apart = world.current()[1].vector != self._vector
@@ -112,7 +112,7 @@ class Paired:
 
     def __init__(
         self,
-        world: World,
+        world: Simulation,
         seed: int,
         *,
         causes: Container[str] | None = None,
@@ -413,7 +413,7 @@ def _elsewhere(present: Value, share: Floats, low: Floats, high: Floats) -> Valu
 
 
 def see_mechanisms(
-    world: World, present: Values, effects: Effects, noise: Noise, number: int
+    world: Simulation, present: Values, effects: Effects, noise: Noise, number: int
 ) -> None:
     """Try every mechanism of what does not move: sizes, layouts, goals, piles.
 

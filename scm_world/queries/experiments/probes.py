@@ -18,7 +18,7 @@ from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.tasks.base import Dice, Scenario, action_range
 from scm_world.variables import Box, Exogenous, Measured, Noise, Rotations, Variable
-from scm_world.world import World, WorldSnapshot
+from scm_world.world import Simulation, WorldSnapshot
 
 Pair = tuple[str, str]
 T = TypeVar("T")
@@ -53,7 +53,7 @@ class Probe:
 
 
 def probes(
-    world: World, n: int, seed: int, *, settled: bool = True, first: int = 0
+    world: Simulation, n: int, seed: int, *, settled: bool = True, first: int = 0
 ) -> Iterator[Probe]:
     """Prepare probe states one after another.
 
@@ -72,7 +72,9 @@ def probes(
         yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
 
 
-def _prepared(world: World, scenario: Scenario, noise: Noise, number: int, settled: bool) -> Probe:
+def _prepared(
+    world: Simulation, scenario: Scenario, noise: Noise, number: int, settled: bool
+) -> Probe:
     """Prepare a state from which the world can go on; the beginning where nothing else is one.
 
     Raises:
@@ -88,7 +90,7 @@ def _prepared(world: World, scenario: Scenario, noise: Noise, number: int, settl
     return _made(world, AT_REST, Dice(noise, number), settled)
 
 
-def _made(world: World, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
+def _made(world: Simulation, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
     states, extra = scenario.prepare(world, dice)
     if states:
         world.do(states)
@@ -110,12 +112,12 @@ def _made(world: World, scenario: Scenario, dice: Dice, settled: bool) -> Probe:
 # --- of any system ------------------------------------------------------------------------------
 
 
-def start(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+def start(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
     """Stay where the episode begins."""
     return {}, None
 
 
-def onward(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+def onward(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
     """Go where random actions lead, each kept for a while."""
     steps = 1 + int(dice.between(0.0, LONGEST))
     for action in _way(world, dice, steps):
@@ -123,7 +125,7 @@ def onward(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
     return {}, None
 
 
-def onward_touching(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+def onward_touching(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
     """Go where random actions lead, to where two bodies are about to touch that do on the way."""
     before: dict[Pair, WorldSnapshot] = {}
     for action in _way(world, dice, LONGEST):
@@ -136,12 +138,12 @@ def onward_touching(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
     return {}, None
 
 
-def anywhere(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+def anywhere(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
     """Move everything to where it can be, with velocities of a few natural units."""
     return _anywhere(world, dice, "moved"), None
 
 
-def touching(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+def touching(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
     """Move everything to where two bodies touch, if some of the states that are tried have such."""
     here, action = world.snapshot(), _at_random(world, None, dice)
     found: dict[Pair, dict[str, Value]] = {}
@@ -160,7 +162,7 @@ def touching(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
     return (_one_of(found, dice) if found else _anywhere(world, dice, "moved")), None
 
 
-def _way(world: World, dice: Dice, steps: int) -> Iterator[Floats]:
+def _way(world: Simulation, dice: Dice, steps: int) -> Iterator[Floats]:
     """Draw actions, each kept for a while."""
     kept = 1 + int(dice.between(0.0, KEPT))
     shares = dice.of("probe way", steps * world.compiled.n_actions).reshape(steps, -1)
@@ -168,7 +170,7 @@ def _way(world: World, dice: Dice, steps: int) -> Iterator[Floats]:
         yield _within(world, shares[step // kept])
 
 
-def _touching(world: World) -> set[Pair]:
+def _touching(world: Simulation) -> set[Pair]:
     """Name the pairs of bodies that press on each other now."""
     pressing = (contact for contact in world.backend.contacts() if contact.force > 0.0)
     return {(min(contact.bodies), max(contact.bodies)) for contact in pressing}
@@ -182,7 +184,7 @@ def _one_of(found: dict[Pair, T], dice: Dice) -> T:
     return found[pairs[int(dice.between(0.0, len(pairs)))]]
 
 
-def _anywhere(world: World, dice: Dice, stream: str) -> dict[str, Value]:
+def _anywhere(world: Simulation, dice: Dice, stream: str) -> dict[str, Value]:
     """Draw a value of every state."""
     model = world.model
     variables = (v for v in model.variables if isinstance(v, Measured) and v.settable)
@@ -196,7 +198,7 @@ def _anywhere(world: World, dice: Dice, stream: str) -> dict[str, Value]:
 def _with_others(prepare: Any) -> Any:
     """Prepare a state under other parameters."""
 
-    def prepared(world: World, dice: Dice) -> tuple[dict[str, Value], None]:
+    def prepared(world: Simulation, dice: Dice) -> tuple[dict[str, Value], None]:
         set_others(world, dice)
         found: tuple[dict[str, Value], None] = prepare(world, dice)
         return found
@@ -204,7 +206,7 @@ def _with_others(prepare: Any) -> Any:
     return prepared
 
 
-def set_others(world: World, dice: Dice) -> None:
+def set_others(world: Simulation, dice: Dice) -> None:
     """Set about half of the parameters to values of their spaces, or near those that they have.
 
     What cannot be set together with the rest stays as it is.
@@ -229,7 +231,7 @@ def set_others(world: World, dice: Dice) -> None:
             return
 
 
-def _jittered(variable: Exogenous, world: World, dice: Dice) -> Value | None:
+def _jittered(variable: Exogenous, world: Simulation, dice: Dice) -> Value | None:
     """Give another value of a parameter, or None where it keeps the one that it has."""
     n = int(np.prod(variable.shape))
     unit = dice.of(f"{variable.name}|other", n + 2)
@@ -267,18 +269,18 @@ def _moved(variable: Variable, present: Value, drawn: Floats) -> Value:
     return np.asarray(low + 0.5 * (1.0 + unit) * (high - low))
 
 
-def _within(world: World, share: Floats) -> Floats:
+def _within(world: Simulation, share: Floats) -> Floats:
     """Give the action at some shares of its range."""
     low, high = action_range(world)
     return np.asarray(low + share * (high - low))
 
 
-def _at_random(world: World, extra: None, dice: Dice) -> Floats:
+def _at_random(world: Simulation, extra: None, dice: Dice) -> Floats:
     """Draw an action."""
     return _within(world, dice.of("probe action", world.compiled.n_actions))
 
 
-def _at_rest(world: World, extra: None, dice: Dice) -> Floats:
+def _at_rest(world: Simulation, extra: None, dice: Dice) -> Floats:
     """Let the system be."""
     return world.task.idle(world)
 
@@ -299,7 +301,7 @@ _TOUCH_OTHERWISE = Scenario(
 """Where parameters have other values, too, it says ``others``."""
 
 
-def _kinds(world: World, *, settled: bool) -> tuple[Scenario, ...]:
+def _kinds(world: Simulation, *, settled: bool) -> tuple[Scenario, ...]:
     """List what is tried in a system of which the task says nothing."""
     if not settled:
         return AT_START, _ANYWHERE, _OTHERWISE

@@ -61,8 +61,8 @@ _INTERVENTIONS = get_args(get_args(Intervention)[0])
 READ_BACK = 1e-6  # how far an engine may report a number from what it was given
 
 
-class World(WorldAttributes):
-    """A task as a causal model, with an engine that moves it.
+class Simulation(WorldAttributes):
+    """The causal model of a task, stepped by a physics backend; ``scm_world.World`` adds questions.
 
     Args:
         task: A registered name, a task, or the ``structures`` of a world that was made with the
@@ -88,7 +88,7 @@ class World(WorldAttributes):
         MissingEngine: The engine is not installed.
 
     Example:
-        >>> world = World("pushing", backend="fake")
+        >>> world = Simulation("pushing", backend="fake")
         >>> world.reset(seed=0)
         >>> audit = world.do({"block.size": [0.07, 0.07, 0.07]})
         >>> world["goal_block.cartesian_position"].round(3)
