@@ -7,7 +7,13 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
-from scm_world.backends.base import Backend, BackendWrapper, Capabilities, Contact, EngineSnapshot
+from scm_world.backends.base import (
+    Backend,
+    BackendWrapper,
+    Capabilities,
+    ContactPoint,
+    EngineSnapshot,
+)
 from scm_world.errors import MissingEngine, UnknownOption
 from scm_world.models import Model
 
@@ -109,7 +115,7 @@ __all__ = [
     "Backend",
     "BackendWrapper",
     "Capabilities",
-    "Contact",
+    "ContactPoint",
     "EngineSnapshot",
     "backends",
     "make_backend",

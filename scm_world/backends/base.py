@@ -29,7 +29,7 @@ from scm_world.models.scene import (
 
 @final
 @dataclass(frozen=True)
-class Contact:
+class ContactPoint:
     """One point where two bodies touch.
 
     Attributes:
@@ -139,7 +139,7 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
 
     @abstractmethod
@@ -313,7 +313,7 @@ class BackendWrapper(Backend, ABC):
         """Hold a command for some physics steps."""
         self.engine.step(mode, command, substeps)
 
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
         return self.engine.contacts()
 
@@ -395,7 +395,7 @@ class InMemory(Backend, ABC):
         """Write the present state into an existing vector."""
         into.vector[:] = self._state.vector
 
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ContactPoint, ...]:
         """Nothing ever touches anything."""
         return ()
 

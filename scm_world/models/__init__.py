@@ -4,7 +4,7 @@ from scm_world.models.model import Input, Model, Parameter, Readout, Row, StateR
 from scm_world.models.scene import (
     ControlMode,
     Difference,
-    Goal,
+    GoalRegion,
     Light,
     ParameterKey,
     Parameters,
@@ -19,7 +19,7 @@ from scm_world.models.scene import (
 __all__ = [
     "ControlMode",
     "Difference",
-    "Goal",
+    "GoalRegion",
     "Input",
     "Light",
     "Model",

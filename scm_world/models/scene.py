@@ -172,7 +172,7 @@ class Light:
 
 @final
 @dataclass(frozen=True)
-class Goal:
+class GoalRegion:
     """A place where something should be. Goals are never bodies: nothing can touch them.
 
     Attributes:
@@ -210,7 +210,7 @@ class Scene:
     structure: Any
     parameters: Parameters
     state: Any
-    goals: tuple[Goal, ...] = ()
+    goals: tuple[GoalRegion, ...] = ()
     light: Light = field(default_factory=Light)
 
     def with_(self, **changes: object) -> Scene:
@@ -265,9 +265,9 @@ def diff(now: Scene, then: Scene) -> Difference:
     Goals are not compared: no engine knows them. Neither are states that cannot be set.
 
     Example:
-        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
+        >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
         >>> from scm_world.models import diff
-        >>> scene = default_scene(Structure(blocks=("tool_block",)))
+        >>> scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
         >>> heavy = {**scene.parameters, ("tool_block", "mass"): np.array(0.05)}
         >>> diff(scene, scene.with_(parameters=heavy)).parameters
         {('tool_block', 'mass'): array(0.05)}

@@ -3,7 +3,7 @@
 from scm_world.policies.scripted import Random
 from scm_world.queries.agreement import Agreement
 from scm_world.queries.consequences import Consequence, Consequences, consequences
-from scm_world.queries.differences import ButFor, Difference, Divergence, but_for, compare
+from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference, but_for, compare
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
@@ -37,10 +37,10 @@ __all__ = [
     "Consequence",
     "Consequences",
     "Contact",
-    "Difference",
     "Divergence",
     "Effect",
     "Episode",
+    "EpisodeDifference",
     "Identification",
     "Laboratory",
     "ObservationalEffect",

@@ -39,7 +39,7 @@ class Divergence:
 
 @final
 @dataclass(frozen=True)
-class Difference:
+class EpisodeDifference:
     """How two episodes differ.
 
     Attributes:
@@ -77,7 +77,7 @@ class Difference:
 
 def compare(
     one: Episode, other: Episode, names: Iterable[str] | None = None, *, tolerance: float = 0.0
-) -> Difference:
+) -> EpisodeDifference:
     """Find out where two episodes differ.
 
     Args:
@@ -108,7 +108,7 @@ def compare(
     noise = _noise(one), _noise(other)
     alone = [(name, which) for which in (0, 1) for name in sorted(noise[which] - noise[1 - which])]
     ordered = dict(sorted(apart.items(), key=lambda item: item[1].first))
-    return Difference(ordered, contacts, tuple(alone))
+    return EpisodeDifference(ordered, contacts, tuple(alone))
 
 
 def _divergence(one: Any, other: Any, tolerance: float) -> Divergence | None:

@@ -15,14 +15,14 @@ from typing import Any, final
 import networkx as nx
 
 from scm_world._types import ArrayLike, Floats
-from scm_world.backends.base import Contact
+from scm_world.backends.base import ContactPoint
 from scm_world.errors import UnknownOption
 from scm_world.models import ControlMode
 from scm_world.world import Simulation
 
 __all__ = ["local_graph"]
 
-Touching = Sequence[Sequence[Contact]]
+Touching = Sequence[Sequence[ContactPoint]]
 """The contacts of each physics step of a control step."""
 
 
@@ -77,7 +77,7 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.DiGrap
     return graph
 
 
-def islands(bodies: Iterable[str], contacts: Iterable[Contact]) -> list[set[str]]:
+def islands(bodies: Iterable[str], contacts: Iterable[ContactPoint]) -> list[set[str]]:
     """Part movable bodies into those that touch, directly or through other movable bodies."""
     graph = nx.Graph()
     graph.add_nodes_from(bodies)
@@ -116,7 +116,7 @@ class _Listener:
 
     def __init__(self, backend: Any) -> None:
         self._backend = backend
-        self.contacts: list[tuple[Contact, ...]] = []
+        self.contacts: list[tuple[ContactPoint, ...]] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)

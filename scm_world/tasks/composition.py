@@ -16,7 +16,7 @@ from scm_world.geometry.scalars import scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import (
     ControlMode,
-    Goal,
+    GoalRegion,
     Light,
     ParameterKey,
     Scene,
@@ -33,7 +33,7 @@ Numbers = float | tuple[float, ...]
 
 @final
 @dataclass(frozen=True)
-class State:
+class StateDeclaration:
     """A quantity that physics moves.
 
     Attributes:
@@ -115,7 +115,7 @@ class Entity(ABC):  # every hook has a sensible empty default
     name: str
 
     @cached_property
-    def declared(self) -> tuple[tuple[Variable, ...], tuple[State, ...]]:
+    def declared(self) -> tuple[tuple[Variable, ...], tuple[StateDeclaration, ...]]:
         """Its variables and its states, which are the same in every structure that it is in."""
         return tuple(self.variables()), tuple(self.states())
 
@@ -123,7 +123,7 @@ class Entity(ABC):  # every hook has a sensible empty default
         """Declare everything but the states."""
         return ()
 
-    def states(self) -> Iterable[State]:
+    def states(self) -> Iterable[StateDeclaration]:
         """Declare what physics moves."""
         return ()
 
@@ -158,7 +158,7 @@ class Entity(ABC):  # every hook has a sensible empty default
         """The shape of a block that is no box."""
         return None
 
-    def goal(self, values: Values) -> Goal | None:
+    def goal(self, values: Values) -> GoalRegion | None:
         """Describe the goal that this entity is, if it is one."""
         return None
 
@@ -266,7 +266,7 @@ class Composition(ABC):
         """Name the bodies between which local graphs are; none if it has no such bodies."""
         return ()
 
-    def goals(self, values: Values) -> tuple[Goal, ...]:
+    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
         """Describe all goals."""
         return ()
 

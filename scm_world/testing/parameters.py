@@ -8,7 +8,7 @@ from scm_world.backends.base import Backend
 from scm_world.models.scene import Difference, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import Structure, parameter_keys
+from scm_world.tasks.trifinger.structure import TriFingerStructure, parameter_keys
 from scm_world.testing.scenes import (
     STONE,
     Suite,
@@ -183,7 +183,7 @@ class ParameterConformance(Suite):
             backend.build(scene)
             state = backend.state()
             without = PhysicalState(1, np.delete(state.vector, np.s_[27:40]))
-            fewer = Structure(("near",), preset=self.preset)
+            fewer = TriFingerStructure(("near",), preset=self.preset)
             backend.apply(Difference(structure=fewer, state=without))
             others = np.delete(expected, np.s_[27:40], axis=1)
             np.testing.assert_allclose(play(backend, 40), others, rtol=0, atol=1e-7)

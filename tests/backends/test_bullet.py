@@ -21,7 +21,7 @@ from scm_world.errors import EngineFailure, SnapshotMismatch
 from scm_world.models import ControlMode, Difference, Scene
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.kinematics import inverse
-from scm_world.tasks.trifinger.structure import Structure, default_scene, parameter_keys
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene, parameter_keys
 from scm_world.testing.backend import busy_scene, changed_states, other_value, play
 
 pytestmark = pytest.mark.skipif(
@@ -110,14 +110,14 @@ def test_a_canonical_world_equals_a_new_one(
 ) -> None:
     """Whatever the fingers touched before, setting a state gives the bits of a new world."""
     blocks, command = ("block",) if touching == "block" else (), TOUCHES[touching]
-    scene = default_scene(Structure(blocks))
+    scene = default_scene(TriFingerStructure(blocks))
     backend.build(scene)
     backend.step(POSITIONS, command, 400)
     assert fingers_touch(backend, touching)
     target = scene.with_(state=backend.state())  # in the very contact that must be forgotten
 
     if way == "remake":
-        backend.build(default_scene(Structure(("other", "another"))))
+        backend.build(default_scene(TriFingerStructure(("other", "another"))))
         play(backend, 1)
     if way == "apply":
         backend.step(POSITIONS, command, 1)

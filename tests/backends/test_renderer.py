@@ -21,12 +21,12 @@ from scm_world.backends.renderer import (
     write_png,
 )
 from scm_world.errors import UnknownOption
-from scm_world.models import Goal, ParameterKey, Scene
+from scm_world.models import GoalRegion, ParameterKey, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.kinematics import forward, link_frames
-from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
 
 TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 """Below the robot's hub, looking down."""
@@ -34,9 +34,11 @@ TOP = Camera("top", eye=(0.0, 0.0, 0.25), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 
 SMALL = replace(OVERVIEW, width=160, height=120)
 
 
-def goal(position: tuple[float, float, float], *, size: float = 0.065, shape: str = "box") -> Goal:
+def goal(
+    position: tuple[float, float, float], *, size: float = 0.065, shape: str = "box"
+) -> GoalRegion:
     """Make a green goal that is not turned."""
-    return Goal(
+    return GoalRegion(
         "goal", shape, np.full(3, size), np.array(position),
         np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]),
     )  # fmt: skip
@@ -45,7 +47,7 @@ def goal(position: tuple[float, float, float], *, size: float = 0.065, shape: st
 @pytest.fixture
 def scene() -> Scene:
     """One red block in the middle of the table."""
-    return default_scene(Structure(blocks=("tool_block",)))
+    return default_scene(TriFingerStructure(blocks=("tool_block",)))
 
 
 def painted(scene: Scene, body: str, color: tuple[float, float, float]) -> Scene:
@@ -226,7 +228,7 @@ def test_sphere_is_round(scene: Scene) -> None:
 def test_shadow_lies_on_the_floor(scene: Scene) -> None:
     """A floating block darkens the floor beside it; without the block there is light."""
     scene.state.positions[0] = (0.05, 0.05, 0.05)
-    dark, light = render(scene, TOP), render(default_scene(Structure()), TOP)
+    dark, light = render(scene, TOP), render(default_scene(TriFingerStructure()), TOP)
     floor = dark.shows("floor") & light.shows("floor")
 
     darker = dark.rgb.astype(int).sum(axis=2) < light.rgb.astype(int).sum(axis=2) - 20
@@ -291,7 +293,7 @@ def test_unknown_body_is_refused(scene: Scene) -> None:
 def test_many_blocks(scene: Scene) -> None:
     """Each block has its own number."""
     names = tuple(f"tool_{i}" for i in range(3))
-    image = render(default_scene(Structure(blocks=names)), OVERVIEW)
+    image = render(default_scene(TriFingerStructure(blocks=names)), OVERVIEW)
 
     assert all(image.shows(name).any() for name in names)
 

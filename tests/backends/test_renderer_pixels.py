@@ -23,12 +23,12 @@ from scm_world.backends.renderer import (
     resized,
 )
 from scm_world.geometry.hulls import box_hull
-from scm_world.models import Goal, Light, Scene
+from scm_world.models import GoalRegion, Light, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.hardware import JOINT_LOW
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
 
 
 def pixels(
@@ -47,7 +47,7 @@ def pixels(
     return out
 
 
-STRUCTURE = Structure(
+STRUCTURE = TriFingerStructure(
     blocks=("tool_block", "stone"),
     obstacles=("barrier",),
     hulls=(("stone", box_hull([0.05, 0.03, 0.04])),),
@@ -61,7 +61,9 @@ def scene() -> Scene:
     barrier = {"size": [0.1, 0.02, 0.05], "position": [0.0, -0.08, 0.025], "color": [1, 1, 0]}
     changes = {("barrier", name): np.array(value, float) for name, value in barrier.items()}
     green, upright = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
-    goal = Goal("goal", "box", np.full(3, 0.065), np.array([0.0, 0.08, 0.0325]), upright, green)
+    goal = GoalRegion(
+        "goal", "box", np.full(3, 0.065), np.array([0.0, 0.08, 0.0325]), upright, green
+    )
     return scene.with_(parameters={**scene.parameters, **changes}, goals=(goal,))
 
 
@@ -70,7 +72,7 @@ def parked(scene: Scene, *, obstacles: bool = True) -> Scene:
     state = PhysicalState(0)
     state.joint_positions[:] = JOINT_LOW
     kept = scene.structure.obstacles if obstacles else ()
-    return scene.with_(state=state, structure=Structure(obstacles=kept))
+    return scene.with_(state=state, structure=TriFingerStructure(obstacles=kept))
 
 
 def now(scene: Scene) -> np.ndarray:
@@ -294,7 +296,7 @@ print(hashlib.sha256(pixels.tobytes()).hexdigest())
 def test_pixels_are_equal_between_processes() -> None:
     """Another process sees the same pixels, bit for bit."""
     ours = np.empty((3, 3, 128, 128), np.uint8)
-    now_pixels(default_scene(Structure(("a", "b"))), CAMERAS, ours)
+    now_pixels(default_scene(TriFingerStructure(("a", "b"))), CAMERAS, ours)
     theirs = subprocess.run(  # noqa: S603 (our own interpreter and our own program)
         [sys.executable, "-c", SNIPPET], capture_output=True, text=True, check=True
     )

@@ -18,7 +18,7 @@ from scm_world.backends.renderer.shapes import (
 from scm_world.geometry import rotation_matrix
 from scm_world.geometry.hulls import box_hull
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Goal, Light
+from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, corners, mesh_of
 
 LIGHT = Light()
@@ -316,7 +316,7 @@ def test_goals_are_silhouettes() -> None:
     """Goals of every shape color pixels, and have neither depth nor number."""
     upright = np.array([0.0, 0.0, 0.0, 1.0])
     for kind, hull in (("box", None), ("sphere", None), ("hull", box_hull([0.3, 0.3, 0.3]))):
-        goal = Goal("goal", kind, np.full(3, 0.3), np.zeros(3), upright, RED[:3], hull)
+        goal = GoalRegion("goal", kind, np.full(3, 0.3), np.zeros(3), upright, RED[:3], hull)
         with_, without = (
             draw_shapes(shapes, CAMERA, LIGHT) for shapes in (goal_shapes([goal]), [])
         )

@@ -33,10 +33,10 @@ from scm_world.backends.renderer import (
 )
 from scm_world.backends.step import StepModel
 from scm_world.errors import EngineError, ModelError, UnknownOption
-from scm_world.models import Goal, Model, Scene
+from scm_world.models import GoalRegion, Model, Scene
 from scm_world.models.camera import Camera
 from scm_world.tasks.trifinger.cameras import CAMERAS, OVERVIEW
-from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
 
 XML = """
 <mujoco model="everything">
@@ -235,7 +235,7 @@ def test_named_cameras_and_their_errors(scene: Scene) -> None:
     with pytest.raises(UnknownOption, match=r"'frnt'.*automatic, front, flat, rider"):
         scene_camera(scene, "frnt")
     with pytest.raises(UnknownOption, match=r"there are: overview, 60, 120, 300"):
-        picture(default_scene(Structure()), "fron")
+        picture(default_scene(TriFingerStructure()), "fron")
 
 
 def test_the_size_of_a_picture(scene: Scene) -> None:
@@ -266,7 +266,7 @@ def test_one_camera_for_two_scenes(scene: Scene) -> None:
 
 def test_the_trifinger_looks_as_before() -> None:
     """Its pictures are those of ``render``, from the overview, and its renderer is ours."""
-    scene = default_scene(Structure(blocks=("tool_block",)))
+    scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
 
     np.testing.assert_array_equal(picture(scene), render(scene, OVERVIEW).rgb)
     np.testing.assert_array_equal(
@@ -357,7 +357,9 @@ def test_pictures_are_equal_in_other_processes(scene: Scene, tmp_path: Path) -> 
 def test_pixels_for_policies(scene: Scene) -> None:
     """Pixels are those of a picture without shadows and goals; goals have pixels of their own."""
     upright = np.array([0.0, 0.0, 0.0, 1.0])
-    goal = Goal("goal", "box", np.full(3, 0.4), np.array([0.0, 0.0, 1.0]), upright, np.ones(3))
+    goal = GoalRegion(
+        "goal", "box", np.full(3, 0.4), np.array([0.0, 0.0, 1.0]), upright, np.ones(3)
+    )
     wanted = scene.with_(goals=(goal,))
     camera = scene_camera(scene, "front", SIZE)
     now, then, image = (
@@ -461,7 +463,9 @@ def test_a_window_shows_a_model(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
     upright = np.array([0.0, 0.0, 0.0, 1.0])
-    goal = Goal("goal", "sphere", np.full(3, 0.4), np.array([0.0, 0.0, 2.0]), upright, np.ones(3))
+    goal = GoalRegion(
+        "goal", "sphere", np.full(3, 0.4), np.array([0.0, 0.0, 2.0]), upright, np.ones(3)
+    )
     viewer = Viewer()
     viewer.show(scene)
     later = moved(colored(scene, "ball", "color", [0, 1, 0, 1]), hinge_position=0.5)

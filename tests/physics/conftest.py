@@ -12,7 +12,7 @@ from scm_world.models import ControlMode, Difference
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, PRECISE, Preset
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
 
 ENGINES = [
     name
@@ -40,7 +40,7 @@ class Lab:
         """Build a scene with blocks ``block_0``, ``block_1``, … at positions (n, 3) [m]."""
         positions = np.atleast_2d(positions)
         names = tuple(f"block_{i}" for i in range(len(positions)))
-        scene = default_scene(Structure(names, preset=self.preset))
+        scene = default_scene(TriFingerStructure(names, preset=self.preset))
         changed = {key: np.asarray(value, dtype=float) for key, value in parameters.items()}
         changed["robot", "height"] = np.asarray(height)
         scene.state.positions[:] = positions

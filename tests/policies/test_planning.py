@@ -15,7 +15,7 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.geometry import from_rotation_vector
-from scm_world.policies.planning import CrossEntropy, Model, Score, Search, nearness
+from scm_world.policies.planning import CrossEntropy, PlanningModel, Score, Search, nearness
 from scm_world.policies.planning.model import as_score
 from scm_world.policies.scripted import NAMED
 from scm_world.queries import World
@@ -50,7 +50,7 @@ def test_rollouts_are_those_of_single_worlds(mode: str) -> None:
     """What copies go through together is, bit for bit, what a world goes through alone."""
     world = begun(action_mode=mode)
     names, actions = ("reward", "tool_block.cartesian_position"), sequences(world, 3, 4)
-    model = Model(world, 4, names, threads=2)
+    model = PlanningModel(world, 4, names, threads=2)
     found = model.rollouts(model.present(world), actions)
     for row in range(3):
         alone = copy.deepcopy(world)
@@ -68,7 +68,7 @@ def test_noise_is_foreseen_only_if_asked_for() -> None:
     actions = sequences(world, 1, 2)
     after = {}
     for foresees in (True, False):
-        model = Model(world, 1, ["joint_positions"], foresees=foresees, threads=1)
+        model = PlanningModel(world, 1, ["joint_positions"], foresees=foresees, threads=1)
         after[foresees] = model.rollouts(model.present(world), actions)["joint_positions"][0, -1]
     for action in actions[0]:
         world.step(action)
@@ -79,7 +79,7 @@ def test_noise_is_foreseen_only_if_asked_for() -> None:
 def test_the_model_may_believe_something_else() -> None:
     """What is believed holds in the model, and the world stays as it is."""
     world = begun(backend="fake")
-    model = Model(world, 2, ["tool_block.mass"], do=HEAVY)
+    model = PlanningModel(world, 2, ["tool_block.mass"], do=HEAVY)
     before = pickle.dumps(world.snapshot())
     found = model.rollouts(model.present(world), sequences(world, 2, 2))
     assert (found["tool_block.mass"] == 0.09).all()
@@ -93,7 +93,9 @@ def test_the_present_is_carried_to_another_engine(acts: str, plans: str) -> None
     pytest.importorskip("pybullet")
     world = begun(backend=acts)
     world.do(HEAVY)
-    model = Model(world, 1, ["joint_positions", "tool_block.mass"], backend=plans, threads=1)
+    model = PlanningModel(
+        world, 1, ["joint_positions", "tool_block.mass"], backend=plans, threads=1
+    )
     rest = np.array(world["joint_positions"])
     found = model.rollouts(model.present(world), rest[None, None])
     world.step(rest)
@@ -307,11 +309,11 @@ def test_wrong_names_are_refused() -> None:
 def test_actions_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
     """More sequences than there are copies, too few axes, too few numbers."""
     world = begun(backend="fake")
-    model = Model(world, 2, ["reward"])
+    model = PlanningModel(world, 2, ["reward"])
     with pytest.raises(ActionError, match=r"shape \(n, steps, 9\), with n up to 2, got"):
         model.rollouts(model.present(world), np.zeros(shape))
     with pytest.raises(UnknownOption, match="threads"):
-        Model(world, 2, ["reward"], threads=0)
+        PlanningModel(world, 2, ["reward"], threads=0)
 
 
 @pytest.mark.parametrize("wrong", [lambda _: np.nan, lambda _: "much", lambda a, b: a])

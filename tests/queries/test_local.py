@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from scm_world.backends.base import Contact
+from scm_world.backends.base import ContactPoint
 from scm_world.errors import NotReset
 from scm_world.queries.local import islands, local_graph, reached
 from scm_world.tasks.trifinger import hardware
@@ -115,12 +115,12 @@ def test_hand_made_scenes(engine: str, scene: Callable[[Simulation], np.ndarray]
     assert {edge for edge in graph.edges if edge[0] not in fixed} == SCENES[scene]
 
 
-def contact(first: str, second: str, force: float = 1.0) -> Contact:
+def contact(first: str, second: str, force: float = 1.0) -> ContactPoint:
     """Let two bodies touch."""
-    return Contact((first, second), np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, force)
+    return ContactPoint((first, second), np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, force)
 
 
-def causes(names: Iterable[str], *steps: list[Contact]) -> dict[str, str]:
+def causes(names: Iterable[str], *steps: list[ContactPoint]) -> dict[str, str]:
     """Say from which bodies each is reached, in short."""
     found = reached(tuple(names), steps)
     return {body: "".join(sorted(from_)) for body, from_ in found.items()}

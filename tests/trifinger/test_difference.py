@@ -11,7 +11,7 @@ from scm_world.models import Difference, Scene, diff
 from scm_world.models.scene import complete
 from scm_world.tasks.trifinger.hardware import PRECISE, ControllerSpec
 from scm_world.tasks.trifinger.structure import (
-    Structure,
+    TriFingerStructure,
     controller_spec,
     default_scene,
     parameter_keys,
@@ -75,7 +75,7 @@ def test_what_is_said_counts() -> None:
 
 def test_default_parameters_specify_the_published_controller() -> None:
     """The controller of the default parameters is the default one, and it follows them."""
-    parameters = dict(default_scene(Structure()).parameters)
+    parameters = dict(default_scene(TriFingerStructure()).parameters)
     assert controller_spec(parameters) == ControllerSpec()
     parameters["controller", "torque_limit"] = np.array(0.2)
     parameters["controller", "velocity_gains"] = np.array([0.3, 0.2, 0.1])

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Backend, Capabilities, Contact, EngineSnapshot
+from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot
 from scm_world.backends.bullet.client import (
     Client,
     Instant,
@@ -383,7 +383,7 @@ class BulletBackend(Backend):
         self._before = self._present.parameters
         self._present, self._light = None, True
 
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
         return self._last().contacts()
 

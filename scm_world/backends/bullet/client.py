@@ -18,7 +18,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.backends.base import Contact
+from scm_world.backends.base import ContactPoint
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.models.scene import ControlMode, ParameterKey, Parameters, State, Structure
 
@@ -223,13 +223,13 @@ class Client(ABC):
 
     # --- the same for all -----------------------------------------------------------------------
 
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ContactPoint, ...]:
         """List the points of the last physics step that touch or press.
 
         The engine also keeps points of bodies that only came near; they are left out.
         """
         return tuple(
-            Contact(
+            ContactPoint(
                 bodies=(self.owner(point[1], point[3]), self.owner(point[2], point[4])),
                 position=(np.array(point[5]) + np.array(point[6])) / 2,
                 normal=-np.array(point[7]),  # the engine's points to the first body

@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.backends.base import (
     Backend,
     Capabilities,
-    Contact,
+    ContactPoint,
     EngineBatch,
     EngineSnapshot,
 )
@@ -221,7 +221,7 @@ class MujocoBackend(Backend):
         if problem:
             raise EngineFailure(problem, self.name)
 
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step.
 
         MuJoCo keeps those of the last stage of a Runge-Kutta step. After a call of ``step`` with

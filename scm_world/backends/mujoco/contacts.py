@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.base import Contact
+from scm_world.backends.base import ContactPoint
 
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _PYRAMID = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
@@ -33,10 +33,10 @@ class Touches:
     shapes: Integers
     numbers: Floats
 
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ContactPoint, ...]:
         """Name the bodies."""
         return tuple(
-            Contact(
+            ContactPoint(
                 (self.owners[first], self.owners[second]),
                 row[:3],
                 row[3:6],

@@ -21,7 +21,7 @@ from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.backends.mujoco.reading import body_names
 from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Goal, Scene
+from scm_world.models.scene import GoalRegion, Scene
 from scm_world.models.shapes import Kind, Mesh, Shape, Tiles, mesh_of
 
 MOST_SHAPES = 10_000
@@ -246,7 +246,7 @@ def drawn(scene: Scene) -> tuple[VisibleModel, mujoco.MjData]:
     return shown[now], now.data
 
 
-def draw_goals(scene: mujoco.MjvScene, goals: Iterable[Goal]) -> None:
+def draw_goals(scene: mujoco.MjvScene, goals: Iterable[GoalRegion]) -> None:
     """Add goals to an abstract scene as silhouettes; of a hull, the box around it."""
     for goal in goals:
         if scene.ngeom >= scene.maxgeom:

@@ -14,7 +14,7 @@ from scm_world.geometry.hulls import Hull, solid
 from scm_world.geometry.rotations import rotation_kernel
 from scm_world.models.camera import Camera
 from scm_world.models.model import Model
-from scm_world.models.scene import Goal, Scene
+from scm_world.models.scene import GoalRegion, Scene
 from scm_world.models.shapes import Shape
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def _drawn(scene: Scene) -> tuple[VisibleModel, Any]:
     return drawn(scene)
 
 
-def goal_bodies(goals: tuple[Goal, ...], eye: tuple[float, float, float]) -> Bodies:
+def goal_bodies(goals: tuple[GoalRegion, ...], eye: tuple[float, float, float]) -> Bodies:
     """List silhouettes from the farthest to the nearest: each is drawn over those behind."""
     ordered = sorted(goals, key=lambda goal: -float(np.linalg.norm(goal.position - eye)))
     bodies = empty_bodies(len(goals), [goal.hull for goal in ordered])

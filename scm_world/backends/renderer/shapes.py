@@ -31,7 +31,7 @@ from scm_world.backends.renderer.meshes import (
 )
 from scm_world.geometry import rotation_matrix
 from scm_world.models.camera import Camera
-from scm_world.models.scene import Goal, Light
+from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import Kind, Mesh, Shape, corners, mesh_of
 
 SOLIDS = {
@@ -100,7 +100,7 @@ def draw_shapes(
     return canvas
 
 
-def goal_shapes(goals: Iterable[Goal]) -> list[Shape]:
+def goal_shapes(goals: Iterable[GoalRegion]) -> list[Shape]:
     """Give the silhouettes of goals."""
     shapes = []
     for goal in goals:

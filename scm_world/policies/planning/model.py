@@ -23,7 +23,7 @@ STREAM = "what a planner expects"
 
 
 @final
-class Model:
+class PlanningModel:
     """Copies of a world in which sequences of actions are tried out; the world is not touched.
 
     Args:
@@ -43,7 +43,7 @@ class Model:
     Example:
         >>> world = Simulation("pushing", backend="fake")
         >>> world.reset(seed=0)
-        >>> model = Model(world, 2, ["reward"])
+        >>> model = PlanningModel(world, 2, ["reward"])
         >>> values = model.rollouts(model.present(world), np.zeros((2, 5, 9)))
         >>> values["reward"].shape, world.index
         ((2, 5), 0)

@@ -22,7 +22,7 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
-from scm_world.policies.planning.model import Model, as_score, nearness
+from scm_world.policies.planning.model import PlanningModel, as_score, nearness
 from scm_world.tasks.base import action_range
 from scm_world.variables import Noise, Normal
 from scm_world.world import Simulation
@@ -203,7 +203,7 @@ class _WorldPlans:
         self._objective = policy.objective or nearness(world.task)
         self._terminal = policy.terminal
         names = (*self._objective.names, *(self._terminal.names if self._terminal else ()))
-        self._model = Model(
+        self._model = PlanningModel(
             world,
             policy.search.samples,
             names,

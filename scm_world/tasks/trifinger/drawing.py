@@ -43,7 +43,7 @@ from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.cameras import CAMERAS, ORIGINAL_CAMERAS, OVERVIEW
 from scm_world.tasks.trifinger.kinematics import FRAMES_PER_FINGER, link_frames
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import WALL_HEIGHT, WALL_RADIUS, Structure
+from scm_world.tasks.trifinger.structure import WALL_HEIGHT, WALL_RADIUS, TriFingerStructure
 
 FLOOR, STAGE, ROBOT = range(3)
 """What a pixel shows, where it is none of the links, blocks or obstacles; see ``names``."""
@@ -79,13 +79,13 @@ class TriFingerDrawing(Drawing):
     cameras = CAMERAS
     original_cameras = ORIGINAL_CAMERAS
 
-    def names(self, structure: Structure) -> tuple[str, ...]:
+    def names(self, structure: TriFingerStructure) -> tuple[str, ...]:
         """Name what the numbers of a segmentation stand for.
 
         Example:
-            >>> DRAWING.names(Structure(blocks=("tool_block",)))[:4]
+            >>> DRAWING.names(TriFingerStructure(blocks=("tool_block",)))[:4]
             ('floor', 'stage', 'robot', 'robot_finger_60_link_0')
-            >>> DRAWING.names(Structure(blocks=("tool_block",), obstacles=("wall",)))[-2:]
+            >>> DRAWING.names(TriFingerStructure(blocks=("tool_block",), obstacles=("wall",)))[-2:]
             ('tool_block', 'wall')
         """
         links = hardware.LINK_NAMES

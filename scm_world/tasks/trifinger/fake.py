@@ -8,7 +8,7 @@ from scm_world._types import Floats
 from scm_world.models import ControlMode, Parameters
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import Structure
+from scm_world.tasks.trifinger.structure import TriFingerStructure
 
 
 def move(state: PhysicalState, mode: ControlMode, command: Floats, seconds: float) -> None:
@@ -26,7 +26,7 @@ def settle(state: PhysicalState) -> None:
     state.orientations[state.orientations[:, 3] < 0.0] *= -1.0
 
 
-def inertia(structure: Structure, parameters: Parameters, body: str) -> Floats:
+def inertia(structure: TriFingerStructure, parameters: Parameters, body: str) -> Floats:
     """Compute the principal moments of inertia of a block or a link, shape (3,) [kg m²]."""
     mass = parameters[body, "mass"]
     if body in hardware.LINK_NAMES:

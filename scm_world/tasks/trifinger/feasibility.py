@@ -71,8 +71,8 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
         One entry for each pair of names, blocks first.
 
     Example:
-        >>> from scm_world.tasks.trifinger.structure import Structure, default_scene
-        >>> scene = default_scene(Structure(blocks=("tool_block",)))
+        >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
+        >>> scene = default_scene(TriFingerStructure(blocks=("tool_block",)))
         >>> overlaps(scene, tolerance=1e-4)
         ()
         >>> scene.state.positions[0, 2] = 0.03

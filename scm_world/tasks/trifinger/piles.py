@@ -13,7 +13,7 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.state import PhysicalState
-from scm_world.tasks.trifinger.structure import Structure, default_parameters
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_parameters
 
 MOST = 9
 SHAPE = (MOST, 7)
@@ -94,7 +94,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
     size, mass, floor, *gravity = np.frombuffer(lone).tolist()
     drops = np.frombuffer(each).reshape(-1, 7)
     names = tuple(f"block_{index}" for index in range(len(drops)))
-    structure = Structure(names)
+    structure = TriFingerStructure(names)
     common = {("world", "gravity"): gravity, ("floor", "friction"): floor}
     common[("robot", "height")] = AWAY
     for name, drop in zip(names, drops, strict=True):

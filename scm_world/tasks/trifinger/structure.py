@@ -29,7 +29,7 @@ SPINNING_FRICTION = 0.001  # torsional coefficient of every contact
 
 @final
 @dataclass(frozen=True)
-class Structure:
+class TriFingerStructure:
     """What has to be compiled: it changes only when bodies come or go.
 
     Attributes:
@@ -111,7 +111,7 @@ SURFACE = ("size", "friction", "color")
 """What every obstacle has besides its pose, and every block that is a box besides its mass."""
 
 
-def parameter_keys(structure: Structure) -> Iterator[ParameterKey]:
+def parameter_keys(structure: TriFingerStructure) -> Iterator[ParameterKey]:
     """List every parameter that a scene of this structure has.
 
     ======================  ==========================================
@@ -162,7 +162,7 @@ def controller_spec(parameters: Parameters) -> ControllerSpec:
     return ControllerSpec(kp, kd, safety, float(limit))
 
 
-def default_parameters(structure: Structure) -> dict[ParameterKey, Floats]:
+def default_parameters(structure: TriFingerStructure) -> dict[ParameterKey, Floats]:
     """Give the published default of every parameter."""
     surface = {"floor": (0.31, 0.27, 0.25), "stage": (0.95, 0.95, 0.95)}
     spec = ControllerSpec()
@@ -204,7 +204,7 @@ SPACING = 0.1  # [m] between the centers of blocks that stand side by side
 LAYER = 0.07  # [m] between the centers of blocks that stand on one another
 
 
-def default_scene(structure: Structure) -> Scene:
+def default_scene(structure: TriFingerStructure) -> Scene:
     """Stand the blocks on the table, in rows and then in layers, with the robot at rest.
 
     Fingers and blocks keep clear of each other up to twelve blocks.

@@ -28,7 +28,7 @@ from scm_world.tasks.trifinger.bullet.arena import (
 from scm_world.tasks.trifinger.bullet.passive import MASSES, resistance
 from scm_world.tasks.trifinger.hardware import ControllerSpec
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
-from scm_world.tasks.trifinger.structure import Structure, controller_spec, parameter_keys
+from scm_world.tasks.trifinger.structure import TriFingerStructure, controller_spec, parameter_keys
 
 Law = Callable[[Sequence[Any], Sequence[float]], list[float]]
 """From joint states (position, velocity, …) and a command, nine each, to nine torques [N m]."""
@@ -163,12 +163,12 @@ class TriFingerClient(Client):
         self._laws: dict[ControlMode, Law] = {}
 
     @staticmethod
-    def keys(structure: Structure) -> Iterable[ParameterKey]:
+    def keys(structure: TriFingerStructure) -> Iterable[ParameterKey]:
         """List every parameter of a structure."""
         return parameter_keys(structure)
 
     @staticmethod
-    def heavy(structure: Structure) -> Iterator[ParameterKey]:
+    def heavy(structure: TriFingerStructure) -> Iterator[ParameterKey]:
         """List the parameters that need new bodies, or new contacts."""
         yield ("robot", "height")
         hulls = dict(structure.hulls)
@@ -179,7 +179,7 @@ class TriFingerClient(Client):
             yield from ((name, quantity) for quantity in ("size", "position", "orientation"))
 
     @staticmethod
-    def rotations(structure: Structure) -> Sequence[int]:
+    def rotations(structure: TriFingerStructure) -> Sequence[int]:
         """List where the quaternions of the blocks begin."""
         return range(ROBOT_SIZE + 3, structure.layout.size, BLOCK_SIZE)
 
@@ -191,7 +191,7 @@ class TriFingerClient(Client):
         self.bodies = Handles(arena.add_robot(engine, handle), floor, stage)
         super().furnish()
 
-    def construct(self, structure: Structure, parameters: Values) -> None:
+    def construct(self, structure: TriFingerStructure, parameters: Values) -> None:
         """Make sure that the obstacles and blocks are there, with their shapes."""
         timestep = structure.preset.timestep
         if timestep != self._timestep:
@@ -208,7 +208,7 @@ class TriFingerClient(Client):
         if not same or tuple(self.bodies.blocks) != structure.blocks:
             self._remake(structure, shapes)
 
-    def _remake(self, structure: Structure, shapes: dict[str, arena.Shape]) -> None:
+    def _remake(self, structure: TriFingerStructure, shapes: dict[str, arena.Shape]) -> None:
         """Replace all obstacles and blocks: their order in the engine is that in the structure."""
         engine, handle, was = self.engine, self.handle, self.bodies
         for body in reversed((*was.obstacles.values(), *was.blocks.values())):

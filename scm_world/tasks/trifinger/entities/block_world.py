@@ -8,7 +8,7 @@ from typing import Any, final
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.hulls import Hull
-from scm_world.models import ControlMode, Goal, Light, ParameterKey, Scene
+from scm_world.models import ControlMode, GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.scene import Overlap
 from scm_world.tasks.composition import Commands, Composition, Entity
 from scm_world.tasks.conventions import CONVENTIONS, Conventions
@@ -20,7 +20,7 @@ from scm_world.tasks.trifinger.hardware import (
     preset,
 )
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState
-from scm_world.tasks.trifinger.structure import Structure
+from scm_world.tasks.trifinger.structure import TriFingerStructure
 from scm_world.variables import Variable
 from scm_world.variables.kinds import parent_of
 from scm_world.variables.reserved import PRESET
@@ -59,7 +59,7 @@ class BlockWorld(Composition):
     obstacles: tuple[str, ...] = field(init=False)
     hulls: tuple[tuple[str, Hull], ...] = field(init=False)
     commands: Commands | None = field(init=False)
-    _structures: dict[str, Structure] = field(init=False, default_factory=dict, repr=False)
+    _structures: dict[str, TriFingerStructure] = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         blocks = [entity for entity in self.entities if entity.is_block]
@@ -73,12 +73,14 @@ class BlockWorld(Composition):
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
-    def structure(self, values: Values) -> Structure:
+    def structure(self, values: Values) -> TriFingerStructure:
         """Say which bodies the engine has to build, and how finely it cuts time."""
         name = PRESET_NAMES[int(values[PRESET])]
         if name not in self._structures:
             published = self.conventions.published_physics
-            made = Structure(self.blocks, preset(name), self.obstacles, self.hulls, published)
+            made = TriFingerStructure(
+                self.blocks, preset(name), self.obstacles, self.hulls, published
+            )
             self._structures[name] = made
         return self._structures[name]
 
@@ -139,7 +141,7 @@ class BlockWorld(Composition):
         """Name the fingers, then the blocks. The bases of fingers are fixed."""
         return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
 
-    def goals(self, values: Values) -> tuple[Goal, ...]:
+    def goals(self, values: Values) -> tuple[GoalRegion, ...]:
         """Describe all goals."""
         goals = (entity.goal(values) for entity in self.entities)
         return tuple(goal for goal in goals if goal is not None)

@@ -13,7 +13,7 @@ from scm_world.geometry.coordinates import from_cylindrical, to_cylindrical
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import from_rotation_vector, to_rotation_vector
 from scm_world.models import ParameterKey
-from scm_world.tasks.composition import Entity, State
+from scm_world.tasks.composition import Entity, StateDeclaration
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.block_world import block_slice, lowest_point
 from scm_world.variables import Box, Derived, Exogenous, Fixed, Function, Variable
@@ -179,12 +179,12 @@ class ToolBlock(Entity):
         yield color(self._v("color"), numbers.BLOCK_COLOR)
         yield from coordinates(self.name, a=self._a, b=self._b)
 
-    def states(self) -> Iterable[State]:
+    def states(self) -> Iterable[StateDeclaration]:
         """Declare pose and velocities."""
         position, orientation = self._v("cartesian_position"), self._v("orientation")
         linear, angular = self._v("linear_velocity"), self._v("angular_velocity")
         always = "gravity", PRESET
-        yield State(
+        yield StateDeclaration(
             position,
             "m",
             (3,),
@@ -197,7 +197,7 @@ class ToolBlock(Entity):
             carry=self._carry,
             restart=self._restart,
         )
-        yield State(
+        yield StateDeclaration(
             orientation,
             "1",
             (4,),
@@ -207,7 +207,7 @@ class ToolBlock(Entity):
             always=(orientation, angular, PRESET),
             **self._respawn(numbers.IDENTITY),
         )
-        yield State(
+        yield StateDeclaration(
             linear,
             "m/s",
             (3,),
@@ -217,7 +217,7 @@ class ToolBlock(Entity):
             always=(linear, *always),
             **self._respawn((0.0, 0.0, 0.0)),
         )
-        yield State(
+        yield StateDeclaration(
             angular,
             "rad/s",
             (3,),

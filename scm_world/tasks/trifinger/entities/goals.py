@@ -10,7 +10,7 @@ import numpy as np
 from scm_world._types import Floats, Values
 from scm_world.geometry import from_cylindrical, rotation_matrix
 from scm_world.geometry.hulls import Hull
-from scm_world.models import Goal
+from scm_world.models import GoalRegion
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger.entities.blocks import color, coordinates, object_type, same
@@ -102,8 +102,8 @@ class _Goal(Entity):
     def _v(self, quantity: str) -> str:
         return f"{self.name}.{quantity}"
 
-    def _silhouette(self, shape: str, values: Values, hull: Hull | None = None) -> Goal:
-        return Goal(
+    def _silhouette(self, shape: str, values: Values, hull: Hull | None = None) -> GoalRegion:
+        return GoalRegion(
             name=self.name,
             shape=shape,
             size=values[self._v("size")],
@@ -159,7 +159,7 @@ class GoalBlock(_Goal):
             self.name, a=self._a, b=self._b, yaw=self._yaw, inverse=self._inverse
         )
 
-    def goal(self, values: Values) -> Goal:
+    def goal(self, values: Values) -> GoalRegion:
         """Describe the silhouette."""
         return self._silhouette("box" if self._shape is None else "hull", values, self._shape)
 
@@ -209,6 +209,6 @@ class GoalSphere(_Goal):
             b=numbers.cylindrical(numbers.RADIUS_B, low, numbers.HEIGHT_B),
         )
 
-    def goal(self, values: Values) -> Goal:
+    def goal(self, values: Values) -> GoalRegion:
         """Describe the silhouette."""
         return self._silhouette("sphere", values)

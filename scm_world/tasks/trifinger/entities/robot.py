@@ -13,7 +13,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.geometry.scalars import scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import ParameterKey
-from scm_world.tasks.composition import Commands, Entity, State
+from scm_world.tasks.composition import Commands, Entity, StateDeclaration
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.entities.blocks import color
@@ -99,7 +99,7 @@ QUANTITIES = ("joint_positions", "joint_velocities", "joint_torques")
 
 @final
 @dataclass(frozen=True)
-class Joints:
+class JointGroup:
     """Some joints that are variables together.
 
     Attributes:
@@ -127,7 +127,7 @@ class Joints:
         return box if self.shape == (N_JOINTS,) else part_of(box, self.where, N_JOINTS, self.shape)
 
 
-def joints_of(resolution: str) -> tuple[Joints, ...]:
+def joints_of(resolution: str) -> tuple[JointGroup, ...]:
     """Cut the nine joints into those that are variables together, in their order.
 
     Args:
@@ -140,19 +140,21 @@ def joints_of(resolution: str) -> tuple[Joints, ...]:
         'finger_300_joint_2.action'
     """
     if resolution == "vector":
-        return (Joints(slice(0, N_JOINTS), FINGERS, QUANTITIES, "action", "all fingers"),)
+        return (JointGroup(slice(0, N_JOINTS), FINGERS, QUANTITIES, "action", "all fingers"),)
     found = []
     for index, finger in enumerate(FINGERS):
         if resolution == "finger":
             name, where = f"finger_{finger}", slice(3 * index, 3 * index + 3)
             names = tuple(f"{name}.{quantity}" for quantity in QUANTITIES)
-            found.append(Joints(where, (finger,), names, f"{name}.action", f"finger {finger}"))
+            found.append(JointGroup(where, (finger,), names, f"{name}.action", f"finger {finger}"))
             continue
         for joint in range(3):
             name, place = f"finger_{finger}_joint_{joint}", 3 * index + joint
             names = tuple(f"{name}.{what}" for what in ("position", "velocity", "torque"))
             of = f"joint {joint} of finger {finger}"
-            found.append(Joints(slice(place, place + 1), (finger,), names, f"{name}.action", of))
+            found.append(
+                JointGroup(slice(place, place + 1), (finger,), names, f"{name}.action", of)
+            )
     return tuple(found)
 
 
@@ -308,18 +310,18 @@ class Robot(Entity):
             "Standard deviation of a command, as a fraction of half the range of an action.",
         )
 
-    def states(self) -> Iterable[State]:
+    def states(self) -> Iterable[StateDeclaration]:
         """Declare joint positions, velocities and the torques the engine reports."""
         of_each = [list(self._quantities(joints)) for joints in self._joints]
         yield from (states[index] for index in range(len(QUANTITIES)) for states in of_each)
 
-    def _quantities(self, joints: Joints) -> Iterable[State]:
+    def _quantities(self, joints: JointGroup) -> Iterable[StateDeclaration]:
         """Declare what moves of some joints: position, velocity and torque."""
         always = self._always(joints)
         start = self._start[joints.where]
         still = (0.0,) * len(start)
         position, velocity, torque = joints.names
-        yield State(
+        yield StateDeclaration(
             position,
             "rad",
             joints.shape,
@@ -330,7 +332,7 @@ class Robot(Entity):
             a=joints.cut(numbers.JOINTS_A),
             b=joints.cut(numbers.JOINTS_B),
         )
-        yield State(
+        yield StateDeclaration(
             velocity,
             "rad/s",
             joints.shape,
@@ -339,7 +341,7 @@ class Robot(Entity):
             "Angular velocities of the joints.",
             always=always,
         )
-        yield State(
+        yield StateDeclaration(
             torque,
             "N m",
             joints.shape,
@@ -350,7 +352,7 @@ class Robot(Entity):
             settable=False,
         )
 
-    def _always(self, joints: Joints) -> tuple[str, ...]:
+    def _always(self, joints: JointGroup) -> tuple[str, ...]:
         """Name what acts on some joints in every control step.
 
         Other fingers are other kinematic trees: they act by contact only.

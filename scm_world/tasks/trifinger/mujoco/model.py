@@ -40,7 +40,7 @@ from scm_world.tasks.trifinger.structure import (
     WALL_RADIUS,
     WALL_SEGMENTS,
     WALL_THICKNESS,
-    Structure,
+    TriFingerStructure,
 )
 
 FLOOR = "floor"
@@ -67,7 +67,7 @@ _ROLLING_FRICTION = 1e-4  # not in force: contacts have four dimensions
 
 
 @lru_cache(maxsize=32)
-def compiled(structure: Structure) -> mujoco.MjModel:
+def compiled(structure: TriFingerStructure) -> mujoco.MjModel:
     """Compile a structure once. Callers copy the model before they change it."""
     spec = mujoco.MjSpec()
     spec.modelname = "scm_world"
@@ -125,7 +125,7 @@ def link_shapes(finger: str, index: int) -> tuple[str, ...]:
     return tuple(shape_name(finger, shape) for shape in shapes)
 
 
-def shape_owners(structure: Structure) -> dict[str, str]:
+def shape_owners(structure: TriFingerStructure) -> dict[str, str]:
     """Map every shape to the published name of its body."""
     owners = {FLOOR: FLOOR}
     owners |= {wall_name(i): STAGE for i in range(WALL_SEGMENTS)}
@@ -135,7 +135,7 @@ def shape_owners(structure: Structure) -> dict[str, str]:
     return owners | {name: name for name in (*structure.blocks, *structure.obstacles)}
 
 
-def contact_pairs(structure: Structure) -> Iterator[tuple[str, str, bool]]:
+def contact_pairs(structure: TriFingerStructure) -> Iterator[tuple[str, str, bool]]:
     """List which shapes can touch, and whether they slide (True) or grip (False).
 
     Yields:
@@ -165,7 +165,7 @@ def contact_pairs(structure: Structure) -> Iterator[tuple[str, str, bool]]:
             )
 
 
-def _write_options(spec: mujoco.MjSpec, structure: Structure) -> None:
+def _write_options(spec: mujoco.MjSpec, structure: TriFingerStructure) -> None:
     """Write everything that concerns the whole simulation."""
     option = spec.option
     option.timestep = structure.preset.timestep
@@ -296,7 +296,7 @@ def _yaw(angle: float) -> tuple[float, float, float, float]:
 _POSITION, _VELOCITY = 1, 2  # where gains rest among the parameters of a gain that is fixed
 
 
-def slots(model: mujoco.MjModel, structure: Structure) -> dict[ParameterKey, Slot]:
+def slots(model: mujoco.MjModel, structure: TriFingerStructure) -> dict[ParameterKey, Slot]:
     """Find the place of every parameter of this structure in this model."""
     hanging = [name(f) for f in hardware.FINGERS for name in (base_name, _fixed_link)]
     heights = [model.body_pos[model.body(name).id, 2, ...] for name in hanging]

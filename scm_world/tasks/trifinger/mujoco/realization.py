@@ -16,7 +16,7 @@ from scm_world.models.scene import ControlMode, ParameterKey
 from scm_world.tasks.trifinger.hardware import N_JOINTS
 from scm_world.tasks.trifinger.mujoco.model import compiled, couple, shape_owners, slots, steer
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE
-from scm_world.tasks.trifinger.structure import Structure
+from scm_world.tasks.trifinger.structure import TriFingerStructure
 
 _CLOSE = 1e-14  # relative; a few roundings, far less than any physics
 
@@ -208,14 +208,14 @@ _STEERED = {"position_gains", "velocity_gains"}
 
 @final
 class TriFinger(Realization):
-    """A ``Structure`` of the TriFinger.
+    """A ``TriFingerStructure`` of the TriFinger.
 
     What the last physics step left is kept in an ``LastStep`` as soon as the state is written.
     """
 
     modes = (ControlMode.JOINT_POSITIONS, ControlMode.JOINT_TORQUES)
 
-    def __init__(self, structure: Structure) -> None:
+    def __init__(self, structure: TriFingerStructure) -> None:
         model = compiled(structure)
         owners = shape_owners(structure)
         super().__init__(
