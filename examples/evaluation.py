@@ -41,7 +41,7 @@ def main(backend: str = "mujoco") -> None:
     print(found.causes("P8", agent="sweep"))
     scores = found.only(agent="sweep", protocol="P8").columns["last_fractional_success"]
     print("\nIts worst episode:")
-    print(why(found, "P8", int(scores.argmin()), agent="sweep"))
+    print(why(found.only(agent="sweep"), "P8", int(scores.argmin())))
 
     with tempfile.TemporaryDirectory() as folder:
         found.save(folder, kind="csv")

@@ -226,8 +226,15 @@ def explain(
         return
     if protocol is None:
         raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
-    asked: dict[str, Any] = {"agent": agent, "engine": engine, "metric": metric, "versus": versus}
     with console.progress("counterfactuals") as tell:
-        reasons = why(found, protocol, episode, **asked, trusted=tuple(trust or ()), progress=tell)
+        reasons = why(
+            found.only(agent=agent, engine=engine),
+            protocol,
+            episode,
+            metric=metric,
+            versus=versus,
+            trusted=tuple(trust or ()),
+            progress=tell,
+        )
     title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
     console.say(title, reasons)

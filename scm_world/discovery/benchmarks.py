@@ -224,7 +224,6 @@ def benchmark(
     out: Location | str | None = None,
     workers: int | None = None,
     engine: Executor | str | None = None,
-    address: str | None = None,
     progress: Progress | None = None,
 ) -> BenchmarkResult:
     """Run learners on problems and score the estimated graphs.
@@ -248,7 +247,6 @@ def benchmark(
         engine: ``"process"``, ``"serial"``, ``"ray"``, or an executor; see ``engine_of``. A run has
             a process of its own on all of them, which ends at the timeout. On Ray each worker
             collects data for itself, and keeps no file of them.
-        address: Of a Ray cluster.
         progress: Called with (done, planned) after each run.
 
     Returns:
@@ -309,7 +307,7 @@ def benchmark(
         groups.append([_Job(name, run, spent[-1], view, place) for run in runs])
     if engine is None:
         engine, workers = PROCESS, 1 if workers is None else workers
-    with opened(engine, workers, address) as executor:
+    with opened(engine, workers) as executor:
         if folder is None:
             runs = _all_runs(groups, truths, None, executor, timeout, progress)
             return BenchmarkResult(truths, tuple(runs), settings)

@@ -134,10 +134,6 @@ def why(
     protocol: str,
     episode: int,
     *,
-    agent: str | None = None,
-    run: int = 0,
-    engine: str | None = None,
-    seed: int | None = None,
     metric: str | None = None,
     versus: str | None = None,
     policy: Any = None,
@@ -145,19 +141,16 @@ def why(
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Explanation:
-    """Ask for each variable that a protocol varied what the episode would have been without it.
+    """Compute what an episode would have been without each variable that its protocol varied.
 
-    The episode happens again with the same noise and the same policy, which acts anew on what it
-    then sees; all other variables keep the values that were drawn.
+    The episode is run again with the same noise and the same policy, which acts on its new
+    observations; all other variables keep the values that were drawn.
 
     Args:
-        evaluation: Its table has the episode.
+        evaluation: Its table has the episode. Of several agents or backends one is chosen with
+            ``evaluation.only(agent=…, engine=…)``. Of several runs or seeds the first one is taken.
         protocol: Name of the protocol.
         episode: Number of the episode.
-        agent: Who acted; need not be said if there is one.
-        run: Number of the training run.
-        engine: On which engine; need not be said if there is one.
-        seed: Of the noise; the first one if None.
         metric: What is compared.
         versus: ``"A"``: the variable drawn from its training space; ``"default"``: left as it is
             without the protocol. If None, A where the protocol draws from elsewhere.
@@ -168,15 +161,16 @@ def why(
         progress: Told how many variables are done.
 
     Raises:
-        UnknownOption: There is no such episode, or nothing was varied in it.
-        SnapshotMismatch: The episode does not happen again bit for bit.
+        UnknownOption: There is no such episode, nothing was varied in it, or several agents or
+            backends have it.
+        SnapshotMismatch: The rerun is not bit-identical.
     """
     metric = evaluation.metric(metric)
-    agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
-    seeds = evaluation.only(agent=agent, engine=engine, protocol=protocol).columns["seed"]
-    seed = int(seeds[0]) if seed is None else seed
+    one = evaluation.only(protocol=protocol, episode=episode)
+    agent, engine = one.the("agent", None), one.the("engine", None)
+    run, seed = (int(one.columns[name][0]) for name in ("run", "seed"))
     where = {"agent": agent, "run": run, "engine": engine, "protocol": protocol, "seed": seed}
-    one = evaluation.only(**where, episode=episode)
+    one = one.only(run=run, seed=seed)
     one_of("versus", versus, (None, *VERSUS))
     found, left_out = [], {}
     with closing(

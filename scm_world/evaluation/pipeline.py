@@ -78,7 +78,6 @@ def evaluate(
     env: Mapping[str, Any] | None = None,
     workers: int | None = None,
     engine: Executor | str | None = None,
-    address: str | None = None,
     out: Location | str | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
@@ -105,7 +104,6 @@ def evaluate(
             policies that can be pickled or are named by a text.
         engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
             ``engine_of``.
-        address: Of a Ray cluster.
         out: Folder, or a URL, for what is finished; the same call goes on there after an
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
@@ -119,7 +117,7 @@ def evaluate(
             policy was trained with.
         EvaluationError: A policy gave no action, or an intervention was refused, with the place;
             all other shards are played and safe by then.
-        EngineFailure: Three workers ended over one shard, or there is no cluster at the address.
+        EngineFailure: Three workers ended over one shard.
         UnreadableFile: Somebody else is writing to the folder, or a file in it is damaged.
 
     Example:
@@ -139,7 +137,7 @@ def evaluate(
     )
     folder = None if out is None else located(out)
     with (
-        opened(engine, workers, address) as executor,
+        opened(engine, workers) as executor,
         locked(folder) if folder is not None else nullcontext(),
     ):
         rows = played(setup, executor, folder=folder, progress=progress)

@@ -62,7 +62,6 @@ def train(
     out: Path | str,
     seed: int = 0,
     backend: str = "mujoco",
-    steps: int | None = None,
     start: Path | str | None = None,
     progress: Progress | None = None,
     tell: Tell | None = None,
@@ -84,7 +83,6 @@ def train(
         out: Folder of the run.
         seed: Of everything that is drawn.
         backend: Name of the engine.
-        steps: Control steps, in place of those of the recipe.
         start: Policy to begin with: a file, the folder of a run, or one of the zoo.
         progress: Told how many steps are done, and how many there are.
         tell: Told in words what happens.
@@ -108,8 +106,6 @@ def train(
         load(module, library, "train")
     from scm_world.training import agents
 
-    if steps is not None:
-        recipe = recipe.but(steps=whole_number("steps", steps, least=1))
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
     count = None if threads is None else whole_number("threads", threads, least=1)

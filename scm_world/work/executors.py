@@ -382,26 +382,22 @@ def engine_of(
 
 
 @contextmanager
-def opened(
-    engine: Executor | str | None, workers: int | None = None, address: str | None = None
-) -> Iterator[Executor]:
-    """Hold what does jobs: what is given is left open, what is named is closed in the end.
+def opened(engine: Executor | str | None, workers: int | None = None) -> Iterator[Executor]:
+    """Give an executor: one that is passed is left open, one that is named is closed at the end.
 
     Args:
         engine: An executor, which has its workers already; or a name, see ``engine_of``.
         workers: See ``engine_of``.
-        address: Likewise.
 
     Raises:
-        UnknownOption: An executor is told how many workers it has, or where it is.
+        UnknownOption: ``workers`` are given beside an executor.
     """
     if isinstance(engine, Executor):
-        for name, value in (("workers", workers), ("address", address)):
-            if value is not None:
-                raise UnknownOption(name, value, ("None with an executor, which has its own",))
+        if workers is not None:
+            raise UnknownOption("workers", workers, ("None with an executor, which has its own",))
         yield engine
         return
-    with engine_of(engine, workers=workers, address=address) as made:
+    with engine_of(engine, workers=workers) as made:
         yield made
 
 

@@ -105,7 +105,6 @@ def test_why_within_an_episode_and_where_bodies_come() -> None:
         ({"protocol": "P0", "episode": 0}, "varies something"),
         ({"protocol": "P6", "episode": 0, "versus": "C"}, "versus"),
         ({"protocol": "P6", "episode": 0, "metric": "beauty"}, "metric"),
-        ({"protocol": "P6", "episode": 0, "run": 3}, "run"),
         ({"protocol": "P6", "episode": 0, "policy": {"typo": "still"}}, "policy"),
     ],
 )
@@ -113,3 +112,10 @@ def test_why_refuses_what_there_is_not(ask: dict[str, Any], said: str) -> None:
     """Episodes, protocols and metrics that do not exist, and episodes without causes."""
     with pytest.raises(UnknownOption, match=said):
         why(small("still"), **ask)
+
+
+def test_why_asks_of_which_agent() -> None:
+    """Where several have played the episode."""
+    several = small({"one": "still", "two": "random"}, "P6", n=1)
+    with pytest.raises(UnknownOption, match="one, two"):
+        why(several, "P6", 0)

@@ -77,7 +77,8 @@ def test_results_say_how_each_agent_acted(agents: dict[str, Any], tmp_path: Path
     found.save(tmp_path / "results", kind="csv")
     again = Evaluation.load(tmp_path / "results")
     assert check(again, episodes=len(again)).wrong == ()
-    assert why(again, "P6", 1, agent="two").others or why(again, "P6", 1, agent="two").left_out
+    found = why(again.only(agent="two"), "P6", 1)
+    assert found.others or found.left_out
 
 
 def test_finished_episodes_are_used_again(agents: dict[str, Any], tmp_path: Path) -> None:

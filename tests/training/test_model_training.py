@@ -57,7 +57,7 @@ def test_an_agent_is_trained_evaluated_and_goes_on(tmp_path: Path, kind: str) ->
     found = evaluate(folder, "A,B", task=task, n=2)
     assert found.task == task
     assert found.metric() == metric
-    longer = train(made, out=folder, steps=512)
+    longer = train(made.but(steps=512), out=folder)
     assert longer.steps == 512
     with pytest.raises(UnreadableFile, match="other work"):
         train(made.but(gamma=0.9), out=folder)

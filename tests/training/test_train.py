@@ -68,10 +68,11 @@ class Killed(BaseException):
     """The power is gone."""
 
 
-def run(name: str | Recipe, out: Path, **options: Any) -> Any:
+def run(name: str | Recipe, out: Path, steps: Any = None, **options: Any) -> Any:
     """Train a little."""
     given = {"out": out, "backend": "fake", "threads": 1, "seed": 3, **options}
-    return train(RECIPES[name] if isinstance(name, str) else name, **given)
+    how = RECIPES[name] if isinstance(name, str) else name
+    return train(how.but(steps=steps), **given)
 
 
 def killed(name: str, out: Path, patch: pytest.MonkeyPatch, after: int) -> None:
@@ -418,7 +419,7 @@ def test_without_the_library_it_says_what_to_install(
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"steps": 0}, "steps"),
     ({"steps": 10}, "at least 32"),
-    ({"steps": "many"}, "many"),
+    ({"steps": "many"}, "steps"),
     ({"seed": -1}, "seed"),
     ({"seed": 2**32}, "from 0 to 4294967295"),
     ({"threads": 0}, "threads"),

@@ -154,9 +154,8 @@ def test_an_executor_is_left_open() -> None:
         with opened(executor) as same:
             assert same is executor
         assert executor._do is not None
-        for given in ({"workers": 2}, {"address": "auto"}):
-            with pytest.raises(UnknownOption, match="has its own"), opened(executor, **given):
-                pass
+        with pytest.raises(UnknownOption, match="has its own"), opened(executor, 2):
+            pass
     with opened("process", 1) as other:
         assert isinstance(other, Executor)
         list(other.run(make, [Task(1)]))

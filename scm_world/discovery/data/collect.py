@@ -52,7 +52,6 @@ def collect(
     progress: Progress | None = None,
     workers: int | None = None,
     engine: Executor | str | None = None,
-    address: str | None = None,
     **circumstances: Unpack[Circumstances],
 ) -> Dataset:
     """Let episodes happen under a design, and write them down as a table with regimes.
@@ -76,7 +75,6 @@ def collect(
             engine it is as many as there are cores.
         engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
             ``engine_of``. A laboratory, which keeps books, has the first one only.
-        address: Of a Ray cluster.
         circumstances: ``steps`` of an episode, 25 in a world. Of a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
             or ``Outcome``), and ``every_step``: a row for each control step, with the action.
@@ -91,7 +89,7 @@ def collect(
         UnreadableFile: The folder holds something else, or a damaged file.
         UnwritableFolder: There is no room, or no permission; nothing is lost.
         UnknownOption: An argument does not fit, or other processes cannot have the source.
-        EngineFailure: Three workers ended over one shard, or there is no cluster at the address.
+        EngineFailure: Three workers ended over one shard.
 
     Example:
         >>> from scm_world.queries import World
@@ -117,7 +115,7 @@ def collect(
     head = Head(about, made.columns, count, size, format, made.edges)
     if out is not None:
         folder = Folder(out, head, design.modules)
-    with opened(engine, workers, address) as executor:
+    with opened(engine, workers) as executor:
         if isinstance(source, Laboratory) and not isinstance(executor, Serial):
             allowed = ("'serial' with one worker: a laboratory keeps its books in one process",)
             raise UnknownOption("engine of work", executor.engine, allowed)

@@ -281,7 +281,6 @@ def sweep(
     format: str = "parquet",  # noqa: A002 # as other libraries call it
     workers: int | None = None,
     engine: Executor | str | None = None,
-    address: str | None = None,
     progress: Progress | None = None,
     **setting: Any,
 ) -> Swept:
@@ -302,7 +301,6 @@ def sweep(
         format: Of these files: ``"parquet"`` or ``"csv"``.
         workers: See ``collect``.
         engine: Likewise.
-        address: Likewise.
         progress: Called with how many episodes are done, and how many there will be.
         setting: ``policy``, ``nature``, ``steps`` and ``seed``; see ``Setting``. By default the
             actions of a world are random, those of a causal model zero.
@@ -342,7 +340,6 @@ def sweep(
             progress=progress,
             workers=workers,
             engine=engine,
-            address=address,
         )
     except FewerEpisodes as error:
         there = error.there // len(points)
