@@ -14,7 +14,7 @@ allowed and what to do::
     │   ├── OutOfBounds          physically impossible
     │   ├── OutOfSpace           possible, but outside the space that was asked for
     │   ├── ConflictingTargets   two names of one quantity in the same do()
-    │   ├── ClosesCycle          a mechanism that makes variables cause one another at once
+    │   ├── ClosesCycle          a mechanism that makes variables cause one another at lag 0
     │   ├── Infeasible           two bodies in one place, or a body outside the arena
     │   └── SeveralProblems      more than one of the above
     ├── CyclicModel              a causal model with contemporaneous cycles (a ModelError)

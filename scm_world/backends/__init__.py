@@ -33,9 +33,9 @@ Kind = TypeVar("Kind", bound=type[Backend])
 
 
 def register(kind: Kind) -> Kind:
-    """Make a backend of one's own known by its ``name``, wherever an engine is named by a text.
+    """Register a custom backend by its ``name``, for every place that takes the name of a backend.
 
-    It can decorate the class. Processes that are started anew know it if the module that
+    It can decorate the class. New processes know it if the module that
     registers it is imported there: put it at the top level of that module.
 
     Args:

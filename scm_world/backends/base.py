@@ -264,7 +264,7 @@ class OneByOne(EngineBatch):
 class BackendWrapper(Backend, ABC):
     """Asks another engine for everything; derive from it and override what should differ.
 
-    A class of one's own needs a ``name``. If it remembers something between two steps, it has to
+    A custom class needs a ``name``. If it remembers something between two steps, it has to
     be forgotten in ``build`` and to be a part of ``snapshot`` and ``restore``.
 
     Args:

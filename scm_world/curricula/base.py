@@ -230,7 +230,7 @@ AnyPart = Annotated[
     PlainValidator(as_part),
     PlainSerializer(lambda part: part.model_dump(mode="json"), return_type=dict),
 ]
-"""A part of any kind, told apart by its ``kind``."""
+"""A part; its ``kind`` says which."""
 
 
 def words(option: str, given: Any) -> tuple[str, ...]:

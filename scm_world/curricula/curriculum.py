@@ -29,7 +29,7 @@ class Curriculum(Frozen):
 
     Attributes:
         part: What is done in which situation.
-        space: A part of the parameter space that every intervention is held against, if any.
+        space: A part of the parameter space that every intervention has to lie in, if any.
 
     Example:
         >>> from scm_world.curricula import during, resample, together

@@ -54,7 +54,7 @@ class CurriculumRunner:
         Args:
             env: At the beginning of an episode.
             episode: Its number; as many as have ended if None.
-            besides: Variables that are left as they are in this episode, in whatever coordinates.
+            besides: Variables that are left as they are in this episode, in any coordinates.
 
         Returns:
             Whether anything was done.

@@ -228,7 +228,7 @@ def benchmark(
 ) -> BenchmarkResult:
     """Run learners on problems and score the estimated graphs.
 
-    With ``out`` every run is a file of its own, written whole or not at all. A benchmark that was
+    With ``out`` every run is a separate file, written whole or not at all. A benchmark that was
     interrupted or killed resumes with the same call: at most the unfinished runs are lost.
 
     Args:
@@ -245,7 +245,7 @@ def benchmark(
         workers: How many runs are done at the same time; the graphs do not depend on it. None is
             one; with an engine it is as many as there are cores.
         engine: ``"process"``, ``"serial"``, ``"ray"``, or an executor; see ``engine_of``. A run has
-            a process of its own on all of them, which ends at the timeout. On Ray each worker
+            a separate process on all of them, which ends at the timeout. On Ray each worker
             collects data for itself, and keeps no file of them.
         progress: Called with (done, planned) after each run.
 
@@ -516,7 +516,7 @@ def _run_here(
 
 @final
 class _Isolated:
-    """Does jobs in a process of its own, which is replaced if one takes longer than the timeout."""
+    """Runs jobs in a separate process, which is replaced if one takes longer than the timeout."""
 
     def __init__(self, timeout: float | None) -> None:
         self._timeout = None if timeout is None else min(timeout, LONGEST)
@@ -582,7 +582,7 @@ class _Runner:
             _as_json(run.as_dict())  # what cannot be written has failed
         except MissingExtra:
             raise
-        except Exception as error:  # of whatever kind: learners are not all ours
+        except Exception as error:  # of any kind: custom learners may raise anything
             seconds, said = time.perf_counter() - started, in_one_line(error)
             return replace(job.run, status="failed", message=said, seconds=seconds)
         return run

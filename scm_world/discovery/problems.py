@@ -45,7 +45,7 @@ WEAKEST, STRONGEST = 0.5, 2.0  # absolute weights, uniform between them; the sig
 PER_NODE = 2  # edges per node of the static families
 MOST = 1000  # variables
 DONE = Normal(mean=2.0, std=1.0)
-"""What interventions draw in random models unless told otherwise: another mean, the same spread."""
+"""What interventions draw in random models by default: another mean, the same spread."""
 
 
 def random_model(name: str, seed: int = 0) -> SCM:
@@ -190,7 +190,7 @@ class Problem(Protocol):
         """
 
     def held_out(self, seed: int) -> Dataset | None:
-        """Collect rows under interventions that no learner sees; None where there are none."""
+        """Collect rows under interventions that no learner is given; None where there are none."""
 
     def simulator(self, seed: int) -> PairedSimulator:
         """Return the paired simulator of the problem."""
@@ -228,7 +228,7 @@ class SCMProblem:
         return collect(self._scm, design, episodes, seed=seed, **steps, **options)
 
     def held_out(self, seed: int) -> Dataset | None:
-        """Set each variable in turn to 2, which no learner sees; None if one cannot be 2."""
+        """Set each variable in turn to 2, which no learner is given; None if one cannot be 2."""
         if self._steps is not None or any(act != DONE for act in self._values.values()):
             return None
         design = Design("single", tuple(self._values), 2.0, 0.0)

@@ -1,4 +1,4 @@
-"""Actions that are relative to where the robot is, or to what it was told last."""
+"""Actions that are relative to where the robot is, or to the last command."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Delta:
         if not 0.0 < share <= 1.0:
             raise UnknownOption("delta_scale", scale, ("a number in (0, 1]",))
         one_of("delta_origin", origin, ORIGINS)
-        # Normalized actions fill [-1, 1] whatever the scale is; others keep their unit.
+        # Normalized actions fill [-1, 1] at every scale; others keep their unit.
         normalized = bool(np.any(half != 1.0) or np.any(middle != 0.0))
         reach = (self._high - self._low) / 2.0
         self._gain, self._reach = (share, reach) if normalized else (1.0, share * reach)

@@ -232,7 +232,7 @@ def check(
             is no file and has no name.
         task: If it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
-        progress: Told how many are done.
+        progress: Called with how many are done.
 
     Raises:
         SnapshotMismatch: It was made with other versions.

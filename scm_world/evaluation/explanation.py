@@ -158,7 +158,7 @@ def why(
             what is no file and has no name.
         task: Where, if it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
-        progress: Told how many variables are done.
+        progress: Called with how many variables are done.
 
     Raises:
         UnknownOption: There is no such episode, nothing was varied in it, or several agents or
@@ -249,12 +249,12 @@ def _no_answer(
     ]
     gone = [n for n in row.drawn if n != name and n not in then.drawn]
     if changed or gone:
-        return f"{', '.join((*changed, *gone))} would have been drawn anew with it"
+        return f"{', '.join((*changed, *gone))} would have been drawn again with it"
     return SAME if one.was == one.would_be else ""
 
 
 def _versus(runner: EpisodeRunner, usual: Mapping[str, Any], name: str, row: EpisodeRow) -> str:
-    """Say what a variable is held against: A, unless it lies there already."""
+    """Choose what a variable is compared with: A, unless its value lies in A already."""
     model = runner.env.world.model
     if name not in model:
         return "default"

@@ -107,7 +107,7 @@ def evaluate(
         out: Folder, or a URL, for what is finished; the same call goes on there after an
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
-        progress: Told how many episodes are done, and how many there are.
+        progress: Called with how many episodes are done, and how many there are.
 
     Returns:
         The table of all episodes, and what follows from it.
@@ -158,7 +158,7 @@ def played(
         setup: Of the evaluation.
         executor: Plays the shards; this process if None.
         folder: For what is finished.
-        progress: Told how many episodes are done, and how many there are.
+        progress: Called with how many episodes are done, and how many there are.
     """
     shards = setup.shards()
     keys = [setup.key(shard) if folder is not None else "" for shard in shards]

@@ -96,7 +96,7 @@ def paired(one: Columns, other: Columns, metric: str) -> Interval:
 
 
 def digest_of(columns: Columns) -> str:
-    """Sum up a table, bit for bit, in whatever order its columns are."""
+    """Return a digest of a table; the order of its columns does not matter."""
     found = blake2b(digest_size=16)
     for name in sorted(columns):
         column = columns[name]
@@ -142,7 +142,7 @@ class Evaluation:
 
     @cached_property
     def digest(self) -> str:
-        """A word that sums up the table, bit for bit, in whatever order its columns are."""
+        """Digest of the table; the order of its columns does not matter."""
         return digest_of(self.columns)
 
     # --- what there is ------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from scm_world.queries.plans import PACKAGE
 from scm_world.tasks import TASKS, Task, make_task, tasks
 
 SHARD = 25
-"""Episodes that are played and written down at once."""
+"""Episodes that are played and written in one piece."""
 
 _MINE = ("task", "backend", "render_mode")
 """Options of the environment that an evaluation sets by itself."""

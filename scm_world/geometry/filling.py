@@ -284,7 +284,7 @@ def overlap_fraction(
     """Compute how much of the volume that the goals cover the blocks cover, too.
 
     It is the volume of what lies in a goal and in a block, divided by the volume of what lies in
-    a goal. Nothing counts twice, whatever intersects, and the result is exact to rounding.
+    a goal. Nothing counts twice where bodies intersect, and the result is exact to rounding.
 
     Args:
         sizes: Full edge lengths of the blocks, shape (n, 3) [m].

@@ -238,7 +238,7 @@ def _polyhedron(cloud: Floats) -> tuple[Floats, Integers, Floats]:
         planes.append([*normal, float(np.max(vertices @ normal))])
     edges = {(f[k], f[(k + 1) % 3]) for f in faces for k in range(3)}
     if len(edges) != 3 * len(faces) or any((q, p) not in edges for p, q in edges):
-        raise ModelError(  # some sides were too thin to be told apart
+        raise ModelError(  # some sides are thinner than the resolution
             ["corners of the mesh nearly coincide, so that it has no clean surface; merge them"]
         )
     return vertices, np.array(faces, dtype=np.int64), np.array(planes)

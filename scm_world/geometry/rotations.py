@@ -69,7 +69,7 @@ def quaternion_product(p: ArrayLike, q: ArrayLike) -> Floats:
         q: Shape (..., 4), broadcast against ``p``.
 
     Returns:
-        Hamilton's product, shape (..., 4), with whatever sign and length it has.
+        Hamilton's product, shape (..., 4), of any sign and length.
 
     Example:
         >>> quarter = from_rotation_vector([0.0, 0.0, np.pi / 2])

@@ -45,7 +45,7 @@ def to_dict(model: SCM) -> dict[str, Any]:
     """Return a model as plain data.
 
     Raises:
-        ModelError: A mechanism is a lambda or another function without a name of its own.
+        ModelError: A mechanism is a lambda or another function without a name.
     """
     check_portable(_functions(model.variables, model.interventions))
     return {

@@ -244,7 +244,7 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
             problems.extend(_parent_problems(variable, _own(causes), by_name))
         problems.extend(_variable_problems(variable, by_name))
         problems.extend(_bundle_problems(variable, by_name))
-    if problems:  # of parents that there are, cycles are told as well
+    if problems:  # cycles among declared parents are reported, too
         for name, causes in parents.items():
             parents[name] = tuple(parent for parent in causes if parent.name in by_name)
     try:

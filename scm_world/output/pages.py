@@ -1,7 +1,7 @@
 """Pages of results: each is one HTML file that needs nothing else, and no network.
 
 Pages are jinja2 templates that extend ``output/page.html`` and use the macros of
-``output/parts.html``. Whatever a template is given is escaped.
+``output/parts.html``. All values of a template are escaped.
 """
 
 from __future__ import annotations

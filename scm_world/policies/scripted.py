@@ -26,7 +26,7 @@ Policy = Callable[[Any], Any]
 class Random(Blind):
     """Actions drawn uniformly, from the noise of the episode.
 
-    Two worlds with the same noise get the same actions, whatever else differs between them.
+    Two worlds with the same noise get the same actions, even if everything else differs.
 
     Attributes:
         share: Of the range of actions, around its middle.

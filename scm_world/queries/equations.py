@@ -1,4 +1,4 @@
-"""Equations that are stepped without a backend: what a world is, for a causal model alone."""
+"""Causal models without a backend, stepped like a world."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Layout(ActionVector):
                     system.step(system.idle())
             wanted = np.array([one.vector for one in alone])
             return np.allclose(both.vector, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
-        except Exception:  # whatever a function says to a shape that it does not know
+        except Exception:  # functions may raise anything for a shape that they do not take
             return False
 
     def read(self, name: str, vectors: Floats) -> Value:
@@ -210,7 +210,7 @@ class Equations:
             request: Interventions by name; of several episodes, such requests by group.
 
         Returns:
-            What was requested and applied, and what followed at once.
+            What was requested and applied, and what followed at lag 0.
 
         Raises:
             InterventionError: The request was refused; everything is as before.
@@ -333,7 +333,7 @@ class Equations:
         return value
 
     def _in_order(self) -> tuple[str, ...]:
-        """Give an order in which everything can be computed, whatever is done in each group."""
+        """Return an order in which every group can be computed under its interventions."""
         if self._order is None:
             models = dict.fromkeys(map(id, (self.model, *self._models)))
             kept = [m for m in (self.model, *self._models) if models.pop(id(m), 0) is None]

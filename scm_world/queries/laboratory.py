@@ -98,7 +98,7 @@ class Journal:
 
     @property
     def next_unit(self) -> int:
-        """Number of the first episode that was not lived yet."""
+        """Number of the first episode that has not been run yet."""
         return sum(r.episodes for r in self.records if not r.kind.endswith("counterfactual"))
 
     def write(self, kind: str, samples: Samples, *, at: int = 0, row: int | None = None) -> None:
@@ -322,8 +322,8 @@ class Laboratory:
         names = tuple(dict.fromkeys(outcome.name for outcome in self.outcomes))
         with self._lock:
             self._permit("counterfactual", request, 1)
-            lived = (r for r in self._journal.records if r.kind in ("see", "do"))
-            known = next((r for r in lived if unit in r.samples.numbers), None)
+            done = (r for r in self._journal.records if r.kind in ("see", "do"))
+            known = next((r for r in done if unit in r.samples.numbers), None)
             if known is None:
                 last = self._journal.next_unit
                 there = f"units 0 to {last - 1}" if last else "none yet: see or do something first"

@@ -1,4 +1,4 @@
-"""The questions that every causal model answers, with a backend or without one."""
+"""The questions that worlds and causal models answer."""
 
 from __future__ import annotations
 
@@ -90,9 +90,9 @@ class Questions(ABC):
         """Run an episode and return its counterfactual: an intervention, with the same noise.
 
         Args:
-            do: What is done; without a time it is done at the instant ``at``.
+            do: The intervention; without a time it takes place at the instant ``at``.
             at: Number of the control step.
-            actions: ``"replay"`` for the same actions, or a policy that chooses anew from there.
+            actions: ``"replay"`` for the same actions, or a policy that acts from there on.
             policy: Of the episode; see ``rollout``, also for what follows.
             seed: Of the noise.
             episode: Number of the episode within that noise.
@@ -134,7 +134,7 @@ class Questions(ABC):
             outcomes: Names of variables (their final values), ``Outcome`` or functions of the
                 episode; see ``usual_outcomes`` if None.
             first: Number of the first one; unit i is the same in every question with one seed.
-            progress: Told after each episode how many are done, and how many there will be.
+            progress: Called after each episode with how many are done, and how many there will be.
             setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
                 By default the actions of a world are random, those of an SCM zero.
 
@@ -170,10 +170,10 @@ class Questions(ABC):
             outcome: The name of a variable (its final value), an ``Outcome``, or a function of the
                 episode that gives numbers.
             do: What is done.
-            versus: What it is held against; nothing if None.
+            versus: The intervention it is compared with; none if None.
             n: How many units.
-            paired: Whether the same units live through both, with the same noise.
-            progress: Told after each episode.
+            paired: Whether both are run on the same units, with the same noise.
+            progress: Called after each episode.
             setting: See ``sample``.
 
         Returns:
@@ -206,7 +206,7 @@ class Questions(ABC):
             name: Of the variable.
             values: Two or more.
             n: How many units.
-            progress: Told after each episode.
+            progress: Called after each episode.
             setting: See ``sample``.
         """
         if len(values) < 2:
@@ -241,11 +241,11 @@ class Questions(ABC):
         Args:
             outcome: As in ``effect``.
             do: What is done.
-            versus: What it is held against; nothing if None.
+            versus: The intervention it is compared with; none if None.
             by: The covariate: like an outcome, one number; read off the world of ``versus``.
             bins: Into how many groups of equal size the units are sorted.
             n: How many units, over all groups.
-            progress: Told after each episode.
+            progress: Called after each episode.
             setting: See ``sample``.
 
         Returns:
@@ -281,8 +281,8 @@ class SCM(Questions, graph.SCM):
     a directed acyclic graph; edges of lag 1 reach from one control step into the next.
 
     A model without lagged edges has episodes of one instant. One with lagged edges begins where
-    its variables have their ``start`` or default, and takes as many control steps as it is told; a
-    variable with noise, or a distribution, is drawn anew in each of them.
+    its variables have their ``start`` or default, and has ``steps`` control steps; a variable with
+    noise, or a distribution, is drawn in each of them.
 
     Args:
         variables: The declarations, or a model of ``scm_world.graph``.
@@ -317,7 +317,7 @@ class SCM(Questions, graph.SCM):
 
     @property
     def graph(self) -> Self:
-        """The causal model, which is this one; of a ``World`` it is told from the backend."""
+        """The causal model: this one. A ``World`` has one beside its backend."""
         return self
 
     def given(self, do: Mapping[str, Any]) -> Self:

@@ -202,7 +202,7 @@ def sample(
         outcomes: What to read off: names of variables, ``Outcome`` or functions of the episode.
         setting: The circumstances.
         first: Number of the first episode.
-        progress: Told after each episode.
+        progress: Called after each episode.
     """
     count = whole_number("n", n, least=1)
     given = (outcomes,) if isinstance(outcomes, str | Outcome) else outcomes

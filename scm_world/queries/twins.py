@@ -1,4 +1,4 @@
-"""Copies of a world on which questions are tried out."""
+"""Copies of a world on which questions are run."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Twins:
 
     @contextmanager
     def twin(self) -> Iterator[Simulation]:
-        """Lend a twin; it is given back afterwards, in whatever state."""
+        """Lend a twin; it may be given back in any state."""
         with self._lock:
             world = self._free.pop() if self._free else self._make()
         try:
@@ -131,7 +131,7 @@ def threaded(work: Callable[[T], R], items: Iterable[T], workers: int) -> list[R
 
 @final
 class EquationTwins:
-    """Where questions to a causal model without a backend are tried out.
+    """Where questions to a causal model without a backend are run.
 
     Args:
         model: With the interventions that hold in every episode.
@@ -161,7 +161,7 @@ _TWINS: WeakKeyDictionary[Simulation, Twins] = WeakKeyDictionary()
 
 
 def twins_of(world: Simulation) -> Twins:
-    """Give the twins of a world; it lives as long as the world."""
+    """Return the twins of a world; they are freed with it."""
     found = _TWINS.get(world)
     if found is None:
         found = _TWINS[world] = Twins(world)

@@ -102,7 +102,7 @@ class Undeclared(Report):
 
 @final
 class Verification(Report):
-    """A declared graph, held against the physics that is said to have it.
+    """The result of comparing a declared graph with the physics.
 
     Attributes:
         format: Of the file.

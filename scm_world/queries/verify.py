@@ -51,9 +51,9 @@ def verify(
 ) -> Verification:
     """Check a declared graph against the physics or the equations that realise it.
 
-    From many probe states one variable at a time is changed, everything else kept, and whatever
-    differs afterwards is held against the declared edges. It ends when every declared edge was
-    seen. It may be interrupted (Ctrl-C); the report then covers the probe states that were
+    From many probe states one variable at a time is changed, everything else kept, and all
+    differences afterwards are compared with the declared edges. It ends when every declared edge
+    was observed. It may be interrupted (Ctrl-C); the report then covers the probe states that were
     finished.
 
     A graph that was generated from a model says what can act on what; some of its edges may never

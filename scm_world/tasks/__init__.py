@@ -45,9 +45,9 @@ Kind = TypeVar("Kind", bound=type[Task])
 
 
 def register(kind: Kind) -> Kind:
-    """Make a task of one's own known by its ``name``, wherever a task is named by a text.
+    """Register a custom task by its ``name``, for every place that takes the name of a task.
 
-    It can decorate the class. Processes that are started anew know it if the module that
+    It can decorate the class. New processes know it if the module that
     registers it is imported there: put it at the top level of that module.
 
     Args:

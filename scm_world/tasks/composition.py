@@ -176,7 +176,7 @@ class Entity(ABC):  # every hook has a sensible empty default
 
 
 class Commands(ABC):
-    """What turns an action into what the engine is told, where they are not the same."""
+    """The conversion of an action into a command of the backend, where they differ."""
 
     @abstractmethod
     def applies(self, values: Values) -> bool:
@@ -232,7 +232,7 @@ class Composition(ABC):
 
     @abstractmethod
     def empty_state(self) -> Any:
-        """Give a state to read into; it is the same in whatever structure."""
+        """Return a state to read into; it is the same in every structure."""
 
     def timestep(self, values: Values) -> float:
         """Give the physics step [s]."""

@@ -35,7 +35,7 @@ class Common(TypedDict, total=False):
         fractional_reward_weight: Weight of the fractional success.
         dense_reward_weights: Weights of the dense terms, in their order.
         activate_sparse_reward: The same as ``weights="sparse"``.
-        terms: Further reward terms: names of ``ready_terms`` of the task, or terms of one's own,
+        terms: Further reward terms: names of ``ready_terms`` of the task, or custom terms,
             ``Measured`` variables with a mechanism, whose names begin with ``reward.``; their
             weights stand in ``weights``.
         joint_positions: Where the robot begins, shape (9,) [rad].

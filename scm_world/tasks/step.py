@@ -33,8 +33,8 @@ from scm_world.variables import (
 class ProcessNoise(Commands):
     """Draws the noise of each control step, which the step function is given.
 
-    A draw depends on seed, episode, control step and name only: it is the same whatever is
-    intervened on.
+    A draw depends on seed, episode, control step and name only: interventions on other
+    variables do not change it.
 
     Args:
         sources: What is drawn from, by name.

@@ -270,7 +270,7 @@ def check_model(
     """Run all checks on a model.
 
     Args:
-        source: Whatever ``World`` takes: a path, XML text, a task.
+        source: What ``World`` takes: a path, XML text, a task.
         backend: Name of the engine.
         steps: With random actions and interventions.
         options: Of ``World.from_mjcf``.

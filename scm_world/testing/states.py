@@ -63,7 +63,7 @@ class StateConformance(Suite):
         assert same(results[0], results[1])
 
     def test_orientations_stay_unit_quaternions(self, backend: Backend) -> None:
-        """Orientations have length one and w >= 0 whatever happens."""
+        """Orientations have length one and w >= 0 at every instant."""
         states = play(backend, 60, mode=ControlMode.JOINT_TORQUES)
         for vector in states:
             orientations = backend.state().with_vector(vector).orientations

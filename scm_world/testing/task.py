@@ -178,7 +178,7 @@ class TaskConformance(WorldConformance):
 
     @pytest.mark.parametrize("space", _SPACES)
     def test_spaces_lie_within_bounds(self, world: Simulation, space: SpaceName) -> None:
-        """Whatever is drawn from A or B, in any coordinates, is possible."""
+        """Every draw from A or B, in any coordinates, is possible."""
         values, noise = world.values(), Noise(SEED)
         for variable in world.model.variables:
             source = variable.space(space)

@@ -424,8 +424,8 @@ class Watch(BaseCallback):
         folder: Of the run.
         backend: Name of the engine, for evaluations.
         card: What is said of the policy.
-        progress: Told how many steps are done.
-        tell: Told in words what happens.
+        progress: Called with how many steps are done.
+        tell: Called with a sentence about each event.
         every: Seconds between checkpoints.
 
     Attributes:

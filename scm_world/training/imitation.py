@@ -537,8 +537,8 @@ def clone(
         out: Folder for all files.
         seed: Of everything that is drawn.
         backend: Name of the engine.
-        progress: Told how many episodes have been shown, and how many will be.
-        tell: Told in words what happens.
+        progress: Called with how many episodes have been shown, and how many will be.
+        tell: Called with a sentence about each event.
 
     Returns:
         Where its policies are.

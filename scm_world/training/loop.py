@@ -84,8 +84,8 @@ def train(
         seed: Of everything that is drawn.
         backend: Name of the engine.
         start: Policy to begin with: a file, the folder of a run, or one of the zoo.
-        progress: Told how many steps are done, and how many there are.
-        tell: Told in words what happens.
+        progress: Called with how many steps are done, and how many there are.
+        tell: Called with a sentence about each event.
         device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one.
         threads: Of the engine and of torch. None: as many as there are cores for the engine,
             whose results do not depend on it, and one for torch, whose last bits do.
@@ -233,7 +233,7 @@ def open_folder(
         form: Format of that file.
         identity: What decides what comes out, as plain data.
         card: The same, and versions.
-        tell: Told which versions are others than before.
+        tell: Called with the versions that have changed.
         may_grow: Whether there may be fewer steps in the folder.
 
     Raises:

@@ -20,7 +20,7 @@ except ImportError as error:
     raise MissingExtra("stable-baselines3", "train") from error
 
 USUAL = ("is_success",)
-"""What is told of ``info`` by default, where the task has it."""
+"""Keys of ``info`` that are passed on by default, where the task has them."""
 
 
 def make_sb3(
@@ -47,13 +47,13 @@ class Sb3VecEnv(VecEnv):
 
     Args:
         envs: With ``autoreset_mode="SameStep"``; wrappers of Gymnasium may be around it.
-        infos: What is told of ``info`` at every step; all of it if None. Building dictionaries
-            takes time: the algorithms read ``is_success`` alone, besides what ends an episode.
+        infos: Keys of ``info`` that are passed on at every step; all if None. Building dictionaries
+            takes time; the algorithms read ``is_success`` and the keys that end an episode.
 
     Attributes:
         worlds: For all that Stable-Baselines3 knows nothing of: ``do``, ``branch``, …
         executor: What simulates them.
-        names: What is told of ``info`` at every step; all of it if None.
+        names: Keys of ``info`` that are passed on at every step; all if None.
 
     Raises:
         UnknownOption: Episodes do not begin in the step that ends the last one, or nothing in
@@ -90,23 +90,23 @@ class Sb3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Advance all of them one control step; what is done begins anew at once."""
+        """Advance all of them one control step; environments that are done are reset."""
         observations, rewards, terminated, truncated, infos = self.worlds.step(self._actions)
         done = terminated | truncated
-        told = _rows(infos, self.names, self.num_envs)
-        for info in told:
+        rows = _rows(infos, self.names, self.num_envs)
+        for info in rows:
             info["TimeLimit.truncated"] = False
         if done.any():
             begun = _rows(infos, None, self.num_envs)
             ended = _rows(infos["final_info"], self.names, self.num_envs)
             for index in np.flatnonzero(done).tolist():
                 self.reset_infos[index] = begun[index]
-                told[index] = {
+                rows[index] = {
                     **ended[index],
                     "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
                     "terminal_observation": infos["final_obs"][index],
                 }
-        return observations, rewards.astype(np.float32), done, told
+        return observations, rewards.astype(np.float32), done, rows
 
     def close(self) -> None:
         """Free what simulates."""
@@ -139,7 +139,7 @@ class Sb3VecEnv(VecEnv):
 
 
 def _rows(infos: Mapping[str, Any], names: Sequence[str] | None, size: int) -> list[dict[str, Any]]:
-    """Give every world its own dictionary of what all of them told.
+    """Split the batched ``infos`` into one dictionary for each environment.
 
     Example:
         >>> _rows({"x": np.array([1.0, 2.0]), "_x": np.array([True, True])}, None, 2)

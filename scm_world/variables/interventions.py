@@ -39,7 +39,7 @@ def _without_bundle(data: dict[str, Any]) -> dict[str, Any]:
 
 @final
 class Hard(Frozen):
-    """Set a variable to a value, whatever its parents say."""
+    """Set a variable to a value, independently of its parents."""
 
     kind: Literal["hard"] = "hard"
     value: Number

@@ -51,7 +51,7 @@ class Parent(Frozen):
 
     Attributes:
         name: The cause.
-        lag: 0 where the cause acts at once, 1 where it acts one control step later.
+        lag: 0 where the cause acts within the instant, 1 where it acts one control step later.
         when: Under which condition the edge holds, None for always: ``"contact"`` while the
             bodies are in one contact island, ``"set"`` at the start of an episode and at the
             instant of an intervention.
@@ -191,7 +191,7 @@ class Variable(Frozen):
         """Give one of the declared spaces, or their union; None where it is not declared.
 
         Whole numbers that lie in both are left out of B; of a continuum, the border stays in the
-        set and is told apart by ``in_space``.
+        set and is distinguished by ``in_space``.
         """
         match name:
             case "A":
@@ -334,7 +334,7 @@ class Measured(Variable):
         settable_state: Whether ``do`` may set it at an instant.
         default: The value at the start of an episode, for a state without ``start``.
         start: The value at the start as a function of the parents with ``when="set"``.
-        carry: How an intervention on a parent with ``when="set"`` moves a state at once:
+        carry: How an intervention on a parent with ``when="set"`` moves a state at lag 0:
             a function of (the present value, those parents before, those parents after).
         restart: Those parents with ``when="set"`` that, when set, give it the value of ``start``.
     """
@@ -408,7 +408,7 @@ class Fixed(Variable):
 AnyVariable = Annotated[
     Exogenous | Derived | Measured | Action | Fixed, Field(discriminator="kind")
 ]
-"""Any declaration, told apart by its ``kind``."""
+"""Any declaration; its ``kind`` says which."""
 
 
 def names(parents: Sequence[Parent], *, lag: int | None = None) -> tuple[str, ...]:

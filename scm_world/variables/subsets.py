@@ -19,7 +19,7 @@ from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Box, Frozen, Space
 
 Region = SpaceName | Space
-"""A declared space by its name, or a set of one's own."""
+"""A declared space by its name, or a custom set."""
 
 
 @final
@@ -27,7 +27,7 @@ class Subset(Frozen):
     """A part of the parameter space.
 
     Every part names variables by a pattern (``*`` and ``?`` stand for any letters) and says where
-    they may lie: in a declared space by its name, in a set of one's own, or nowhere (None): then
+    they may lie: in a declared space by its name, in a custom set, or nowhere (None): then
     they are not to be set. For each variable the last part counts whose pattern fits its name; a
     variable that none fits is not to be set.
 
@@ -147,11 +147,11 @@ AB = Subset("A|B")
 """The union of the two."""
 
 AnyRegion = SpaceName | Subset
-"""What an intervention can be held against."""
+"""A space that interventions have to lie in."""
 
 
 def as_region(option: str, given: Any) -> AnyRegion | None:
-    """Read what interventions are held against: a name, a subset, or what makes one.
+    """Read the space that interventions have to lie in: a name, a subset, or its parts.
 
     Args:
         option: Its name, for the error.

@@ -1,1 +1,1 @@
-"""Work in processes of its own, with one thread each."""
+"""Executors: jobs in this process, in others, or on Ray."""

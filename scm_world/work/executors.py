@@ -38,8 +38,8 @@ SHOWN = 5  # failed jobs that an error lists
 class Bag(Generic[Job]):
     """Jobs, and the places of those that wait.
 
-    A job that fails, or that takes its process with it again and again, is put aside. Those that
-    were put aside are told of when nothing else is left to do: no job is in another one's way.
+    A job that fails, or that repeatedly ends its process, is put aside. Those that
+    were put aside are reported when no other job is left.
 
     Args:
         jobs: All of them.
@@ -324,7 +324,7 @@ class Processes(Executor):
                 self._busy[pipe] = (worker, number)
 
     def close(self) -> None:
-        """End the processes at once, whatever they are doing."""
+        """Kill the processes."""
         for worker in self._workers:
             worker.stop()
         self._idle = list(self._workers)

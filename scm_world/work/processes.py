@@ -209,7 +209,7 @@ class Worker:
             return self.answer()
         except Exception:
             raise
-        except BaseException:  # Ctrl-C, at whatever moment: nobody waits for the answer any more
+        except BaseException:  # Ctrl-C, at any moment: nobody waits for the answer any more
             self.stop()
             raise
 
@@ -371,7 +371,7 @@ def answered(make: bytes, things: list[object], method: str, given: bytes) -> by
         how = FAILED
         result = getattr(things[0], method)(*pickle.loads(given))  # noqa: S301 # as above
         return bytes(ForkingPickler.dumps((DONE, result)))
-    except Exception as error:  # told to the process that asked
+    except Exception as error:  # reported to the calling process
         return bytes(ForkingPickler.dumps((how, _portable(error))))
 
 
@@ -390,7 +390,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def _end_with_parent() -> None:
-    """End this process, whatever it is doing, when the one that started it is no more."""
+    """End this process when the one that started it has ended."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -81,7 +81,7 @@ def answer(luggage: Luggage, job: bytes) -> bytes:
 
 
 def _prepared(luggage: Luggage) -> EngineFailure | None:
-    """Make room for another bag of jobs."""
+    """Check versions and free memory for other jobs."""
     mine = versions()
     others = [name for name, version in luggage.versions.items() if mine[name] != version]
     if others:

@@ -157,7 +157,7 @@ class WorldAttributes:
         return self.compiled.describe(values, state)
 
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
-        """Name some variables and what follows them at once, without physics, causes first."""
+        """Name some variables and what follows them at lag 0, without physics, causes first."""
         return self.compiled.static_order(targets)
 
     def in_coordinates(self, name: str, *values: Value) -> Value:

@@ -45,7 +45,7 @@ class Audit:
 
     Attributes:
         targets: One entry for each target, by name.
-        followed: Parameters and states that changed at once because a target did: values before
+        followed: Parameters and states that changed at lag 0 because a target did: values before
             and after. Other coordinates of them, and readouts, are not listed.
         engine: Quantities that the engine derives: the principal moments of inertia of each body
             whose mass or size changed [kg m²], before and after.

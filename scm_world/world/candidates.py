@@ -24,7 +24,7 @@ CHUNK = 64
 
 
 class Unknown(Exception):  # no error: such draws are planned one after another
-    """What a draw would give cannot be told without planning it."""
+    """The result of a draw is unknown before it is planned."""
 
 
 @final
@@ -188,7 +188,7 @@ def promising(
 ) -> Iterator[tuple[int, Plan | None]]:
     """Yield the further draws that may be feasible, and the last one.
 
-    A draw that is left out puts two bodies in one place. Where that cannot be told, it is yielded.
+    A draw that is left out puts two bodies in one place. Where that is unknown, it is yielded.
 
     Args:
         base: The world as physics left it.

@@ -245,7 +245,7 @@ class CompiledTask(ActionVector):
         return self.composition.structure(values)
 
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
-        """Name some variables and what follows them at once, without physics, causes first."""
+        """Name some variables and what follows them at lag 0, without physics, causes first."""
         key = tuple(targets)
         if key not in self._follow:
             follow = {*key, *self.model.structure.instant_descendants(key)}

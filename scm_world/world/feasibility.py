@@ -264,9 +264,9 @@ def _stay(
     kept: frozenset[str],
     problems: Iterable[Overlap],
 ) -> bool:
-    """Tell whether an overlap is there whatever is drawn.
+    """Tell whether every draw has an overlap.
 
-    It is where no draw moves anything, or where both bodies are blocks or obstacles that do not
+    So it is where no draw moves anything, or where both bodies are blocks or obstacles that do not
     follow a draw. Where a draw decides which bodies there are, nothing is known.
     """
     draws = {name for name, act in request.items() if isinstance(act, Draw)} - kept

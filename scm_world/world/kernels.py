@@ -116,7 +116,7 @@ def _adapter_of(signature: Any) -> tuple[Any, int]:
     kinds = _types.TypeRef(_types.Tuple(signature.args)), _types.TypeRef(signature.return_type)
     made = types.void(*_HEAD, *kinds)
     compiled = njit(made, cache=True)(_adapter)
-    return compiled, _address(compiled, made)  # the code lives as long as the function does
+    return compiled, _address(compiled, made)  # the code is freed with the function
 
 
 def addresses(function: Any, kinds: tuple[Any, ...], *, is_vector: bool) -> tuple[int, int] | None:

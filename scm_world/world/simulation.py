@@ -76,12 +76,12 @@ class Simulation(WorldAttributes):
             are variables of the whole robot (``"vector"``), of each ``"finger"`` or of each
             ``"joint"``. The names of the whole robot can be used at every resolution, and nothing
             that happens depends on it.
-        frame_skip: Length of a control step: of the robot's tasks in units of 4 ms, whatever the
+        frame_skip: Length of a control step: of the robot's tasks in units of 4 ms for every
             preset; of a model in its physics steps. The default of the task if None.
         max_episode_length: In control steps; the task's own length if None.
         conventions: ``"scm_world"``, or ``"causal_world"`` for the predecessor's.
         variables_space: The space that every target of an intervention must lie in, unless ``do``
-            is told another one: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``.
+            is given another one: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``.
 
     Raises:
         UnknownOption: One of the names does not exist.
@@ -366,7 +366,7 @@ class Simulation(WorldAttributes):
 
     @property
     def pace(self) -> tuple[ControlMode, int]:
-        """What the engine is told besides: what a command means, and physics steps for it."""
+        """The control mode of the backend, and the physics steps of a command."""
         return self.composition.mode, self._substeps
 
     @property
@@ -751,8 +751,8 @@ class Simulation(WorldAttributes):
         reported = self.backend.parameters(keys)
         wrong = [n for key, n in keys.items() if not _close(present.static[n], reported[key])]
         if wrong:
-            told = f"the engine has other values of {', '.join(wrong)}"
-            raise SnapshotMismatch(f"the snapshot is damaged: {told}")
+            problem = f"the engine has other values of {', '.join(wrong)}"
+            raise SnapshotMismatch(f"the snapshot is damaged: {problem}")
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""

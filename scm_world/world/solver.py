@@ -362,7 +362,7 @@ class Solver:
                     self.problems.append(problem)
 
     def _asked_within(self, requested: Variable, space: AnyRegion, context: Values) -> bool:
-        """Tell whether what was asked of other coordinates lies in a space, whatever they keep."""
+        """Tell whether an intervention on other coordinates always lies in a space."""
         if getattr(requested, "inverse", None) is None:
             return False
         _, act = self.pending[self._task.model.target(requested.name)]

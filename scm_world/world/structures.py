@@ -69,7 +69,7 @@ class StructureCache:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the variables, whatever arguments declared them, and of the model."""
+        """Digest of the variables and of the model, not of the arguments of the task."""
         natural = self.natural(None)
         structure = natural.structure(natural.model.solve(only=natural.static_names))
         found = blake2b(str(reference(structure)).encode(), digest_size=16)

@@ -108,7 +108,7 @@ def test_causes_stand_left_of_their_effects_and_boxes_apart(task: str) -> None:
 @pytest.mark.parametrize("task", ["pushing", "towers"])
 def test_the_page_needs_nothing_else(task: str) -> None:
     """It is well formed, has every node and edge, names no address, and escapes what it shows."""
-    model = World(task, backend="fake").model
+    model = Simulation(task, backend="fake").model
     page, drawing = to_html(model, title="<script>"), lay_out(model)
     assert "<script></" not in page
     assert set(re.findall(r"https?://[^\"]+", page)) == {

@@ -62,7 +62,7 @@ class SavedState:
 @final
 @dataclass
 class History:
-    """What a world has been through since its last canonical state; enough to live it again.
+    """Everything since the last canonical state that is needed to replay it.
 
     Attributes:
         origin: The last canonical state.
@@ -143,7 +143,7 @@ class BulletBackend(Backend):
         self._engine = load()
         self._version = version()
         self._base: Client | None = None  # holds the world of the last step, once it is needed
-        self._lost = False  # whether the base must live through its past before it is used
+        self._lost = False  # whether the past must be replayed before the base is used
         self._spare: Client | None = None  # holds the canonical world, if there is one
         self._history: History | None = None
         self._before: Values = {}  # parameters of the last step

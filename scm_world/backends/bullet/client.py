@@ -256,7 +256,7 @@ class Client(ABC):
         self.handle = None
 
     def canonicalize(self, instant: Instant) -> None:
-        """Bring about the one world that has these parameters and this state, whatever was before.
+        """Build the one world with these parameters and this state, independently of the past.
 
         Bodies stay where all their shapes stay; all else that remembers the past, the contact
         caches, goes when the collision objects are entered anew, always in one order.

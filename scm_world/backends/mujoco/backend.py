@@ -19,7 +19,7 @@ from scm_world.backends.base import (
     EngineSnapshot,
 )
 from scm_world.backends.mujoco import fields, reading
-from scm_world.backends.mujoco.batch import MujocoBatch, Seat
+from scm_world.backends.mujoco.batch import MujocoBatch, Slot
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import (
     Realization,
@@ -121,7 +121,7 @@ class MujocoBackend(Backend):
 
     _now: Realization
     _touches: Touches | None
-    seat: Seat | None = None
+    slot: Slot | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
@@ -144,7 +144,7 @@ class MujocoBackend(Backend):
         now = self._realized(scene.structure, scene.parameters)
         now.reset()
         now.place(scene.state.vector)
-        self._now, self.seat, self._touches = now, None, None
+        self._now, self.slot, self._touches = now, None, None
 
     def apply(self, difference: Difference) -> None:
         """Change structure, parameters and state without advancing time.
@@ -189,7 +189,7 @@ class MujocoBackend(Backend):
 
     def read(self, into: State) -> None:
         """Write the present state into an existing vector."""
-        if self.seat is not None:
+        if self.slot is not None:
             self._return()
         self._now.read(into.vector)
 
@@ -201,7 +201,7 @@ class MujocoBackend(Backend):
                 of the user is in use.
             UnknownOption: The structure has no such mode.
         """
-        if self.seat is not None:
+        if self.slot is not None:
             self._return()
         refuse_callbacks()
         now = self._now
@@ -251,29 +251,29 @@ class MujocoBackend(Backend):
             now.applied = payload.parameters
         now.recall(payload.numbers, payload.memory)
         now.replay, now.began = payload.again
-        self._now, self.seat, self._touches = now, None, payload.touches
+        self._now, self.slot, self._touches = now, None, payload.touches
 
     @classmethod
     def batch(cls, backends: Sequence[Backend], threads: int) -> EngineBatch:
         """Give what steps several scenes in one call, with C threads."""
-        guests = [backend for backend in backends if isinstance(backend, MujocoBackend)]
-        return MujocoBatch(guests, threads)
+        members = [backend for backend in backends if isinstance(backend, MujocoBackend)]
+        return MujocoBatch(members, threads)
 
     @property
     def realization(self) -> Realization:
-        """The compiled model, with parameters and state of the scene when it is not in a seat."""
+        """The compiled model, with parameters and state of the scene when it is not in a slot."""
         return self._now
 
-    def depart(self, seat: Seat, mode: ControlMode) -> bool:
-        """Let a seat have the state; tell whether the model has changed since the last time."""
+    def move_to(self, slot: Slot, mode: ControlMode) -> bool:
+        """Copy the state to a slot; tell whether the model has changed since the last time."""
         now = self._now
         if mode is not now.mode:
             now.switch(mode)
         edited = now.edited
-        if self.seat is not seat:
+        if self.slot is not slot:
             self._return()
-            seat.take(now)
-            self.seat, edited = seat, True
+            slot.take(now)
+            self.slot, edited = slot, True
         now.forget()
         self._touches = None
         now.edited = False
@@ -281,9 +281,9 @@ class MujocoBackend(Backend):
 
     def _return(self) -> None:
         """Take the state back from where it is stepped."""
-        if self.seat is not None:
-            self.seat.give_back(self._now)
-            self.seat = None
+        if self.slot is not None:
+            self.slot.give_back(self._now)
+            self.slot = None
 
     def close(self) -> None:
         """Free the model and its data."""

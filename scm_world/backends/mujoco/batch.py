@@ -1,4 +1,4 @@
-"""Many scenes in MuJoCo, stepped in one call by threads of its own."""
+"""Many scenes in MuJoCo, stepped in one call by a thread pool."""
 
 from __future__ import annotations
 
@@ -23,42 +23,42 @@ if TYPE_CHECKING:
 KEPT = 4
 """Structures whose simulations are kept although no scene is in them at the moment."""
 
-_STRANDED: list[_Room] = []
+_LEFT_BEHIND: list[_Group] = []
 """Simulations whose threads were left behind by a fork."""
 
 
 @final
-class Seat:
-    """A place in a batch, for one scene.
+class Slot:
+    """The place of one scene in a batch.
 
     Attributes:
-        room: Where it is.
+        group: The simulations that it belongs to.
         index: Of the simulation.
     """
 
-    __slots__ = ("index", "room")
+    __slots__ = ("group", "index")
 
-    def __init__(self, room: _Room, index: int) -> None:
-        self.room, self.index = room, index
+    def __init__(self, group: _Group, index: int) -> None:
+        self.group, self.index = group, index
 
     def take(self, scene: Realization) -> None:
         """Take over the state of a scene."""
-        mujoco.mj_getState(scene.model, scene.data, self.room.batch.state[self.index], STATE)
-        self.room.taken[self.index] = 0
+        mujoco.mj_getState(scene.model, scene.data, self.group.batch.state[self.index], STATE)
+        self.group.taken[self.index] = 0
 
     def give_back(self, scene: Realization) -> None:
         """Copy everything that the last step left, or what it takes to compute it again."""
-        room, index = self.room, self.index
-        if scene.lean and room.taken[index]:
-            mujoco.mj_setState(scene.model, scene.data, room.batch.state[index], STATE)
-            scene.replay = room.before[index].copy(), int(room.taken[index])
+        group, index = self.group, self.index
+        if scene.lean and group.taken[index]:
+            mujoco.mj_setState(scene.model, scene.data, group.batch.state[index], STATE)
+            scene.replay = group.before[index].copy(), int(group.taken[index])
         elif not scene.lean:
-            room.batch.get_data(index, scene.data)
-        scene.began = room.began[index]
+            group.batch.get_data(index, scene.data)
+        scene.began = group.began[index]
 
 
 @final
-class _Room:
+class _Group:
     """The simulations of all scenes of one structure.
 
     Args:
@@ -75,7 +75,7 @@ class _Room:
         self.before: Floats = np.zeros(self.batch.state.shape if scene.lean else (n, 0))
         self.taken = np.zeros(n, dtype=np.int64)  # physics steps of the last step
         self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
-        self.seats = [Seat(self, index) for index in range(n)]
+        self.slots = [Slot(self, index) for index in range(n)]
         # Scenes that are as the first one was share a copy of its model: it stays in the cache.
         self.usual = scene.fingerprint(), copy.copy(scene.model)
         self.models: list[mujoco.MjModel] = [self.usual[1]] * n
@@ -87,7 +87,7 @@ class _Room:
 
     def step(self, which: Integers, commands: Floats, substeps: int) -> None:
         """Hold commands, shape (n, at least n_commands), in some of the simulations."""
-        width, everyone = self._width, len(which) == len(self.seats)
+        width, everyone = self._width, len(which) == len(self.slots)
         rows = slice(None) if everyone else which
         self._commands[rows, :width] = commands[rows, :width]
         if self.before.size:
@@ -99,23 +99,23 @@ class _Room:
 
 @final
 class MujocoBatch(EngineBatch):
-    """Scenes of MuJoCo, each with parameters of its own, stepped by C threads.
+    """Scenes of MuJoCo, each with its own parameters, stepped by C threads.
 
-    While a scene is being stepped here, its state is in a seat; as soon as anything else is asked
-    of it, it takes its state back. Results are, bit for bit, those of single scenes.
+    While a scene is stepped here, its state is in a slot. Any other call of its backend copies the
+    state back. Results are bit-identical to those of single scenes.
 
     Args:
-        guests: The scenes.
+        backends: Of the scenes.
         threads: That step them; the results do not depend on how many.
     """
 
-    def __init__(self, guests: Sequence[MujocoBackend], threads: int) -> None:
-        self._guests = tuple(guests)
-        self._threads = max(1, min(threads, len(self._guests)))
-        self._rooms: dict[Any, _Room] = {}
-        self._seats: list[Seat | None] = [None] * len(self._guests)
+    def __init__(self, backends: Sequence[MujocoBackend], threads: int) -> None:
+        self._backends = tuple(backends)
+        self._threads = max(1, min(threads, len(self._backends)))
+        self._groups: dict[Any, _Group] = {}
+        self._slots: list[Slot | None] = [None] * len(self._backends)
         self._process = os.getpid()
-        self._last: tuple[_Room, ControlMode] | None = None  # if all were stepped in one room
+        self._last: tuple[_Group, ControlMode] | None = None  # if all were stepped in one group
 
     def step(
         self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
@@ -127,73 +127,76 @@ class MujocoBatch(EngineBatch):
                 stepped. Or a callback of the user is in use; none was.
         """
         if self._process != os.getpid():
-            # Everything is made anew after a fork: threads stay in the process that started them.
-            # What they worked for cannot be freed here: that would wait for them for ever.
+            # Threads do not survive a fork, so all simulations are made again. The old ones cannot
+            # be freed here: that would wait for the threads for ever.
             self._process, self._last = os.getpid(), None
-            _STRANDED.extend(self._rooms.values())
-            _STRANDED.extend(seat.room for seat in self._seats if seat is not None)
-            self._rooms.clear()
-            self._seats = [None] * len(self._guests)
+            _LEFT_BEHIND.extend(self._groups.values())
+            _LEFT_BEHIND.extend(slot.group for slot in self._slots if slot is not None)
+            self._groups.clear()
+            self._slots = [None] * len(self._backends)
         refuse_callbacks()
-        if self._last is not None and len(which) == len(self._guests):
-            room, last = self._last
-            if mode is last and [guest.seat for guest in self._guests] == self._seats:
-                problem = _step(room, which.astype(np.int32), commands, substeps, into)
+        if self._last is not None and len(which) == len(self._backends):
+            group, last = self._last
+            if mode is last and [backend.slot for backend in self._backends] == self._slots:
+                problem = _step(group, which.astype(np.int32), commands, substeps, into)
                 if problem:
                     raise EngineFailure(problem, "mujoco")
                 return
-        rooms: dict[int, tuple[_Room, list[int]]] = {}
+        groups: dict[int, tuple[_Group, list[int]]] = {}
         changed: set[int] = set()
         for index in which.tolist():
-            seat = self._seat(index)
-            key = id(seat.room)
-            rooms.setdefault(key, (seat.room, []))[1].append(index)
-            if self._guests[index].depart(seat, mode):
-                scene, (fingerprint, model) = self._guests[index].realization, seat.room.usual
+            slot = self._slot(index)
+            key = id(slot.group)
+            groups.setdefault(key, (slot.group, []))[1].append(index)
+            if self._backends[index].move_to(slot, mode):
+                scene, (fingerprint, model) = self._backends[index].realization, slot.group.usual
                 alike = scene.fingerprint() == fingerprint
-                seat.room.models[index] = model if alike else scene.model
+                slot.group.models[index] = model if alike else scene.model
                 changed.add(key)
         problems = []
-        everyone = len(rooms) == 1 and len(which) == len(self._guests)
-        self._last = (next(iter(rooms.values()))[0], mode) if everyone else None
-        for key, (room, members) in rooms.items():
+        everyone = len(groups) == 1 and len(which) == len(self._backends)
+        self._last = (next(iter(groups.values()))[0], mode) if everyone else None
+        for key, (group, members) in groups.items():
             if key in changed:
-                room.batch.set_models(room.models)
-            problem = _step(room, np.array(members, dtype=np.int32), commands, substeps, into)
+                group.batch.set_models(group.models)
+            problem = _step(group, np.array(members, dtype=np.int32), commands, substeps, into)
             problems += [problem] if problem else []
         if problems:
             raise EngineFailure("; ".join(problems), "mujoco")
 
-    def _seat(self, index: int) -> Seat:
-        """Give the seat of a scene in the room of its structure."""
-        scene, seat = self._guests[index].realization, self._seats[index]
-        if seat is not None and seat.room.structure == scene.structure:
-            return seat
-        self._seats[index], room = None, self._rooms.get(scene.structure)
-        if room is None:
-            used = {id(seat.room) for seat in self._seats if seat is not None}
-            unused = [key for key, other in self._rooms.items() if id(other) not in used]
-            for key in unused[: max(0, len(self._rooms) + 1 - KEPT)]:
-                del self._rooms[key]
-            room = _Room(scene, len(self._guests), self._threads)
-            self._rooms[scene.structure] = room
-        seat = self._seats[index] = room.seats[index]
-        return seat
+    def _slot(self, index: int) -> Slot:
+        """Return the slot of a scene in the group of its structure."""
+        scene, slot = self._backends[index].realization, self._slots[index]
+        if slot is not None and slot.group.structure == scene.structure:
+            return slot
+        self._slots[index], group = None, self._groups.get(scene.structure)
+        if group is None:
+            used = {id(slot.group) for slot in self._slots if slot is not None}
+            unused = [key for key, other in self._groups.items() if id(other) not in used]
+            for key in unused[: max(0, len(self._groups) + 1 - KEPT)]:
+                del self._groups[key]
+            group = _Group(scene, len(self._backends), self._threads)
+            self._groups[scene.structure] = group
+        slot = self._slots[index] = group.slots[index]
+        return slot
 
 
-def _step(room: _Room, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
+def _step(group: _Group, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
     """Step and read; say what went wrong, or nothing."""
     said = ""
     try:
-        room.step(which, commands, substeps)
+        group.step(which, commands, substeps)
     except SimulationError as error:
         said = f"MuJoCo: {error}"
-    counts = room.batch.warning[..., 1]
-    wrong, full = room.read(which, into), counts[:, 1:3].max(axis=1) > 1
+    counts = group.batch.warning[..., 1]
+    wrong, full = group.read(which, into), counts[:, 1:3].max(axis=1) > 1
     counts[:] = 1
     if not said and full[which].any():
         said = f"scene {which[full[which]][0]} of the batch: {FULL}"
     elif not said and wrong >= 0:
-        vector, time = into[wrong, : room.structure.layout.size], float(room.batch.state[wrong, 0])
-        said = f"scene {wrong} of the batch: {lost(room.structure, vector, time)}"
+        vector, time = (
+            into[wrong, : group.structure.layout.size],
+            float(group.batch.state[wrong, 0]),
+        )
+        said = f"scene {wrong} of the batch: {lost(group.structure, vector, time)}"
     return said

@@ -1,4 +1,4 @@
-"""What follows from the states of a model at once: poses, velocities, sensors.
+"""What follows from the states of a model at lag 0: poses, velocities, sensors.
 
 A readout computes on a model and data of its own, in which everything that is not among its
 parents stays as it is in the file. So its value is a function of its parents, to the last bit.

@@ -388,7 +388,7 @@ class Realization(ABC):
         return {key: self._slots[key].read() for key in keys}
 
     def edit(self, parameters: Parameters) -> None:
-        """Write parameters, then whatever follows from them; those in force cost nothing.
+        """Write parameters, then all numbers that follow from them; unchanged ones cost nothing.
 
         Raises:
             UnknownOption: There is no such parameter. Nothing has changed.

@@ -1,4 +1,4 @@
-"""Scenes in, pictures out: for people, and the pixels that a policy sees."""
+"""Scenes in, pictures out: for people, and the pixels that a policy observes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Drawing:
         return model_shapes(structure.default_scene())[1]
 
     def content(self, scene: Scene, *, shadows: bool) -> Any:
-        """Gather what pictures of a scene have in common, whatever the camera."""
+        """Gather what all pictures of a scene have in common, for any camera."""
         return model_shapes(scene)[0] + goal_shapes(scene.goals), shadows
 
     def background(self, scene: Scene, *, obstacles: bool) -> Scene:

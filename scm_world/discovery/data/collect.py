@@ -26,7 +26,7 @@ from scm_world.work.executors import Executor, Serial, opened
 from scm_world.world import Simulation
 
 ENOUGH = 20
-"""After so many episodes it is told whether most of them are refused."""
+"""After so many episodes the share of refused ones is checked."""
 
 
 class Circumstances(TypedDict, total=False):
@@ -69,8 +69,8 @@ def collect(
         out: A folder, or a URL: new, empty, or one in which this collection was begun.
         shard: How many episodes are in one of its files.
         format: Of the files: ``"parquet"`` (needs the extra ``data``) or ``"csv"``.
-        progress: Told how many episodes are done, and how many there will be: after each episode
-            in this process, after each shard of others.
+        progress: Called with how many episodes are done, and how many there will be: after each
+            episode in this process, after each shard of others.
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
         engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
@@ -137,7 +137,7 @@ def source_of(
     """Turn what can be collected from into something that has episodes.
 
     Raises:
-        UnknownOption: It is none of the kinds, or is told what it cannot take.
+        UnknownOption: It is none of the kinds, or is given arguments that it does not take.
     """
     match source:
         case SCM():
@@ -218,6 +218,6 @@ def _gathered(
 
 
 def made_of(source: DataSource, tell: Tell | None, numbers: range) -> SourceRows:
-    """Make the rows of a shard, in whatever process; ``tell`` is of this one, or None."""
+    """Make the rows of a shard, in any process; ``tell`` is None in other ones."""
     part = source.part(numbers, tell or (lambda more: None))
     return replace(part, table=replace(part.table, about={}))  # it is the same in all of them

@@ -24,7 +24,7 @@ from scm_world.queries.twins import EquationTwins
 FORMAT = "scm_world/dataset/1"
 
 Tell = Callable[[int], None]
-"""Told how many further episodes are done."""
+"""Called with how many further episodes are done."""
 
 
 @final

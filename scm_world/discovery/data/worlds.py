@@ -210,7 +210,7 @@ class WorldSource:
         return np.concatenate([np.ravel(value) for value in values])[None]
 
     def _sensed(self, episode: Episode, name: str, steps: Iterable[int]) -> Floats:
-        """Read a variable at every instant, with noise at some; the same whatever else is read."""
+        """Read a variable at every instant, with sensor noise at some instants."""
         values, half = np.array(episode[name], dtype=np.float64), self._half.get(name)
         if half is None or not half.any() or not np.any(episode[SENSOR_NOISE]):
             return values

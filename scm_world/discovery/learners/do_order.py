@@ -13,9 +13,9 @@ share of false edges is bounded, as long as effects are what their causes add up
 not, a note says so.
 
 Only what was intervened on somewhere can be found to be a cause, and not of what was set in all the
-same rows. Earlier control steps are causes without that, because time has an order. What stands
-still in an episode (a mass) is an effect only of what does so too, at once, and acts on the rest
-one step later.
+same rows. Earlier control steps are causes without that, because time has an order. A variable
+that is constant in an episode (a mass) is an effect only of other constants, at lag 0, and acts on
+all other variables at lag 1.
 
 It assumes that effects add up (``features`` gives them curves) and that no unobserved variable acts
 on two of those that were intervened on. Scales do not matter: standardised data give the same.
@@ -39,7 +39,7 @@ from scm_world.discovery.data.dataset import Bools, Dataset
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError, UnknownOption
 
-RIDGE = 1e-9  # of the variance: what cannot be told apart gets wide intervals, not an error
+RIDGE = 1e-9  # of the variance: indistinguishable causes get wide intervals, not an error
 EXACT = 1e-10  # variance of residuals, in that of the variable: below it, it is rounding
 SPARE = 5  # rows that a regression needs beyond its terms
 GAIN = 20.0  # twice the log likelihood that a change of the order has to bring
@@ -459,7 +459,7 @@ def _separable(rows: Rows) -> Bools:
 
 def _notes(data: Dataset, rows: Rows, causes: Bools, separable: Bools) -> tuple[str, ...]:
     found = []
-    still = [name for name, lives in zip(data.names, rows.alive, strict=True) if not lives]
+    still = [name for name, varies in zip(data.names, rows.alive, strict=True) if not varies]
     if still:
         found.append(f"never varied, no edges: {', '.join(still)}")
     chosen = np.flatnonzero(causes & ~rows.past)
@@ -467,7 +467,9 @@ def _notes(data: Dataset, rows: Rows, causes: Bools, separable: Bools) -> tuple[
     between = separable[np.ix_(chosen, chosen)] | (block[:, None] == block)
     if not between.all():
         together = ", ".join(data.names[i] for i in chosen[~between.all(axis=0)])
-        found.append(f"always set where another one is, so some edges are not told: {together}")
+        found.append(
+            f"always set where another one is, so some edges are not identified: {together}"
+        )
     few = int((rows.alive & ((~rows.targeted).sum(axis=0) <= causes.sum() + 1)).sum())
     if few:
         found.append(f"{few} columns have too few rows for {int(causes.sum())} possible causes")

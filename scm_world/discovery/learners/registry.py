@@ -39,7 +39,7 @@ class Learner:
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
             steps as further columns.
         extra: The optional dependency it needs; empty if none.
-        package: Whose version is noted, and whose absence is told.
+        package: Whose version is recorded, and whose absence is reported.
         doc: In one line.
     """
 
@@ -141,7 +141,7 @@ def learn(
     table = data
     if isinstance(data, Dataset) and data.is_temporal and not chosen.temporal:
         table = data.lagged()
-    if "blocks" in known:  # what is told apart has to be tested apart
+    if "blocks" in known:  # groups that are distinguished are tested separately
         settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
     result = chosen.learn(table, seed=seed, **settings)

@@ -133,7 +133,7 @@ class SCMSimulator:
         return np.asarray(np.where(np.isfinite(high - low), high - low, 1.0))
 
     def _mechanisms(self, now: Values, before: Values) -> Floats:
-        """Compute each mechanism; 0 where there is none, whatever the value is."""
+        """Compute each mechanism; 0 where there is none."""
         found = (
             self._model.solve(now, previous=before, key=self._key, only=(name,))[name]
             if self._model[name].all_parents

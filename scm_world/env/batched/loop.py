@@ -24,7 +24,7 @@ SNAPSHOT = "the snapshot"
 class LoopExecutor:
     """Environments that are made alike, each with its own parameters, noise and clock; in turns.
 
-    Each does, bit for bit, what it would do alone. Whatever happens to one of them is in its row
+    Each does, bit for bit, what it would do alone. The result of each is in its row
     of the buffers afterwards. ``reset``, ``do`` and ``restore`` happen in all of those that are
     named or in none; so does what makes one unlike the others (see ``Form.check``). The message of
     an error says in which environment it happened. All other executors do the same.

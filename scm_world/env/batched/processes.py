@@ -21,7 +21,7 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.work.processes import PROCESS, Ended, Worker, cores
 from scm_world.world import Audit
 
-ANEW = "make the environments anew"
+ANEW = "make the environments again"
 
 
 @final
@@ -195,7 +195,7 @@ class ProcessExecutor:
         *,
         undo: bool = False,
     ) -> dict[int, Any]:
-        """Ask some processes at once; whatever one of them says, the others are heard, too.
+        """Call some processes in parallel, and read all answers, also after an error.
 
         Args:
             calls: For each process a method of its executor, and the arguments.

@@ -265,7 +265,7 @@ def write_outputs(
         videos: Whether the best, the median and the worst episode of each agent are filmed.
         policy: Who acted, for videos of policies that are no files and have no names.
         trusted: Packages whose functions may be policies, for videos.
-        progress: Told how many control steps of a video are done.
+        progress: Called with how many control steps of a video are done.
 
     Returns:
         The files.

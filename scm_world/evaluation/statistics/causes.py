@@ -74,7 +74,7 @@ class ColumnEffect:
     def direction(self) -> str:
         """``"up"`` or ``"down"``, as the score goes with the value, or ``"unclear"``.
 
-        It is also unclear if the score first rises and then falls, whatever the share.
+        It is also unclear if the score first rises and then falls, for any share.
         """
         if not self.contrast.excludes(0.0):
             return "unclear"

@@ -146,9 +146,10 @@ class Score:
 
     Attributes:
         names: Of the variables.
-        function: Told the values in this order, each of shape (..., *shape) of its variable; gives
-            numbers of shape (...), the higher the better. It can be pickled if it has a name.
-        sums: Whether it is told the sum of a variable with several numbers instead, where it is
+        function: Takes the values in this order, each of shape (..., *shape) of its variable, and
+            returns numbers of shape (...), the higher the better. It can be pickled if it has a
+            name.
+        sums: Whether it is given the sum of a variable with several numbers instead, where it is
             known which axes are those of the variable.
 
     Example:

@@ -107,8 +107,8 @@ class Search:
 class CrossEntropy:
     """Tries sequences of actions out in copies of the world, and does the beginning of the best.
 
-    Every ``every`` control steps it searches anew, from the present and from what is left of its
-    last plan. It sees everything, since it looks at the world and not at an observation. What
+    Every ``every`` control steps it searches again, from the present and from what is left of its
+    last plan. It reads the state of the world, not an observation. What
     it does follows from the world, its noise, ``seed``, and the steps of the episode at which it
     was asked: a world that is restored in the middle of an episode has no last plan. How many
     threads there are does not matter. One instance serves any number of episodes and worlds.
@@ -117,7 +117,7 @@ class CrossEntropy:
         objective: What is summed up over the control steps of a plan: the name of a variable such
             as ``"reward"``, weights by name, or a ``Score``; if None, how near everything is to
             its goal, see ``nearness``, and the reward where the task has no goals.
-        terminal: What the end of a plan is worth besides; nothing if None.
+        terminal: Value of the last state of a plan, added to its rewards; nothing if None.
         every: For how many control steps a plan is followed.
         do: What the planner wrongly believes, as in ``World.do``: ``{"tool_block.friction": 0.2}``.
             With None it plans with the true model.
@@ -173,7 +173,7 @@ class CrossEntropy:
         return {name: value for name, value in vars(self).items() if name != "_programs"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Begin anew."""
+        """Forget the last plan."""
         self.__dict__.update(state, _programs=WeakKeyDictionary())
 
     def __call__(self, world: Simulation) -> Floats:

@@ -15,10 +15,10 @@ EdgeKey = tuple[str, str, int]
 """Cause, effect, lag."""
 
 RESOLUTION = 1e-12
-"""Differences below it are not told from rounding, where the floor itself is exactly zero."""
+"""Smaller differences are rounding, where the noise floor is exactly zero."""
 
 FACTOR = 10.0
-"""How far above the floor an effect must lie."""
+"""How many times the noise floor an effect must be."""
 
 
 @final
@@ -62,7 +62,7 @@ class Effects:
         largest: By cause, effect and lag.
         settings: Where the largest effect of each pair was seen, if it is not zero.
         states: In how many probe states each pair answered, beyond rounding.
-        floor: Largest difference after something was done and undone.
+        floor: Noise floor: the largest difference after something was done and undone.
         exact: Whether any difference counts, rounding too, where no edge is declared.
         undone: Targets that were changed and put back.
         rollouts: Control steps simulated in an experiment of their own.
@@ -182,7 +182,7 @@ class Series:
     Args:
         paired: Does the experiments: ``Paired`` or ``PairedEquations``.
         planned: How many probe states there are.
-        progress: Is told how far it is.
+        progress: Called after each probe.
         done: How many of them were finished before.
 
     Attributes:

@@ -6,7 +6,7 @@ remains while every other variable that X moved is held at its old value.
 
 Within the instant, variables that can be set are held by the intervention itself, and computed
 ones by handing their old value to their children. Over one control step the engine is one joint
-mechanism, so whatever differs in a state is a direct effect of what was different before; a
+mechanism, so a difference in a state is a direct effect of the differences before; a
 computed variable has a lagged cause if it still differs while all present values are held.
 """
 
@@ -193,7 +193,7 @@ class Paired:
     # --- the pieces of an experiment ----------------------------------------------------------
 
     def _doing(self, change: Floats | None) -> None:
-        """Say what is being done, so that what is seen can be told where it was seen."""
+        """Record the present probe, for the report of the differences that are found."""
         self.effects.setting = ProbeSetting(self._number, self._probe.kind, change)
 
     def _advanced(self, action: Floats) -> dict[str, Value]:
@@ -263,7 +263,7 @@ class Paired:
                 return None
 
     def _within_the_instant(self, target: str, value: Value, deciding: tuple[str, ...]) -> None:
-        """Find the effects at once and one step later, in the structure that there is."""
+        """Find the effects at lags 0 and 1, in the structure that there is."""
         moved = [name for name in self._before.differing(self._world) if name != target]
         held = [name for name in moved if name not in self._computed]
         if held:
@@ -356,7 +356,7 @@ class Paired:
                 self.effects.see(cause, name, 1, value, self._later[name])
 
     def _undo(self, target: str, value: Value) -> None:
-        """Do and undo: whatever remains is not an effect but noise of the apparatus."""
+        """Intervene and undo: a difference that remains is numerical noise, not an effect."""
         self._world.restore(self._probe.snapshot)
         self._world.do({target: value})
         self._world.do({target: self._at_once[target]})

@@ -133,14 +133,14 @@ class TriFingerTask(Task):
 
     @abstractmethod
     def entities(self) -> Iterable[Entity]:
-        """List what stands in the world besides the robot and the stage."""
+        """List the entities of the scene other than the robot and the stage."""
 
     @abstractmethod
     def readouts(self) -> Iterable[Variable]:
         """Declare reward terms, fractional success and success."""
 
     def idle(self, world: Any) -> Floats:
-        """Keep the robot where it is told to be: joints, fingertips, or no torque, shape (9,)."""
+        """Return the command that keeps the robot at rest (position, or no torque), shape (9,)."""
         if world.action_mode == "joint_torques":
             return super().idle(world)
         name = "end_effector_positions" if "effector" in world.action_mode else "joint_positions"
@@ -190,7 +190,7 @@ class TriFingerTask(Task):
 
 @lru_cache(maxsize=32)
 def _always_there(timing: Timing, start: tuple[float, ...]) -> tuple[Entity, ...]:
-    """List what stands in the world whatever the goal family: none of it follows from the plan."""
+    """List the entities of every goal family; none of them depends on the plan."""
     return (
         Robot(timing.action_mode, start, timing.resolution),
         Stage(timing.preset),

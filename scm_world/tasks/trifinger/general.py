@@ -126,7 +126,7 @@ class General(Building):
 
     From where they are dropped is a variable: draw it for another goal. What the blocks are like,
     gravity and the friction of the floor are causes of the goal, as they are of all motion. The
-    pile is simulated on MuJoCo, whatever engine moves the world, so that one seed gives the same
+    pile is simulated on MuJoCo for every backend of the world, so that one seed gives the same
     goal everywhere. The fingers begin raised.
 
     Reward terms:

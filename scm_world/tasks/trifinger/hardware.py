@@ -128,7 +128,7 @@ LINK_NAMES = tuple(link_name(finger, i) for finger in FINGERS for i in range(LIN
 """All links, finger by finger."""
 
 
-TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, whatever the preset
+TIMESTEP = 0.004  # [s] the unit in which ``frame_skip`` counts, for every preset
 
 
 @dataclass(frozen=True)

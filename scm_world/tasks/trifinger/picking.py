@@ -135,8 +135,8 @@ class Picking(OneBlock):
     def _above(self) -> tuple[Box, Box]:
         """Give the cylindrical positions above the block's place; at radius 0 any angle will do.
 
-        The predecessor publishes wider spaces, and puts whatever is drawn or set above the centre
-        of the arena; see ``above_the_center``.
+        The predecessor publishes wider spaces, and moves every value that is drawn or set above the
+        centre of the arena; see ``above_the_center``.
         """
         if self.conventions.published_spaces:
             return (

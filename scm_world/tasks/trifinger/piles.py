@@ -38,7 +38,7 @@ def pile(
 ) -> Floats:
     """Drop blocks one after another, and see where they lie 0.8 s after the last.
 
-    A simulation on MuJoCo, whatever engine moves the world: one seed gives one goal everywhere.
+    Simulate on MuJoCo for every backend of the world: one seed gives one goal everywhere.
     There is no robot in reach; what is no argument here has its default. A block that would
     begin in the floor or in another block begins above it. Blocks that leave the arena (gravity
     may point anywhere) are put at its border.

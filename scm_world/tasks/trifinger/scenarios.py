@@ -1,7 +1,7 @@
 """Where causes in the robot's world have a chance to show.
 
-An edge that needs contact shows only where there is contact. So besides free motion, fingers are
-held against a block, on the floor and at the wall; blocks are in the air, at the wall, on one
+An edge that needs contact shows only where there is contact. So fingers move freely, and are
+pressed against a block, on the floor and at the wall; blocks are in the air, at the wall, on one
 another, in their goals, and where a further block or obstacle would come into being.
 """
 
@@ -147,7 +147,7 @@ def around(center: Floats, radius: float | Floats, angles: Floats, height: float
 
 
 def beyond_corners(size: Floats) -> float:
-    """Compute how far from the middle of a block a tip is clear of it, whatever its yaw [m]."""
+    """Compute how far from the middle of a block a tip is clear of it at any yaw [m]."""
     return float(np.hypot(size[0], size[1])) / 2 + TIP + CLEARANCE
 
 

@@ -69,7 +69,7 @@ COLUMNS = (
     "linkJointTypes",
     "linkJointAxis",
 )
-"""What ``createMultiBody`` is told of every link."""
+"""Arguments of ``createMultiBody`` for every link."""
 
 
 @final
@@ -80,7 +80,7 @@ class _Links:
         engine: The module ``pybullet``.
 
     Attributes:
-        rows: What the engine is told of each: see ``COLUMNS``.
+        rows: Arguments for each: see ``COLUMNS``.
     """
 
     def __init__(self, engine: Any) -> None:

@@ -146,7 +146,7 @@ def _carried(linear: Numbers, spin: Numbers, arm: Numbers, sign: float) -> Numbe
 class ModelClient(Client):
     """A physics client with a ``Model`` in it.
 
-    Springs, dampers and actuators are not in the engine, but in the forces that it is told.
+    Springs, dampers and actuators are not in the engine, but in the forces that are applied to it.
     """
 
     modes: ClassVar[tuple[ControlMode, ...]] = (ControlMode.CONTROLS,)

@@ -1,4 +1,4 @@
-"""Forces on joints: actuators, springs and dampers. They are told to the engine before each step.
+"""Forces on joints: actuators, springs and dampers. They are passed to the engine before each step.
 
 What brakes in proportion to speed, dampers and the velocity gains of servos, acts with the speed
 at the end of the step, as in MuJoCo's integrator ``implicitfast``: with that before the step,

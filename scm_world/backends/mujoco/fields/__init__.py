@@ -49,7 +49,7 @@ def table(mj: mujoco.MjModel, *, fluid: bool = False) -> tuple[Field, ...]:
     """List the parameters of a compiled model, each with its own name.
 
     Where two elements have the same name and attribute, the usual one keeps the plain name; if
-    none or both are usual, both are told apart by their kind: ``"geom:torso.color"``. So is what
+    none or both are usual, both are distinguished by their kind: ``"geom:torso.color"``. So is what
     has the name of a state.
 
     Args:

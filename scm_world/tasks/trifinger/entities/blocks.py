@@ -38,7 +38,7 @@ def standing(size: Floats, orientation: Floats, *, place: Floats) -> Floats:
 
 
 def constantly(*_: Floats, value: Floats) -> Floats:
-    """Give a constant, whatever the parents."""
+    """Return a constant; parents do not matter."""
     return value
 
 

@@ -58,7 +58,7 @@ CONTROLLER = (
     numbers.TORQUE.root(
         "torque_limit",
         _SPEC.limit,
-        "Largest torque of a joint. Torques that are commanded end at 0.36 N m whatever it is.",
+        "Largest torque of a joint. Torques that are commanded end at 0.36 N m for any value.",
     ),
 )
 """The joint controller."""

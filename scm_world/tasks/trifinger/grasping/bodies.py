@@ -1,4 +1,4 @@
-"""What a policy that grasps sees: boxes on a table, and the hand above them."""
+"""The scene of a policy that grasps: boxes on a table, and the hand above them."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Hold:
         tool: The block.
         grip: How it is held.
         press: With which force [N].
-        aside: Fingertips as they are told to be, shape (9,) [m]; unused ones stay there.
+        aside: Commanded fingertips, shape (9,) [m]; unused ones stay there.
 
     Attributes:
         lost: Whether the block has slipped away.
@@ -211,7 +211,7 @@ class Pace:
 class Grasp:
     """Takes block after block, the one with the lowest goal first, and puts it at its goal.
 
-    It sees everything: places, sizes, masses and friction of the blocks, and the robot. It chooses
+    It reads places, sizes, masses and friction of the blocks, and the robot's state. It chooses
     the faces to press and the fingers that do so, goes around what is in the way, turns a block
     about the vertical if its goal asks for it, puts it down on the way if it cannot go there at
     once, makes way for it, tries again when it has slipped, and holds it where a goal is in the

@@ -1,4 +1,4 @@
-"""From a structure to a compiled model, and where each parameter lives in it.
+"""From a structure to a compiled model, and where each parameter stands in it.
 
 Stock settings cannot lift a block with three fingers, let it creep on a slope and make a fast one
 hover. A softer friction reference for contacts without fingers, elliptic cones and a high
