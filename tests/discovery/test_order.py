@@ -80,7 +80,7 @@ def test_what_is_always_set_together_is_not_told_apart() -> None:
     scm = random_model("er2:8")
     found = learn("do_order", drawn(scm, 1_000, 0, design="all", seen=0.3))
     assert found.directed == found.undirected == ()
-    assert any("edges are not told: x0, x1" in note for note in found.notes)
+    assert any("edges are not identified: x0, x1" in note for note in found.notes)
 
 
 def test_what_is_always_set_together_still_has_effects() -> None:
@@ -228,7 +228,7 @@ def test_a_vector_is_one_cause() -> None:
     found = learn("do_order", data)
     assert found.names == ("v", "y")
     assert found.directed == (("v", "y", 0),)
-    assert not any("not told" in note for note in found.notes)
+    assert not any("not identified" in note for note in found.notes)
     whole = learn("do_order", data, level="component", blocks=True)
     assert {cause for cause, *_ in whole.directed} == {"v[0]", "v[1]", "v[2]"}
     alone = learn("do_order", data, level="component")

@@ -48,7 +48,7 @@ def test_the_graph_of_an_episode_has_what_nature_does() -> None:
     assert set(nx.ancestors(plain, PLACE)) < set(nx.ancestors(plain, "reward"))
 
 
-def test_watching_tells_what_acting_does_if_the_mass_is_watched() -> None:
+def test_an_adjusted_effect_agrees_with_the_experiment_if_the_mass_is_observed() -> None:
     """Adjusted it agrees; unadjusted it is wrong by far; without the mass it is refused."""
     world = World("pushing")
     options: dict[str, Any] = {"values": (0.2, 0.3), "nature": NATURE, "steps": 12, "policy": None}

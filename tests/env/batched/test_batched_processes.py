@@ -105,7 +105,7 @@ def test_nothing_is_left_behind() -> None:
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
-    with pytest.raises(EngineFailure, match="closed; make the environments anew"):
+    with pytest.raises(EngineFailure, match="closed; make the environments again"):
         envs.step(actions(1, 3)[0])
 
 
