@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, TypeVar, final
 
 import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError
@@ -149,6 +149,10 @@ class Part(Frozen):
 
     kind: str
 
+    if TYPE_CHECKING:  # as in ``Frozen``
+
+        def __init__(self, **fields: Any) -> None: ...
+
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         """Know the part by its kind, so that it can be read from a file."""
@@ -158,15 +162,15 @@ class Part(Frozen):
             Part.KINDS[default] = cls
 
     def acts(self, situation: Situation) -> Acts:
-        """Say what is done now; nothing, mostly."""
+        """Return the interventions of now; none by default."""
         return {}
 
     def parts(self) -> tuple[Part, ...]:
-        """List what it is made of."""
+        """List its parts."""
         return ()
 
     def walk(self) -> Iterator[Part]:
-        """List it and everything that it is made of."""
+        """List it and all its parts, recursively."""
         yield self
         for part in self.parts():
             yield from part.walk()
@@ -282,7 +286,7 @@ class Do(Part):
     request: dict[str, Intervention]
 
     def __init__(self, request: Mapping[str, Any], **fields: Any) -> None:
-        super().__init__(request=acts_of(request), **fields)  # type: ignore[call-arg]
+        super().__init__(request=acts_of(request), **fields)
 
     def acts(self, situation: Situation) -> Acts:
         """Give the intervention; its draws have noises of their own."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
 
@@ -24,6 +24,10 @@ class _Timed(Part):
     """
 
     part: AnyPart
+
+    if TYPE_CHECKING:  # as in ``Frozen``
+
+        def __init__(self, **fields: Any) -> None: ...
 
     def parts(self) -> tuple[Part, ...]:
         """Give what acts."""
@@ -56,7 +60,7 @@ class AtStep(_Timed):
 
     def __init__(self, step: Any, part: Any, **fields: Any) -> None:
         step = whole_number("step", step, least=0)
-        super().__init__(step=step, part=as_part(part), **fields)  # type: ignore[call-arg]
+        super().__init__(step=step, part=as_part(part), **fields)
 
     def is_due(self, situation: Situation) -> bool:
         """Tell whether this is the step."""
@@ -99,7 +103,7 @@ class Every(_Timed):
     def __init__(self, steps: Any, part: Any, *, first: Any = 0, **fields: Any) -> None:
         steps = whole_number("steps", steps, least=1)
         first = whole_number("first", first, least=0)
-        super().__init__(steps=steps, part=as_part(part), first=first, **fields)  # type: ignore[call-arg]
+        super().__init__(steps=steps, part=as_part(part), first=first, **fields)
 
     def is_due(self, situation: Situation) -> bool:
         """Tell whether this is one of the steps."""
@@ -175,7 +179,7 @@ class _Several(Part):
         if not made:
             kind = str(type(self).model_fields["kind"].default)
             raise UnknownOption(kind, (), ("one part or more",))
-        super().__init__(of=made, **fields)  # type: ignore[call-arg]
+        super().__init__(of=made, **fields)
 
     def parts(self) -> tuple[Part, ...]:
         """List them."""

@@ -48,7 +48,7 @@ class Curriculum(Frozen):
 
     def __init__(self, part: Any = None, **fields: Any) -> None:
         given = as_part({} if part is None else part)
-        super().__init__(part=given, **fields)  # type: ignore[call-arg]
+        super().__init__(part=given, **fields)
 
     def as_dict(self) -> dict[str, Any]:
         """Write it as plain data.

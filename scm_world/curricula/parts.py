@@ -71,7 +71,7 @@ class Resample(Part):
         if not (isinstance(space, Frozen | dict) or space in SPACES):
             raise UnknownOption("space", space, (*SPACES, "a Subset", "a distribution"))
         refuse_infinite("space", space)
-        super().__init__(what=words("what", what), space=space, **fields)  # type: ignore[call-arg]
+        super().__init__(what=words("what", what), space=space, **fields)
 
     def acts(self, situation: Situation) -> Acts:
         """Draw, where it is due."""
@@ -186,7 +186,7 @@ class Goal(Part):
     def __init__(self, space: Any = "A", **fields: Any) -> None:
         one_of("space", space, SPACES)
         fields["besides"] = words("besides", fields.get("besides", ()))
-        super().__init__(space=space, **fields)  # type: ignore[call-arg]
+        super().__init__(space=space, **fields)
 
     def acts(self, situation: Situation) -> Acts:
         """Draw, where it is due."""
@@ -244,7 +244,7 @@ class Interpolate(Part):
         fields["start"] = _plain("start", fields.get("start") or {})
         fields["episodes"] = whole_number("episodes", fields.get("episodes"), least=1)
         fields["first"] = whole_number("first", fields.get("first", 0), least=0)
-        super().__init__(stop=_plain("stop", stop), **fields)  # type: ignore[call-arg]
+        super().__init__(stop=_plain("stop", stop), **fields)
         for name in self.start.keys() - self.stop.keys():
             raise UnknownOption("start", name, self.stop)
 
@@ -332,7 +332,7 @@ class Follow(Part):
             allowed = ("a function of the situation", "its name: 'module:name'")
             raise UnknownOption("function of a curriculum", function, allowed)
         named = Function(function) if isinstance(function, str) else function
-        super().__init__(function=named, **fields)  # type: ignore[call-arg]
+        super().__init__(function=named, **fields)
         if isinstance(self.function, Linear):
             raise UnknownOption("function of a curriculum", self.function, ("a Function",))
 

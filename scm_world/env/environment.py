@@ -212,8 +212,9 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             bounds = (np.where(scaled, -1.0, low), np.where(scaled, 1.0, high))
         self._delta = None
         if mode.startswith(PREFIX):
-            how = {"scale": delta_scale, "origin": delta_origin}
-            self._delta = Delta(self.world, self._middle, self._half, **how)  # type: ignore[arg-type]
+            self._delta = Delta(
+                self.world, self._middle, self._half, scale=delta_scale, origin=delta_origin
+            )
         else:
             for option, value, usual in (
                 ("delta_scale", delta_scale, 1.0),

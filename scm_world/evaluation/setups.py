@@ -92,13 +92,14 @@ class EvaluationPlace:
             arguments = {name: value for name, value in arguments.items() if name != "model"}
             own["model"] = system.digest
         try:
-            return json.loads(  # type: ignore[no-any-return]
+            found: dict[str, Any] = json.loads(
                 json.dumps(
                     {"task": self.name, "arguments": arguments, **own, "env": dict(self.options)},
                     default=_plain,
                     allow_nan=False,
                 )
             )
+            return found
         except (TypeError, ValueError) as error:
             raise ModelError([f"the environment cannot be written down: {error}"]) from None
 

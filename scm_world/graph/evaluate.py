@@ -143,12 +143,11 @@ class Evaluator:
             value = key.draw(source, requested.name, requested.shape, values, stream)
         return self._given(requested, name, value)
 
-    def _given(self, requested: Variable, name: str, value: Value) -> Value:
+    def _given(self, requested: Any, name: str, value: Value) -> Value:
         if requested.name == name:
             return np.asarray(value)
         if requested.parts:
-            mechanism: Any = requested.mechanism  # type: ignore[attr-defined]
-            return np.asarray(mechanism.split(value)[requested.parts.index(name)])
+            return np.asarray(requested.mechanism.split(value)[requested.parts.index(name)])
         return np.asarray(self._bound(requested, inverse=True)(value))
 
     def evaluate(
@@ -273,10 +272,10 @@ class Evaluator:
             np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first
         )
 
-    def _bound(self, variable: Variable, *, inverse: bool = False) -> Callable[..., Any]:
+    def _bound(self, variable: Any, *, inverse: bool = False) -> Callable[..., Any]:
         key = f"{variable.name}|inverse" if inverse else variable.name
         found = self._functions.get(key)
         if found is None:
-            mechanism = variable.inverse if inverse else variable.mechanism  # type: ignore[attr-defined]
+            mechanism = variable.inverse if inverse else variable.mechanism
             found = self._functions[key] = mechanism.bind()
         return found

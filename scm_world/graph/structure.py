@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
-from typing import final
+from typing import Any, final
 
 import networkx as nx
 
@@ -208,8 +208,9 @@ def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Ite
 
 
 def _bundle_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
+    mechanism: Any = getattr(variable, "mechanism", None)  # a bundle has one
     for index, name in enumerate(variable.parts):
-        part, shape = known.get(name), variable.mechanism.shapes[index]  # type: ignore[attr-defined]
+        part, shape = known.get(name), mechanism.shapes[index]
         if part is not None and part.shape != shape:
             yield f"the bundle {variable.name!r} has {name!r} as {shape}, not {part.shape}"
         if part is not None and (part.parts or getattr(part, "inverse", None)):

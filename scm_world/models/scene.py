@@ -213,9 +213,9 @@ class Scene:
     goals: tuple[GoalRegion, ...] = ()
     light: Light = field(default_factory=Light)
 
-    def with_(self, **changes: object) -> Scene:
+    def with_(self, **changes: Any) -> Scene:
         """Copy the scene with some fields replaced."""
-        return replace(self, **changes)  # type: ignore[arg-type]
+        return replace(self, **changes)
 
 
 TOLERANCE = 1e-3

@@ -41,7 +41,7 @@ class Outcome(Frozen):
     def __init__(self, name: str, how: str = "final", component: int | None = None) -> None:
         if how not in HOWS:
             raise UnknownOption("outcome", how, HOWS)
-        super().__init__(name=name, how=how, component=component)  # type: ignore[call-arg]
+        super().__init__(name=name, how=how, component=component)
 
     def of(self, episode: Episode) -> Floats:
         """Read it off an episode."""

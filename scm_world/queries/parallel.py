@@ -181,7 +181,7 @@ def _solved_together(twins: EquationTwins, units: Sequence[Unit]) -> tuple[Float
     actions = np.empty((len(units), first.steps, twins.layout.n_actions))
     for row, policy in enumerate(policies):
         one.reset(seed=first.seed, episode=numbers[row])
-        actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined]
+        actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # Blind
     together = Equations(twins.layout, groups)
     unit = replace(first, policy=lambda system: actions[:, system.index], names=())
     running = Running(unit, together)

@@ -54,7 +54,7 @@ class At(Frozen):
     act: Intervention
 
     def __init__(self, step: Any, act: Any, **fields: Any) -> None:
-        super().__init__(step=whole_number("At(step)", step, least=0), act=as_act(act), **fields)  # type: ignore[call-arg]
+        super().__init__(step=whole_number("At(step)", step, least=0), act=as_act(act), **fields)
 
 
 @final
@@ -85,7 +85,7 @@ class Clamp(Frozen):
         if isinstance(act, Null):
             allowed = ("a value or an intervention on a variable", "At(step, Null())")
             raise UnknownOption("Clamp(act)", act, allowed)
-        super().__init__(act=as_act(act), start=first, stop=last, **fields)  # type: ignore[call-arg]
+        super().__init__(act=as_act(act), start=first, stop=last, **fields)
 
 
 @final
@@ -105,7 +105,7 @@ class Contact(Frozen):
         for body in (first, second):
             if not isinstance(body, str):
                 raise UnknownOption("body", body, ("the name of a body, or its beginning",))
-        super().__init__(first=first, second=second, **fields)  # type: ignore[call-arg]
+        super().__init__(first=first, second=second, **fields)
 
     @property
     def bodies(self) -> tuple[str, str]:
@@ -158,7 +158,7 @@ class Reaches(Frozen):
         if isinstance(number, str) or np.ndim(number) or not np.isfinite(number):
             raise UnknownOption("threshold of Reaches", number, ("a finite number",))
         whole_number("component of Reaches", fields.get("component", 0), least=0)
-        super().__init__(name=name, **fields)  # type: ignore[call-arg]
+        super().__init__(name=name, **fields)
 
     def happens(self, world: System) -> bool:
         """Tell whether it is there now."""
@@ -197,7 +197,7 @@ class On(Frozen):
             raise UnknownOption(
                 "event", event, ("Contact(first, second)", "Reaches(name, above=…)")
             )
-        super().__init__(event=event, act=as_act(act), **fields)  # type: ignore[call-arg]
+        super().__init__(event=event, act=as_act(act), **fields)
 
 
 TIMED = (At, Clamp, On)

@@ -55,11 +55,11 @@ def load_factory(reference: str) -> Callable[..., Any]:
         finally:
             if added and here in sys.path:
                 sys.path.remove(here)
-    found = getattr(module, name, None)
+    found: Callable[..., Any] | None = getattr(module, name, None)
     if not callable(found):
         offered = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise UnknownOption(f"function in {home}", name, offered)
-    return found  # type: ignore[no-any-return]
+    return found
 
 
 def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:

@@ -597,7 +597,8 @@ def clone(
                 say(f"round {round_}: loss {loss:.4f}; {words(scores) or 'not evaluated'}")
                 save_policy(path, policy, policy.about.with_card(trials=scores))
             policies.append(load_policy(str(path)))
-        means = [mean(policy.about.card.get("trials") or {}) for policy in policies]  # type: ignore[arg-type]
+        trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
+        means = [mean(scores) for scores in trials]
         last, best = folder / "policy.safetensors", folder / "best.safetensors"
         save_policy(last, policies[-1])
         if None in means:

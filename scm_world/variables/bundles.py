@@ -107,7 +107,7 @@ def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
     parts = variable.parts
     if not parts:
         return {variable.name: act}
-    mechanism: Any = variable.mechanism  # type: ignore[attr-defined]
+    mechanism: Any = getattr(variable, "mechanism", None)  # a bundle has one
     match act:
         case Draw() | Mechanism():
             return dict.fromkeys(parts, act.model_copy(update={"of": variable.name}))

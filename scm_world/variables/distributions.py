@@ -35,7 +35,7 @@ class Normal(Frozen):
     std: float = Field(default=1.0, ge=0.0)
 
     def __init__(self, mean: float = 0.0, std: float = 1.0, **fields: Any) -> None:
-        super().__init__(mean=mean, std=std, **fields)  # type: ignore[call-arg]
+        super().__init__(mean=mean, std=std, **fields)
 
     def parents(self) -> frozenset[str]:
         """Name the variables that it depends on: there are none."""
@@ -80,7 +80,7 @@ class Cylinder(Frozen):
     box: Box
 
     def __init__(self, box: Any, **fields: Any) -> None:
-        super().__init__(box=box, **fields)  # type: ignore[call-arg]
+        super().__init__(box=box, **fields)
 
     def parents(self) -> frozenset[str]:
         """Name the variables that the corners depend on."""

@@ -45,7 +45,7 @@ class Hard(Frozen):
     value: Number
 
     def __init__(self, value: Any, **fields: Any) -> None:
-        super().__init__(value=_number("Hard(value)", value), **fields)  # type: ignore[call-arg]
+        super().__init__(value=_number("Hard(value)", value), **fields)
 
 
 @final
@@ -61,7 +61,7 @@ class Shift(Frozen):
     by: Number
 
     def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=_number("Shift(by)", by), **fields)  # type: ignore[call-arg]
+        super().__init__(by=_number("Shift(by)", by), **fields)
 
 
 @final
@@ -72,7 +72,7 @@ class Scale(Frozen):
     by: Number
 
     def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=_number("Scale(by)", by), **fields)  # type: ignore[call-arg]
+        super().__init__(by=_number("Scale(by)", by), **fields)
 
 
 @final
@@ -109,7 +109,7 @@ class Draw(Frozen):
     def __init__(self, source: Any, **fields: Any) -> None:
         if not isinstance(source, Frozen | dict) and source not in SPACES:
             raise UnknownOption("Draw(source)", source, (*SPACES, "a distribution, such as a Box"))
-        super().__init__(source=source, **fields)  # type: ignore[call-arg]
+        super().__init__(source=source, **fields)
 
 
 @final
@@ -145,7 +145,7 @@ class Mechanism(Frozen):
         if not (callable(function) or isinstance(function, Function | Linear | dict)):
             allowed = ("a function of the parents", "Function", "Linear")
             raise UnknownOption("Mechanism(function)", function, allowed)
-        super().__init__(function=function, parents=named, **fields)  # type: ignore[call-arg]
+        super().__init__(function=function, parents=named, **fields)
 
 
 @final

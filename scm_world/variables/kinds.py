@@ -62,7 +62,7 @@ class Parent(Frozen):
     when: Literal["contact", "set"] | None = None
 
     def __init__(self, name: Any = None, lag: int = 0, when: str | None = None) -> None:
-        super().__init__(name=name, lag=lag, when=when)  # type: ignore[call-arg]
+        super().__init__(name=name, lag=lag, when=when)
 
 
 @final

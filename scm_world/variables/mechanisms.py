@@ -155,7 +155,8 @@ class Function(Frozen):
             found = getattr(found, part)
         if not callable(found):
             raise ModelError([f"{self.reference!r} is not a function"])
-        return found  # type: ignore[no-any-return]
+        function: Callable[..., Any] = found
+        return function
 
     def resolve(self) -> Callable[..., Any]:
         """Give the function, importing its module if need be."""

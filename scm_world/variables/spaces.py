@@ -73,6 +73,10 @@ class Frozen(BaseModel, metaclass=_Named):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    if TYPE_CHECKING:  # subclasses that take other arguments pass their fields on
+
+        def __init__(self, **fields: Any) -> None: ...
+
 
 @final
 class Affine(Frozen):
@@ -154,6 +158,10 @@ def _widened(low: Floats, high: Floats) -> tuple[Floats, Floats]:
 
 
 class _Space(Frozen):
+    if TYPE_CHECKING:  # as in ``Frozen``
+
+        def __init__(self, **fields: Any) -> None: ...
+
     def parents(self) -> frozenset[str]:
         """Name the variables that the bounds depend on."""
         return frozenset()
@@ -184,7 +192,7 @@ class Box(_Space):
     high: Bounds
 
     def __init__(self, low: Any, high: Any, **fields: Any) -> None:
-        super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
+        super().__init__(low=low, high=high, **fields)
 
     def model_post_init(self, context: Any) -> None:
         """Refuse an empty box; a validator would do so again in every declaration that has it."""
@@ -275,7 +283,7 @@ class Integers(_Space):
     high: int
 
     def __init__(self, low: int, high: int, **fields: Any) -> None:
-        super().__init__(low=low, high=high, **fields)  # type: ignore[call-arg]
+        super().__init__(low=low, high=high, **fields)
 
     @model_validator(mode="after")
     def _is_not_empty(self) -> Self:
@@ -321,7 +329,7 @@ class Categories(_Space):
     members: tuple[int, ...] = Field(min_length=1)
 
     def __init__(self, members: Any, **fields: Any) -> None:
-        super().__init__(members=tuple(members), **fields)  # type: ignore[call-arg]
+        super().__init__(members=tuple(members), **fields)
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Tell whether every component is a member."""
@@ -365,7 +373,7 @@ class Either(_Space):
     second: _Part
 
     def __init__(self, first: Any, second: Any, **fields: Any) -> None:
-        super().__init__(first=first, second=second, **fields)  # type: ignore[call-arg]
+        super().__init__(first=first, second=second, **fields)
 
     def parents(self) -> frozenset[str]:
         """Name the variables that the bounds depend on."""

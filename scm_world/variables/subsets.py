@@ -51,7 +51,7 @@ class Subset(Frozen):
         if isinstance(parts, str):
             parts = {"*": parts}
         pairs = parts.items() if isinstance(parts, Mapping) else parts
-        super().__init__(parts=tuple(_pair(pair) for pair in pairs), **fields)  # type: ignore[call-arg]
+        super().__init__(parts=tuple(_pair(pair) for pair in pairs), **fields)
 
     def region(self, name: str) -> Region | None:
         """Say where a variable may lie; None where it is not to be set."""

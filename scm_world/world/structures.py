@@ -119,7 +119,7 @@ class StructureCache:
         known = {
             v.name: static[v.name]
             for v in self.head.variables
-            if v.kind == "exogenous" and v.name not in targets  # type: ignore[attr-defined]
+            if isinstance(v, Exogenous) and v.name not in targets
         }
         values = model.solve(known, key=key)
         if not all(_possible(variable, values) for variable in self.head.variables):

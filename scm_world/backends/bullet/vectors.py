@@ -39,7 +39,7 @@ def scaled(factor: float, a: Vector) -> Vector:
 @njit(cache=True)
 def dot(a: Any, b: Any) -> float:
     """Compute the inner product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # type: ignore[no-any-return]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # type: ignore[no-any-return] # of floats
 
 
 @njit(cache=True)

@@ -119,7 +119,7 @@ class Walls(Building):
 
     def counts(self) -> tuple[int, ...]:
         """Say how many blocks each level has."""
-        return self.plan or self.regular()  # type: ignore[return-value] # what arrange gives
+        return self.plan or self.regular()  # type: ignore[return-value] # from ``arrange`` # what arrange gives
 
     def regular(self) -> tuple[int, ...]:
         """Count the blocks of each level of the wall that there is without interventions."""
@@ -310,7 +310,7 @@ class CreativeStackedBlocks(Walls):
         return obstacle_names(self._arranged()[1])
 
     def _arranged(self) -> Plan:
-        return self.plan or (self.regular(), self._obstacles)  # type: ignore[return-value]
+        return self.plan or (self.regular(), self._obstacles)  # type: ignore[return-value] # from ``arrange``
 
     def entities(self) -> Iterable[Entity]:
         """The wall, and small boxes."""

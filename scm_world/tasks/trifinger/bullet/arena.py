@@ -56,8 +56,8 @@ def _finger(finger: int, forms: Mapping[str, str]) -> Iterator[str]:
     """Describe the five links of a finger and the joints above them."""
     names = [hardware.link_name(hardware.FINGERS[finger], link) for link in range(4)]
     names.append(f"{names[3]}_tip")
-    tip = tuple(moment / hardware.TIP_MASS for moment in hardware.TIP_INERTIA)
-    inertials = (*hardware.INERTIAL, Inertial(_UNIT.center, _UNIT.orientation, tip))  # type: ignore[arg-type]
+    x, y, z = (moment / hardware.TIP_MASS for moment in hardware.TIP_INERTIA)
+    inertials = (*hardware.INERTIAL, Inertial(_UNIT.center, _UNIT.orientation, (x, y, z)))
     masses = (*hardware.LINK_MASS, hardware.TIP_MASS)
     for link, name in enumerate(names):
         form = forms.get(PARTS[link - 1]) if link else None
