@@ -19,7 +19,7 @@ from scm_world.backends.base import (
     EngineSnapshot,
 )
 from scm_world.backends.mujoco import fields, reading
-from scm_world.backends.mujoco.batch import MujocoBatch, Slot
+from scm_world.backends.mujoco.batch import MujocoBatch, BatchSlot
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import (
     Realization,
@@ -121,7 +121,7 @@ class MujocoBackend(Backend):
 
     _now: Realization
     _touches: Touches | None
-    slot: Slot | None = None
+    slot: BatchSlot | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
@@ -264,7 +264,7 @@ class MujocoBackend(Backend):
         """The compiled model, with parameters and state of the scene when it is not in a slot."""
         return self._now
 
-    def move_to(self, slot: Slot, mode: ControlMode) -> bool:
+    def move_to(self, slot: BatchSlot, mode: ControlMode) -> bool:
         """Copy the state to a slot; tell whether the model has changed since the last time."""
         now = self._now
         if mode is not now.mode:

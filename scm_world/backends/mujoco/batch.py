@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 KEPT = 4
 """Structures whose simulations are kept although no scene is in them at the moment."""
 
-_LEFT_BEHIND: list[_Group] = []
+_LEFT_BEHIND: list[_Simulations] = []
 """Simulations whose threads were left behind by a fork."""
 
 
 @final
-class Slot:
+class BatchSlot:
     """The place of one scene in a batch.
 
     Attributes:
@@ -38,7 +38,7 @@ class Slot:
 
     __slots__ = ("group", "index")
 
-    def __init__(self, group: _Group, index: int) -> None:
+    def __init__(self, group: _Simulations, index: int) -> None:
         self.group, self.index = group, index
 
     def take(self, scene: Realization) -> None:
@@ -58,7 +58,7 @@ class Slot:
 
 
 @final
-class _Group:
+class _Simulations:
     """The simulations of all scenes of one structure.
 
     Args:
@@ -75,7 +75,7 @@ class _Group:
         self.before: Floats = np.zeros(self.batch.state.shape if scene.lean else (n, 0))
         self.taken = np.zeros(n, dtype=np.int64)  # physics steps of the last step
         self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
-        self.slots = [Slot(self, index) for index in range(n)]
+        self.slots = [BatchSlot(self, index) for index in range(n)]
         # Scenes that are as the first one was share a copy of its model: it stays in the cache.
         self.usual = scene.fingerprint(), copy.copy(scene.model)
         self.models: list[mujoco.MjModel] = [self.usual[1]] * n
@@ -112,10 +112,10 @@ class MujocoBatch(EngineBatch):
     def __init__(self, backends: Sequence[MujocoBackend], threads: int) -> None:
         self._backends = tuple(backends)
         self._threads = max(1, min(threads, len(self._backends)))
-        self._groups: dict[Any, _Group] = {}
-        self._slots: list[Slot | None] = [None] * len(self._backends)
+        self._groups: dict[Any, _Simulations] = {}
+        self._slots: list[BatchSlot | None] = [None] * len(self._backends)
         self._process = os.getpid()
-        self._last: tuple[_Group, ControlMode] | None = None  # if all were stepped in one group
+        self._last: tuple[_Simulations, ControlMode] | None = None  # if all were stepped in one group
 
     def step(
         self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
@@ -142,7 +142,7 @@ class MujocoBatch(EngineBatch):
                 if problem:
                     raise EngineFailure(problem, "mujoco")
                 return
-        groups: dict[int, tuple[_Group, list[int]]] = {}
+        groups: dict[int, tuple[_Simulations, list[int]]] = {}
         changed: set[int] = set()
         for index in which.tolist():
             slot = self._slot(index)
@@ -164,7 +164,7 @@ class MujocoBatch(EngineBatch):
         if problems:
             raise EngineFailure("; ".join(problems), "mujoco")
 
-    def _slot(self, index: int) -> Slot:
+    def _slot(self, index: int) -> BatchSlot:
         """Return the slot of a scene in the group of its structure."""
         scene, slot = self._backends[index].realization, self._slots[index]
         if slot is not None and slot.group.structure == scene.structure:
@@ -175,13 +175,13 @@ class MujocoBatch(EngineBatch):
             unused = [key for key, other in self._groups.items() if id(other) not in used]
             for key in unused[: max(0, len(self._groups) + 1 - KEPT)]:
                 del self._groups[key]
-            group = _Group(scene, len(self._backends), self._threads)
+            group = _Simulations(scene, len(self._backends), self._threads)
             self._groups[scene.structure] = group
         slot = self._slots[index] = group.slots[index]
         return slot
 
 
-def _step(group: _Group, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
+def _step(group: _Simulations, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
     """Step and read; say what went wrong, or nothing."""
     said = ""
     try:
