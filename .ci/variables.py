@@ -31,7 +31,7 @@ def variables_page() -> str:
         "The tables show the structure that each task begins with; `F` stands for a "
         "finger (60, 120, 300) and `N` for a number. *Possible* is what physics allows; A is the "
         "training space and B the held-out one. *Follows* lists the causes: one control step "
-        "earlier for states, at once for everything else; `(set)` marks a cause that acts when "
+        "earlier for states, at lag 0 for everything else; `(set)` marks a cause that acts when "
         "something is set, and *contacts* stands for every physical quantity of the world.",
         "",
         "What `do` means depends on the role:",

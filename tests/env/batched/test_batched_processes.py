@@ -49,7 +49,7 @@ def test_a_process_that_is_killed_is_an_error() -> None:
     envs.reset(seed=0)
     worker: Worker = envs.executor._workers[1]
     os.kill(worker._process.pid, signal.SIGKILL)
-    text = r"environments 2 to 3 are lost: .* exit code -9; make the environments anew"
+    text = r"environments 2 to 3 are lost: .* exit code -9; make the environments again"
     for _ in range(2):
         with pytest.raises(EngineFailure, match=text):
             envs.step(actions(1)[0])
