@@ -19,7 +19,7 @@ from scm_world.backends.base import (
     EngineSnapshot,
 )
 from scm_world.backends.mujoco import fields, reading
-from scm_world.backends.mujoco.batch import MujocoBatch, BatchSlot
+from scm_world.backends.mujoco.batch import BatchSlot, MujocoBatch
 from scm_world.backends.mujoco.contacts import Touches
 from scm_world.backends.mujoco.realization import (
     Realization,

@@ -115,7 +115,9 @@ class MujocoBatch(EngineBatch):
         self._groups: dict[Any, _Simulations] = {}
         self._slots: list[BatchSlot | None] = [None] * len(self._backends)
         self._process = os.getpid()
-        self._last: tuple[_Simulations, ControlMode] | None = None  # if all were stepped in one group
+        self._last: tuple[_Simulations, ControlMode] | None = (
+            None  # if all were stepped in one group
+        )
 
     def step(
         self, which: Integers, mode: ControlMode, commands: Floats, substeps: int, into: Floats
