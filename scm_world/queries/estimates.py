@@ -32,7 +32,7 @@ class Effect:
         caution: When the interval is too short, as far as the sample can show; empty if it shows
             nothing of the kind.
         n: How many units; paired, each of them is simulated twice.
-        paired: Whether both interventions met the same noise.
+        paired: Whether both interventions had the same noise.
         variance_ratio: Variance of an unpaired difference over that of a paired one: so many
             times fewer units give an interval of the same length.
         treated: Mean under ``do``.
