@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
@@ -81,19 +81,9 @@ def routes_of(ahead: nx.DiGraph, column: Mapping[Any, int]) -> dict[tuple[Any, A
     }
 
 
-def neighbors_of(routes: Iterable[Collection[Item]]) -> dict[Item, list[Item]]:
-    """Return the neighbors of each item on a route."""
-    found: dict[Item, list[Item]] = {}
-    for route in routes:
-        for one, other in pairwise(route):
-            found.setdefault(one, []).append(other)
-            found.setdefault(other, []).append(one)
-    return found
-
-
 def heights_of(
     column: Mapping[Item, int],
-    near: Mapping[Item, Collection[Item]],
+    near: nx.Graph,
     height: Callable[[Item], float],
 ) -> dict[Item, float]:
     """Return the middle of each item, downwards from 0, so that few edges cross and most are short.
@@ -114,7 +104,7 @@ def heights_of(
     y = {item: (i + 0.5) / len(layer) for layer in ordered for i, item in enumerate(layer)}
     for sweep in range(40):
         for layer in ordered if sweep % 2 == 0 else reversed(ordered):
-            wanted = {i: np.mean([y[n] for n in near.get(i, ())] or [y[i]]) for i in layer}
+            wanted = {i: np.mean([y[n] for n in near[i]] or [y[i]]) for i in layer}
             if sweep < 24:
                 layer.sort(key=wanted.__getitem__)
                 y |= {item: (i + 0.5) / len(layer) for i, item in enumerate(layer)}
@@ -182,9 +172,11 @@ def lay_out(model: SCM) -> LayeredModel:
     column = columns_of(ahead)
     routes = routes_of(ahead, column)
     items = column | {item: item[2] for route in routes.values() for item in route[1:-1]}
-    y = heights_of(
-        items, neighbors_of(routes.values()), lambda i: BOX + GAP if isinstance(i, str) else LANE
-    )
+    near = nx.Graph()
+    near.add_nodes_from(items)
+    for route in routes.values():
+        nx.add_path(near, route)
+    y = heights_of(items, near, lambda item: BOX + GAP if isinstance(item, str) else LANE)
     step = WIDTH / (max(column.values(), default=0) + 1)
     half = min(170.0, 0.72 * step) / 2.0
     at = {item: (step * (number + 0.5), y[item]) for item, number in items.items()}
