@@ -142,7 +142,9 @@ def _edges(corners: Floats, edges: Floats) -> float:
     for i in range(3):
         a0, a1, a2 = corners[(i + 1) % 3]
         b0, b1, b2 = corners[(i + 2) % 3]
-        edges[i] = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+        edges[i, 0] = a1 * b2 - a2 * b1
+        edges[i, 1] = a2 * b0 - a0 * b2
+        edges[i, 2] = a0 * b1 - a1 * b0
     x, y, z = corners[0]
     volume: float = x * edges[0, 0] + y * edges[0, 1] + z * edges[0, 2]
     return volume

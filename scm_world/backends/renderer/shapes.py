@@ -30,6 +30,7 @@ from scm_world.backends.renderer.meshes import (
     shadow_map,
 )
 from scm_world.geometry import rotation_matrix
+from scm_world.geometry.arrays import compact, rows
 from scm_world.models.camera import Camera
 from scm_world.models.scene import GoalRegion, Light
 from scm_world.models.shapes import Kind, Mesh, Shape, corners, mesh_of
@@ -117,16 +118,15 @@ def goal_shapes(goals: Iterable[GoalRegion]) -> list[Shape]:
 def _table(shapes: Sequence[Shape]) -> Bodies:
     """Collect the shapes that are neither meshes nor planes."""
     round_ = [shape for shape in shapes if shape.kind in SOLIDS]
-    n = len(round_)
     return Bodies(
         np.array([SOLIDS[shape.kind] for shape in round_], dtype=np.int64),
-        np.array([shape.position for shape in round_]).reshape(n, 3),
-        np.array([shape.rotation for shape in round_]).reshape(n, 3, 3),
-        np.array([shape.halves for shape in round_]).reshape(n, 3),
-        np.array([shape.color for shape in round_]).reshape(n, 4)[:, :3].copy(),
+        rows([shape.position for shape in round_], 3),
+        compact([shape.rotation for shape in round_]).reshape(-1, 3, 3),
+        rows([shape.halves for shape in round_], 3),
+        rows([shape.color[:3] for shape in round_], 3),
         np.array([shape.body for shape in round_], dtype=np.int64),
         np.empty((0, 4)),
-        np.zeros(n + 1, dtype=np.int64),
+        np.zeros(len(round_) + 1, dtype=np.int64),
     )
 
 
