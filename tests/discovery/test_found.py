@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -176,6 +176,7 @@ def test_a_regression_without_rows_tells_nothing() -> None:
     assert regression_tail(1.0, 0.0, 1, 10.0) < 1e-100
 
 
+@settings(deadline=None)  # scipy is imported on the way
 @given(st.lists(st.integers(-5, 5), min_size=1, max_size=60).map(np.array))
 def test_normal_scores_follow_the_order(values: NDArray[np.int64]) -> None:
     """Equal numbers share a score, larger ones have a larger one, and signs turn around."""

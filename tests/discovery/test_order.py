@@ -75,6 +75,51 @@ def test_half_of_the_variables_may_be_set_at_once(seed: int) -> None:
     assert wrong(scm, drawn(scm, 2_000, seed, design="half", seen=0.3)) <= 1
 
 
+def projected(scm: SCM, targets: set[str]) -> Edges:
+    """List pairs of a target and what it acts on directly or through variables that are none."""
+    children: dict[str, list[str]] = {}
+    for edge in scm.edges:
+        children.setdefault(edge.cause, []).append(edge.effect)
+    found: Edges = set()
+    for cause in targets:
+        left = list(children.get(cause, []))
+        while left:
+            effect = left.pop()
+            if (cause, effect, 0) not in found:
+                found.add((cause, effect, 0))
+                left += [] if effect in targets else children.get(effect, [])
+    return found
+
+
+@pytest.mark.parametrize("share", [0.5, 0.75, 0.9])
+def test_what_was_never_set_may_be_a_hidden_cause(share: float) -> None:
+    """Edges are those of the latent projection: at most one in twenty is false, most are found."""
+    false = found = there = 0
+    for seed in range(6):
+        scm = random_model("er2:16", seed)
+        order = np.random.default_rng(seed).permutation(list(scm)).tolist()
+        targets = tuple(order[: round(share * len(order))])
+        data = collect(scm, Design("single", targets, DONE, 0.1), 2_400, seed=seed)
+        edges = set(learn("do_order", data).directed)
+        truth = projected(scm, set(targets))
+        false, found, there = false + len(edges - truth), found + len(edges), there + len(truth)
+    assert false <= 0.05 * found
+    assert found - false >= 0.6 * there
+
+
+def test_a_hidden_common_cause_makes_no_edge() -> None:
+    """Of two effects of a hidden cause one is set: the other one does not follow it."""
+    rng = np.random.default_rng(0)
+    targets = [((), ("a",))[i % 2] for i in range(600)]
+    u, noise = rng.normal(size=600), rng.normal(size=(600, 3))
+    a = np.where([bool(t) for t in targets], noise[:, 0], 2.0 * u + noise[:, 0])
+    b, m = 2.0 * u + noise[:, 1], a + 0.5 * noise[:, 2]
+    data = Dataset.of(np.column_stack([a, b, m]), ["a", "b", "m"], targets=targets)
+    found = learn("do_order", data)
+    assert found.directed == (("a", "m", 0),)
+    assert any("latent projection" in note for note in found.notes)
+
+
 def test_what_is_always_set_together_is_not_told_apart() -> None:
     """If all are set or none is, no edge between them is claimed, and a note says why."""
     scm = random_model("er2:8")

@@ -17,12 +17,21 @@ same rows. Earlier control steps are causes without that, because time has an or
 that is constant in an episode (a mass) is an effect only of other constants, at lag 0, and acts on
 all other variables at lag 1.
 
-It assumes that effects add up (``features`` gives them curves) and that no unobserved variable acts
-on two of those that were intervened on. Scales do not matter: standardised data give the same.
+Columns that vary but were never set may act on others, too, and so on a cause and its effect at
+once. Where there are such columns, there is no order to be found: an effect of a cause is then what
+follows the values to which the cause was set, with these values as instruments. The graph is the
+latent projection: an edge between two variables may pass through columns that were never set, and
+these have no effects in it.
+
+It assumes that effects add up (``features`` gives them curves) and that variables that are no
+columns act on no two of those that were intervened on, unless there are columns that were never
+set. Scales do not matter: standardised data give the same.
 
 Source:
     Invariance of a mechanism: Peters, Bühlmann and Meinshausen, *Causal inference by using
-    invariant prediction*, JRSS B 2016.
+    invariant prediction*, JRSS B 2016. Direct effects among hidden causes: Hyttinen, Eberhardt and
+    Hoyer, *Learning linear cyclic causal models with latent variables*, JMLR 2012; instruments
+    instead of covariances, with the sandwich variance of White, Econometrica 1980.
 """
 
 from __future__ import annotations
@@ -261,7 +270,7 @@ def do_order(
     Args:
         data: Rows in which nothing is done, or some variables are set at random.
         seed: Not used: nothing is drawn.
-        q: Expected share of false edges among those found, at most.
+        q: Expected share of false edges among those found, at most; not with ``ranks``.
         features: Highest power in which a cause may act: 1 for straight lines.
         ranks: Whether effects are replaced by the normal scores of their ranks, so that outliers do
             not count; for edges, not for the order.
@@ -281,6 +290,7 @@ def do_order(
     if not isinstance(features, int) or features not in POWERS:
         raise UnknownOption("features", features, map(str, POWERS))
     rows, still = _rows(data, blocks), _still(data)
+    hidden = _hidden(rows)
     causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
     if not causes.any():
         raise ModelError(
@@ -292,8 +302,13 @@ def do_order(
     from scipy.stats import false_discovery_control  # takes a third of a second
 
     form = _Form(features, ranks, spread)
-    p_values = _tested(rows, ~still & ~rows.past, causes & ~still, form)
-    if still.any():  # one row of each episode: the others say the same once more
+    if hidden.any():
+        p_values = _instrumented(rows, causes, form)
+    else:
+        p_values = _tested(rows, ~still & ~rows.past, causes & ~still, form)
+    if (
+        still.any() and not hidden.any()
+    ):  # one row of each episode: the others say the same once more
         _, first = np.unique(data.episode, return_index=True)
         begins = _rows(data.rows(first), blocks)
         p_values[:, still] = _tested(begins, still, causes & still, form)[:, still]
@@ -304,7 +319,9 @@ def do_order(
     chosen[tested] = false_discovery_control(p_values[tested], method="by") <= q
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = chosen[rows.block_of], weight[rows.block_of]
-    notes = (*_notes(data, rows, causes, separable), *_bent(rows, matrix, form))
+    notes = (*_notes(data, rows, causes, separable, hidden), *_bent(rows, matrix, form))
+    if ranks:
+        notes = (*notes, "of ranks: the share of false edges is not bounded by q")
     settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}
     return EstimatedGraph.of(data.names, matrix, edge_scores=sure, settings=settings, notes=notes)
 
@@ -364,6 +381,61 @@ def _tested(rows: Rows, effects: Bools, causes: Bools, form: _Form) -> Floats:
         for b, p in _tails(design, answers, blocks).items():
             found[b, column] = p
     return found
+
+
+def _hidden(rows: Rows) -> Bools:
+    """Return which columns may act unseen on a cause and its effect, shape (p,).
+
+    These are the columns that were never set, where a cause was free in some row and there are no
+    earlier control steps, whose order says what acts on what.
+    """
+    set_ = rows.targeted.any(axis=0)
+    free = bool((rows.targeted[:, set_] < 1).any())
+    return rows.alive & ~set_ & bool(free and set_.any() and not rows.past.any())
+
+
+def _instrumented(rows: Rows, causes: Bools, form: _Form) -> Floats:
+    """Test every block of causes with the values that were set as instruments, (blocks, p)."""
+    terms, owner = _features(rows, form.features)
+    found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
+    for column in np.flatnonzero(rows.alive).tolist():
+        free = ~rows.targeted[:, column]
+        used = causes & (rows.targeted[free].sum(axis=0) > 1)
+        used[column] = False
+        wanted = np.flatnonzero(used[owner])
+        design, given = terms[free][:, wanted], rows.targeted[free][:, owner[wanted]]
+        alone = np.where(given, 0.0, design).sum(axis=0) / np.maximum((~given).sum(axis=0), 1)
+        tools = np.where(given, design - alone, 0.0)  # what the design says about a cause
+        most = np.where(given, design, -np.inf).max(axis=0, initial=-np.inf)
+        least = np.where(given, design, np.inf).min(axis=0, initial=np.inf)
+        keep = (most - least > 1e-9) | (wanted < rows.x.shape[1])  # powers of one value say nothing
+        one = np.ones((int(free.sum()), 1))
+        design, tools = (np.hstack([part[:, keep], one]) for part in (design, tools))
+        wanted, rest = wanted[keep], len(one) - design.shape[1]
+        if not len(wanted) or rest < 1:
+            continue
+        inverse = np.linalg.pinv(tools.T @ design)
+        answers = _answers(rows.x[free, column], form.ranks, form.spread)
+        for y in answers:
+            weights = inverse @ (tools.T @ y)
+            scores = tools * (y - design @ weights)[:, None]
+            variance = inverse @ (scores.T @ scores) @ inverse.T * (len(one) / rest)
+            for b, where in enumerate(rows.blocks):
+                mine = np.flatnonzero(np.isin(owner[wanted], where))
+                if not len(mine):
+                    continue
+                spread = variance[np.ix_(mine, mine)] + EXACT / len(one) * np.eye(len(mine))
+                ratio = float(weights[mine] @ np.linalg.pinv(spread) @ weights[mine]) / len(mine)
+                p = len(answers) * _f_tail(ratio, len(mine), rest)
+                found[b, column] = min(found[b, column], 1.0, p)
+    return found
+
+
+def _f_tail(ratio: float, m: int, free: int) -> float:
+    """Return the probability of a larger F ratio."""
+    from scipy.special import fdtrc
+
+    return float(fdtrc(m, free, ratio))
 
 
 def _features(rows: Rows, highest: int) -> tuple[Floats, Ints]:
@@ -457,7 +529,9 @@ def _separable(rows: Rows) -> Bools:
     return np.asarray(separable)
 
 
-def _notes(data: Dataset, rows: Rows, causes: Bools, separable: Bools) -> tuple[str, ...]:
+def _notes(
+    data: Dataset, rows: Rows, causes: Bools, separable: Bools, hidden: Bools
+) -> tuple[str, ...]:
     found = []
     still = [name for name, varies in zip(data.names, rows.alive, strict=True) if not varies]
     if still:
@@ -473,9 +547,14 @@ def _notes(data: Dataset, rows: Rows, causes: Bools, separable: Bools) -> tuple[
     few = int((rows.alive & ((~rows.targeted).sum(axis=0) <= causes.sum() + 1)).sum())
     if few:
         found.append(f"{few} columns have too few rows for {int(causes.sum())} possible causes")
-    watched = int((rows.alive & ~causes & ~rows.past).sum())
-    if watched:
-        found.append(f"{watched} columns were never intervened on: they can be effects only")
+    never = int((rows.alive & ~causes & ~rows.past).sum())
+    if hidden.any():
+        found.append(
+            f"{never} columns were never intervened on: edges are those of the latent projection, "
+            "in which they have no effects"
+        )
+    elif never:
+        found.append(f"{never} columns were never intervened on: they can be effects only")
     return tuple(found)
 
 
