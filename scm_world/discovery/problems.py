@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
-from scm_world.discovery.data.recorded import first_label, settable
+from scm_world.discovery.data.recorded import first_name, is_state, settable
 from scm_world.discovery.learners.simulators import (
     EpisodeSimulator,
     PairedSimulator,
@@ -405,8 +405,8 @@ class WorldProblem:
         model = self._world.model
         outcomes = [outcome.name for outcome in self._outcomes]
         graph = nature_graph(model, self._contexts, outcomes)
-        named = {n: f"{first_label(model, n)} {n}".strip() for n in self._causes}
-        node = {f"{model.target(n)}@0" if first_label(model, n) else n: f for n, f in named.items()}
+        named = {n: first_name(model, n) for n in self._causes}
+        node = {f"{model.target(n)}@0" if is_state(model, n) else n: f for n, f in named.items()}
         node |= {outcome: outcome for outcome in outcomes}
         edges = tuple((node[c], node[e], 0) for c, e in projected(graph, node))
         ends = tuple(dict.fromkeys(outcomes))

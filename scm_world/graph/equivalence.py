@@ -182,11 +182,8 @@ def _apart(graph: Bools) -> Bools:
 # --- members of a class -----------------------------------------------------------------------
 
 
-def extension(graph: Bools, rng: np.random.Generator | None = None) -> Bools | None:
+def extension(graph: Bools) -> Bools | None:
     """Direct all edges, without a cycle or another v-structure; None if that is impossible.
-
-    ``rng`` chooses among the possible sinks; the first is taken if None. Every member of the class
-    can come, but not all with the same probability.
 
     Source:
         Dor and Tarsi, *A simple algorithm to construct a consistent extension of a partially
@@ -205,7 +202,7 @@ def extension(graph: Bools, rng: np.random.Generator | None = None) -> Bools | N
         sinks = np.flatnonzero(here & ~(left & ~left.T).any(axis=1) & ~strangers)
         if not len(sinks):
             return None
-        sink = sinks[0] if rng is None else rng.choice(sinks)
+        sink = sinks[0]
         dag[sink, free[sink]] = False
         left[sink], left[:, sink], here[sink] = False, False, False
     return dag

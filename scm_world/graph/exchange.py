@@ -10,9 +10,8 @@ import csv
 import io
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, final, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import networkx as nx
 import numpy as np
@@ -374,9 +373,7 @@ def to_causal_learn(source: SCM | nx.DiGraph, *, view: View = "two_slice") -> An
     return made
 
 
-@final
-@dataclass(frozen=True)
-class TigramiteGraph:
+class TigramiteGraph(NamedTuple):
     """What tigramite's functions take as ``graph`` and ``var_names``.
 
     Attributes:

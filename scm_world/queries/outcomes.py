@@ -121,11 +121,6 @@ def usual_outcomes(world: System) -> tuple[str, ...]:
     return found
 
 
-def watched(outcome: Any) -> tuple[str, ...]:
-    """Name the variables that have to be written down for an outcome."""
-    return (outcome.name,) if isinstance(outcome, Outcome) else ()
-
-
 def read(outcome: Any, episode: Episode) -> Floats:
     """Read an outcome off an episode, as numbers.
 

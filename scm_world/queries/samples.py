@@ -16,7 +16,7 @@ from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
-from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read, watched
+from scm_world.queries.outcomes import Outcome, as_numbers, as_outcome, column, read
 from scm_world.queries.parallel import Result, paths, run_units
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress
@@ -207,7 +207,7 @@ def sample(
     count = whole_number("n", n, least=1)
     given = (outcomes,) if isinstance(outcomes, str | Outcome) else outcomes
     wanted = [as_outcome(outcome) for outcome in given]
-    names = tuple(dict.fromkeys(name for outcome in wanted for name in watched(outcome)))
+    names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
     done = 0
 
     def finish(place: int, result: Result) -> list[Floats]:

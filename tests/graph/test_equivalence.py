@@ -102,23 +102,15 @@ def test_classes_on_four_nodes() -> None:
 
 @pytest.mark.parametrize("seed", range(30))
 def test_extensions_belong_to_the_class(seed: int) -> None:
-    """A random extension of an essential graph has that essential graph."""
+    """An extension of an essential graph has that essential graph."""
     rng = np.random.default_rng(seed)
     dag = random_dag(int(rng.integers(2, 25)), rng.uniform(0.05, 0.8), rng)
     essential = cpdag(dag)
-    member = extension(essential, rng)
+    member = extension(essential)
     assert member is not None
     assert is_acyclic(member)
     np.testing.assert_array_equal(cpdag(member), essential)
     np.testing.assert_array_equal(meek(essential), essential)
-
-
-def test_random_extensions_differ() -> None:
-    """Every one of the six orders of a triangle comes up."""
-    triangle = ~np.eye(3, dtype=bool)
-    rng = np.random.default_rng(0)
-    drawn = {extension(triangle, rng).tobytes() for _ in range(200)}  # type: ignore[union-attr]
-    assert len(drawn) == 6
 
 
 def test_a_square_without_chord_has_no_extension() -> None:

@@ -99,16 +99,16 @@ def labelled(columns: Iterable[Column], label: str) -> tuple[Column, ...]:
     return tuple(replace(c, name=lead + c.name, variable=lead + c.variable) for c in columns)
 
 
-def first_label(model: SCM, name: str) -> str:
+def first_name(model: SCM, name: str) -> str:
     """Name the beginning of a variable: of a state it is not what its end is.
 
     Example:
         >>> from scm_world.queries import World
         >>> model = World("pushing", backend="fake").model
-        >>> [first_label(model, name) for name in ("tool_block.mass", "joint_positions")]
-        ['', 'first']
+        >>> [first_name(model, name) for name in ("tool_block.mass", "joint_positions")]
+        ['tool_block.mass', 'first joint_positions']
     """
-    return "first" if is_state(model, name) else ""
+    return f"first {name}" if is_state(model, name) else name
 
 
 def is_state(model: SCM, name: str) -> bool:

@@ -17,7 +17,7 @@ from scm_world.discovery.data.recorded import (
     columns_of_outcome,
     default_causes,
     default_outcomes,
-    first_label,
+    first_name,
     is_state,
     labelled,
     reached,
@@ -100,7 +100,7 @@ class WorldSource:
         varied = tuple(dict.fromkeys((*chosen, *design.targets)))
         if outcomes is None:
             usual = default_outcomes(world, every_step=every_step)
-            outcomes = [o for o in usual if first_label(model, o.name) or o.name not in varied]
+            outcomes = [o for o in usual if is_state(model, o.name) or o.name not in varied]
         measured = _outcomes(outcomes, every_step=every_step)
         layout = world.compiled
         self._actions = {*(layout.actions if isinstance(layout, Layout) else layout.commanded)}
@@ -113,7 +113,7 @@ class WorldSource:
             parts = [columns_of(model.declared(name)) for name in self._watched]
         else:
             parts = [
-                *(labelled(columns_of(model.declared(n), "first"), first_label(model, n))
+                *(labelled(columns_of(model.declared(n), "first"), "first" * is_state(model, n))
                   for n in varied),
                 *(columns_of_outcome(model.declared(o.name), o) for o in measured),
             ]  # fmt: skip
@@ -186,7 +186,7 @@ class WorldSource:
         there = reached(model, names)
         if self._every_step:
             return tuple(n for n in there if step == 0 or not is_state(model, n))
-        return tuple(f"{first_label(model, n)} {n}".strip() for n in there)
+        return tuple(first_name(model, n) for n in there)
 
     def _row(self, episode: Episode) -> Floats:
         """Read an episode, shape (rows, p)."""
@@ -353,5 +353,5 @@ class Experiments:
 
     def _named(self, regime: Regime) -> Regime:
         model = self._model
-        names = (f"{first_label(model, n)} {n}".strip() for n in reached(model, regime.targets))
+        names = (first_name(model, name) for name in reached(model, regime.targets))
         return replace(regime, targets=tuple(names))

@@ -14,7 +14,7 @@ from typing import Any, Protocol, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.discovery.data.recorded import first_label
+from scm_world.discovery.data.recorded import first_name
 from scm_world.errors import InterventionError, ModelError
 from scm_world.graph import SCM, NoiseKey
 from scm_world.queries.experiments.effects import Effects, Series
@@ -198,7 +198,7 @@ class EpisodeSimulator:
         declared = world.model.declared
         self._drawn = tuple(n for n in self._causes if isinstance(declared(n), Exogenous))
         self._read = tuple(dict.fromkeys((*self._causes, *self._target.values())))
-        self._named = {n: f"{first_label(world.model, n)} {n}".strip() for n in self._causes}
+        self._named = {n: first_name(world.model, n) for n in self._causes}
         ends = (str(outcome).removeprefix("final ") for outcome in self._outcomes)
         self.names = (*self._named.values(), *ends)
 
