@@ -68,7 +68,7 @@ class Capabilities:
 @final
 @dataclass(frozen=True)
 class EngineSnapshot:
-    """All that decides how an engine goes on: state, parameters, caches. It can be pickled.
+    """All that decides the future of an engine: state, parameters, caches. It can be pickled.
 
     Attributes:
         engine: Name and version of the engine that took it.
@@ -190,7 +190,7 @@ class Backend(ABC):
 
         Args:
             backends: All of this class. Each can still be used by itself at any time.
-            threads: That an engine may use which can step several scenes at once.
+            threads: That an engine may use which can step several scenes together.
         """
         return OneByOne(backends)
 
@@ -264,7 +264,7 @@ class OneByOne(EngineBatch):
 class BackendWrapper(Backend, ABC):
     """Asks another engine for everything; derive from it and override what should differ.
 
-    A custom class needs a ``name``. If it remembers something between two steps, it has to
+    A custom class needs a ``name``. If it keeps something between two steps, it has to
     be forgotten in ``build`` and to be a part of ``snapshot`` and ``restore``.
 
     Args:
@@ -351,7 +351,7 @@ class InMemory(Backend, ABC):
         return self._structure
 
     def build(self, scene: Scene) -> None:
-        """Remember the scene."""
+        """Keep the scene."""
         self._structure, self._state = scene.structure, scene.structure.empty_state()
         self._parameters: dict[ParameterKey, Floats] = {}
         self._keep(scene.parameters)

@@ -38,7 +38,7 @@ class FakeBackend(InMemory):
         return self._parameters[body, "inertia"].copy()
 
     def step(self, mode: ControlMode, command: Floats, substeps: int) -> None:
-        """Let pass time.
+        """Advance time.
 
         Raises:
             EngineFailure: A number is not finite afterwards.

@@ -77,7 +77,7 @@ class StepModel:
         states: What the function moves, in the order of the state vector.
         actions: What a policy decides, in the order of the command.
         noise: What is random in every step; it follows the actions in a command.
-        vectorized: Whether the function takes many systems at once: every value has a leading
+        vectorized: Whether the function takes many systems together: every value has a leading
             axis, and no row may depend on another one, to the last bit.
         signature: How the function is called.
     """
@@ -93,7 +93,7 @@ class StepModel:
     signature: Literal["dicts", "arrays"] = "dicts"
 
     def realization(self, backend: str) -> None:
-        """Return None: the function itself says what happens."""
+        """Return None: the function itself is the physics."""
 
     @cached_property
     def digest(self) -> str:
@@ -322,7 +322,7 @@ class StepFunction(InMemory):
     _asked: StepModel | None = None
 
     def build(self, scene: Scene) -> None:
-        """Remember the scene.
+        """Keep the scene.
 
         Raises:
             ModelError: It is not that of a step function.

@@ -142,7 +142,7 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
     """Return a task.
 
     Args:
-        name: Of the task, or what ``make_task`` takes besides.
+        name: Of the task, or what else ``make_task`` takes.
         option: What differs from its defaults, each as ``name=value``.
 
     Raises:

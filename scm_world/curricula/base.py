@@ -44,7 +44,7 @@ class Progress:
 @final
 @dataclass
 class Memory:
-    """What a curriculum remembers from one episode to the next.
+    """The state of a curriculum between episodes.
 
     Attributes:
         episode: How many episodes have begun before the present one.
@@ -336,7 +336,7 @@ def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str])
         kind: Of the value.
         data: Plain data.
         form: What its ``"format"`` has to be.
-        trusted: Packages, besides this one, whose functions may be called.
+        trusted: Packages other than this one whose functions may be called.
 
     Raises:
         ModelError: It is something else, or it calls a function outside of those packages.

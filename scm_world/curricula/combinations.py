@@ -38,7 +38,7 @@ class _Timed(Part):
         return situation.due
 
     def acts(self, situation: Situation) -> Acts:
-        """Let it act, at its time."""
+        """Return the interventions of the part, at its time."""
         return self.part.acts(replace(situation, due=self.is_due(situation)))
 
 
@@ -147,7 +147,7 @@ class During(_Timed):
         super().__init__(part=as_part(part), **fields)
 
     def acts(self, situation: Situation) -> Acts:
-        """Let it act, in its episodes."""
+        """Return the interventions of the part, in its episodes."""
         return self.part.acts(situation) if self._includes(situation.episode) else {}
 
     def _includes(self, episode: int) -> bool:
@@ -188,7 +188,7 @@ class _Several(Part):
 
 @final
 class Together(_Several):
-    """Do all at once, of which the later one counts; ``together`` in a sentence.
+    """Do all together; of two on one quantity the later one counts; ``together`` in a sentence.
 
     Raises:
         UnknownOption: There is no part.
@@ -234,7 +234,7 @@ class InTurn(_Several):
         return self.of[episode // self.each % len(self.of)]
 
     def acts(self, situation: Situation) -> Acts:
-        """Let the one act whose turn it is."""
+        """Return the interventions of the part whose turn it is."""
         return self._present(situation.episode).acts(situation)
 
     def live(self, memory: Memory, episode: int) -> Iterator[Part]:
@@ -245,7 +245,7 @@ class InTurn(_Several):
 
 @final
 class Weighted(_Several):
-    """Do one by lot, anew in each episode; ``weighted`` in a sentence.
+    """Do one that is drawn in each episode; ``weighted`` in a sentence.
 
     Its arguments are pairs of a weight and a part.
 
@@ -275,7 +275,7 @@ class Weighted(_Several):
         super().__init__(*(part for _, part in pairs), weights=tuple(map(float, weights)), **fields)
 
     def acts(self, situation: Situation) -> Acts:
-        """Let the one act that was drawn at the beginning of the episode."""
+        """Return the interventions of the part that was drawn for the episode."""
         ends = np.cumsum(self.weights)
         drawn = replace(situation, step=0).uniform(self.key) * ends[-1]
         chosen = int(np.searchsorted(ends, drawn, side="right"))
@@ -315,7 +315,7 @@ class Stages(_Several):
         super().__init__(*parts, up=up, down=down, window=window, **fields)
 
     def acts(self, situation: Situation) -> Acts:
-        """Let the present stage act."""
+        """Return the interventions of the present stage."""
         return self.of[self.progress(situation.memory).level].acts(situation)
 
     def live(self, memory: Memory, episode: int) -> Iterator[Part]:
@@ -324,7 +324,7 @@ class Stages(_Several):
         yield from self.of[self.progress(memory).level].live(memory, episode)
 
     def progress(self, memory: Memory) -> Progress:
-        """Give what is remembered of this part."""
+        """Return the state of this part."""
         return memory.stages.setdefault(self.key, Progress())
 
     def ended(self, memory: Memory, *, success: bool) -> None:

@@ -25,7 +25,7 @@ FORMAT = "scm_world/curriculum/1"
 
 @final
 class Curriculum(Frozen):
-    """Who intervenes, and when: a value with JSON without loss.
+    """An intervention curriculum: immutable and JSON-serialisable.
 
     Attributes:
         part: What is done in which situation.
@@ -69,7 +69,7 @@ class Curriculum(Frozen):
 
         Args:
             data: Plain data.
-            trusted: Packages, besides this one, whose functions may be called.
+            trusted: Packages other than this one whose functions may be called.
 
         Raises:
             ModelError: It is no curriculum, or it calls a function outside of those packages.

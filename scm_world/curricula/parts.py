@@ -42,7 +42,7 @@ from scm_world.world.compiled_task import CompiledTask
 
 @final
 class Resample(Part):
-    """Draw variables anew; ``resample`` in a sentence.
+    """Draw variables again; ``resample`` in a sentence.
 
     Attributes:
         what: Names, patterns with ``*``, or groups such as ``"@looks"``; one or several.

@@ -1,4 +1,4 @@
-"""A curriculum for many environments at once: they count episodes and learn together."""
+"""A curriculum for many environments, which share its counts and its progress."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def make_vec(
         vectorization_mode: ``"native"``: many in one call of the engine; ``"processes"``:
             several in each of some processes; ``"loop"``: in this process, one after another;
             None: the fastest that there is. What comes out does not depend on it.
-        autoreset_mode: When a member that is done begins anew, as in Gymnasium.
+        autoreset_mode: When a member that is done is reset, as in Gymnasium.
         options: Of the environments; ``threads`` with ``"native"``, ``workers`` with
             ``"processes"``.
 
@@ -141,7 +141,7 @@ class CurriculumVectorEnv(VectorWrapper):
         self._success = np.zeros(self.num_envs, bool)
 
     def state(self) -> dict[str, Any]:
-        """Give what decides how the curriculum goes on, as plain data.
+        """Return the state of the curriculum, as plain data.
 
         Episodes that are not over begin again.
         """
@@ -151,7 +151,7 @@ class CurriculumVectorEnv(VectorWrapper):
         return {**self.memory.as_dict(), "again": again, "noises": places}
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Go on where ``state`` was taken, with the next reset of all members.
+        """Continue where ``state`` was taken, with the next reset of all members.
 
         Args:
             state: What ``state`` gave, of as many environments.

@@ -1,4 +1,4 @@
-"""What runs a curriculum: it counts episodes, remembers successes, and intervenes."""
+"""The wrapper that runs a curriculum: it counts episodes and successes, and intervenes."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class CurriculumRunner:
 
     Args:
         curriculum: What is done.
-        memory: Where it goes on; at the beginning if None.
+        memory: The state to continue from; the beginning if None.
 
     Attributes:
         curriculum: What is done.
-        memory: The state that decides how it goes on.
+        memory: The state of the curriculum.
     """
 
     def __init__(self, curriculum: Any, memory: Memory | None = None) -> None:
@@ -217,14 +217,14 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._place, self._running = where, False
 
     def state(self) -> dict[str, Any]:
-        """Give what decides how the curriculum goes on, as plain data.
+        """Return the state of the curriculum, as plain data.
 
         An episode that is not over begins again.
         """
         return {**self.memory.as_dict(), "noise": None if self.where is None else [*self.where]}
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Go on where ``state`` was taken, with the next reset, in any process.
+        """Continue where ``state`` was taken, with the next reset, in any process.
 
         A seed, or an episode, that the reset is given counts more than that of the state.
 

@@ -50,7 +50,7 @@ from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
 FORMAT = "scm_world/benchmark/1"
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
-LONGEST = 1e6  # [s] that can be waited for at once
+LONGEST = 1e6  # [s] of one wait
 
 # --- results --------------------------------------------------------------------------------------
 
@@ -236,7 +236,7 @@ def benchmark(
         problems: As ``problem`` takes them.
         budgets: How many rows, episodes or experiments a learner may use; a single one is also
             divided by 2, 4 and 8.
-        seeds: How many: models, data and learners are drawn anew with each.
+        seeds: How many: models, data and learners are drawn again with each.
         data: Kinds of data; what each learner can make most of if empty.
         view: Of tasks and worlds.
         timeout: Of a run [s]; None for no limit.

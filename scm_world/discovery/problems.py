@@ -384,7 +384,7 @@ class WorldProblem:
 
     @property
     def _contexts(self) -> dict[str, Any]:
-        """Let everything vary by itself that has a space of its own.
+        """Vary every variable that has its own space.
 
         Blocks begin near the middle, each in a sector of its own, so that no draw has to be
         rejected: rejection would make everything that is drawn depend on everything else.

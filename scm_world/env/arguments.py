@@ -112,7 +112,7 @@ def begin(
         seed: Of the noise.
         acts: What is done at the reset.
         attempts: How often bodies may be drawn into one place until that is an error. Every
-            attempt is the beginning of the next episode, so it draws anew.
+            attempt is the beginning of the next episode, so it draws again.
         episode: Number of the first one within the noise.
 
     Raises:

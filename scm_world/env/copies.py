@@ -26,7 +26,7 @@ class EnvSnapshot:
 
 
 class Copied(EzPickle):
-    """Makes an environment anew from its arguments, and puts its world where the other one is.
+    """Makes an environment again from its arguments, with the state of the other one.
 
     Attributes:
         world: That is simulated.
@@ -41,7 +41,7 @@ class Copied(EzPickle):
         return dict(self._ezpickle_kwargs)
 
     def snapshot(self) -> EnvSnapshot:
-        """Save everything that decides how the episode goes on.
+        """Save everything that decides the future of the episode.
 
         Raises:
             NotReset: There is no episode yet.

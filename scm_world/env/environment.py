@@ -70,7 +70,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     has one. ``info`` has ``success``, ``fractional_success`` and goals if the task has them. An
     intervention that changes which bodies exist changes what is
     observed: ``observation_space`` is then the one of the new structure. A copy, or what comes
-    out of a pickle, goes on bit for bit like the original.
+    out of a pickle, continues bit-identically to the original.
 
     Args:
         task: Name of a registered task, or a task.
@@ -287,7 +287,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         Raises:
             UnknownOption: Another key.
             InterventionError: The intervention was refused.
-            ModelError: A reward term of one's own is no number.
+            ModelError: A custom reward term is no number.
         """
         super().reset(seed=seed)
         asked_for = {} if options is None else options
@@ -345,7 +345,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         if self._delta is not None:
             given = self._delta.absolute(np.array(given, dtype=np.float64))
         self._given[...] = given  # every 32-bit number is a 64-bit one
-        command = np.empty(given.shape)  # the world remembers it
+        command = np.empty(given.shape)  # the world keeps it
         if not scaled_clip_kernel(self._given, *self._range, command):
             raise ActionError(f"an action is {finite(command.size)}, got {action!r}", action)
         return command

@@ -1,4 +1,4 @@
-"""``scm_world/Model-v0``: an environment of any model, from a file or a task of one's own."""
+"""``scm_world/Model-v0``: an environment of any model, from a file or a custom task."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from scm_world.world.mechanisms import places
 # --- bounds ---------------------------------------------------------------------------------------
 
 WIDE = float(np.finfo(np.float32).max)
-"""Stands for no bound: Gymnasium wants finite ones, and no 32-bit number lies beyond."""
+"""Stands for no bound: Gymnasium requires finite ones, and no 32-bit number lies beyond."""
 
 _COORDINATES: dict[str, tuple[Any, Any]] = {
     "cylindrical_position": ((0.0, -np.pi, -1.0), (1.5, np.pi, 1.0)),  # [m, rad, m]

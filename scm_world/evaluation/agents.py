@@ -31,7 +31,7 @@ Trained = Sequence[tuple[str, PolicyAbout | None]]
 """Agents, and what each was trained for, if it says so."""
 
 TASK = "pushing"
-"""Where agents act that say nothing, if nobody says anything."""
+"""The default task of agents that name none."""
 
 
 @final

@@ -80,7 +80,7 @@ class Fingerprint:
         self.look()
 
     def look(self) -> None:
-        """Take in the state, and the parameters if somebody has intervened."""
+        """Take in the state, and the parameters after an intervention."""
         world = self._world
         now, present = world.current()
         if world.version != self._version:

@@ -186,7 +186,7 @@ def why(
         done_there = shard_runner.setup.protocols[shard.protocol]
         player, runner = shard_runner.setup.agents[shard.agent].player, shard_runner.runner(shard)
         runner.env.reset(seed=seed, options={"episode": episode})
-        usual = runner.env.world.values()  # where nobody intervenes
+        usual = runner.env.world.values()  # without interventions
         against: dict[str, Any] = {n: versus or _versus(runner, usual, n, row) for n in row.drawn}
         for done, (name, how) in enumerate(against.items()):
             part = Instead(of=done_there.part, name=name, versus=how)

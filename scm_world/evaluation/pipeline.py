@@ -54,7 +54,7 @@ class ShardRunner:
         )
 
     def runner(self, shard: Shard) -> EpisodeRunner:
-        """Give where the episodes of a shard happen: on its engine, in the form of its agent."""
+        """Return the runner of a shard: its backend, and the options of its agent."""
         key = self.setup.where(shard)
         if key not in self.runners:
             self.runners[key] = EpisodeRunner(self.setup.env(shard))
@@ -104,7 +104,7 @@ def evaluate(
             policies that can be pickled or are named by a text.
         engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
             ``engine_of``.
-        out: Folder, or a URL, for what is finished; the same call goes on there after an
+        out: Folder, or a URL, for what is finished; the same call resumes there after an
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
         progress: Called with how many episodes are done, and how many there are.
@@ -118,7 +118,7 @@ def evaluate(
         EvaluationError: A policy gave no action, or an intervention was refused, with the place;
             all other shards are played and safe by then.
         EngineFailure: Three workers ended over one shard.
-        UnreadableFile: Somebody else is writing to the folder, or a file in it is damaged.
+        UnreadableFile: Another process is writing to the folder, or a file in it is damaged.
 
     Example:
         >>> found = evaluate("still", "P0,P5", n=2, backend="fake", env={"max_episode_length": 3})

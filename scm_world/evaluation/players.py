@@ -223,7 +223,7 @@ def _function(policy: Any, env: ScmWorldEnv) -> Actor:
 
 
 def _model(model: Any, env: ScmWorldEnv) -> Actor:
-    """Carry what a recurrent model remembers from step to step."""
+    """Carry the state of a recurrent model from step to step."""
     state, first = None, True
 
     def act(observation: Any) -> Any:

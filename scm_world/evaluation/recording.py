@@ -190,7 +190,7 @@ class Recording:
 
         Args:
             path: Of the file.
-            trusted: Packages, besides this one, whose functions may be mechanisms.
+            trusted: Packages other than this one whose functions may be mechanisms.
 
         Raises:
             MissingExtra: pyarrow is not installed.
@@ -407,7 +407,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         episode.interventions = self._inner.interventions
 
     def _update(self, episode: _Episode) -> None:
-        """Record the present instant anew if there was an intervention since."""
+        """Record the present instant again if there was an intervention since."""
         if self._inner.world.version != self._version:
             observation, info = self._inner.present()
             del episode.observations[-1], episode.states[-1]

@@ -35,7 +35,7 @@ DRAWN = "drawn "
 """First word of the columns with the values that were drawn."""
 
 RATES = (*FRACTIONS, "success")
-"""The metrics that lie in [0, 1] whatever happens."""
+"""The metrics that always lie in [0, 1]."""
 
 Columns = dict[str, NDArray[Any]]
 

@@ -41,11 +41,11 @@ _MINE = ("task", "backend", "render_mode")
 @final
 @dataclass(frozen=True)
 class EvaluationPlace:
-    """Where episodes happen.
+    """Where episodes are run.
 
     Attributes:
         task: Name, or a task.
-        options: Of the environment, besides task and engine.
+        options: Of the environment, without task and backend.
     """
 
     task: Task | str
@@ -289,7 +289,7 @@ def prepare(
 
 
 def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
-    """Name the task in which policies act if nobody says anything else.
+    """Name the default task of policies.
 
     Args:
         policy: As in ``prepare``.

@@ -56,7 +56,7 @@ def hull_of(points: ArrayLike) -> Hull:
     """Wrap points in a convex polyhedron of uniform density.
 
     The result is expressed in the frame of its center of mass and its principal axes, and
-    remembers how these lay. Order and signs of the axes are those that turn the points least;
+    keeps how these lay. Order and signs of the axes are those that turn the points least;
     where moments are equal, and axes can be chosen, too. A shape whose axes are principal axes is
     not turned at all.
 

@@ -3,7 +3,7 @@
 Bodies are numbered: first the boxes that can move, then the bodies made of capsules, then the
 boxes that cannot, then the floor (the plane z = 0) and the wall (see ``penetration``). Several
 capsules may belong to one body; the deepest counts. Every box that can move is compared with
-everything; what a capsule is compared with besides these is up to its flags. What cannot move is
+everything; further comparisons of a capsule are up to its flags. What cannot move is
 not compared with one another.
 """
 

@@ -93,7 +93,7 @@ def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
 
 
 def adds_edges(act: AppliedIntervention) -> bool:
-    """Return whether an intervention gives its target causes: then the order is computed anew."""
+    """Return whether an intervention gives its target causes: then the order is computed again."""
     if isinstance(act.intervention, Draw):
         return bool(source_of(act).parents())
     return isinstance(act.intervention, Mechanism)

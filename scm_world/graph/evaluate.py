@@ -41,7 +41,7 @@ class NoiseKey:
         origin: The control step at which variables got their own noise, if that was another one:
             what was drawn at the start of an episode stays, however late one intervenes.
         attempt: How many draws were rejected before, because they were infeasible.
-        kept: Variables that are not drawn anew at another attempt.
+        kept: Variables that are not drawn again at another attempt.
     """
 
     noise: Noise

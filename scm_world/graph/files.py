@@ -60,8 +60,8 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
 
     Args:
         data: Plain data.
-        trusted: Packages whose functions may serve as mechanisms, besides those of this package
-            that compute numbers.
+        trusted: Packages whose functions may serve as mechanisms, in addition to those of this
+            package that compute numbers.
 
     Raises:
         ModelError: The data is no model, or names a function outside the trusted packages.

@@ -89,7 +89,7 @@ class Input(Row):
 @final
 @dataclass(frozen=True)
 class Readout:
-    """Something that follows from states and parameters at once, such as the place of a site.
+    """A quantity that follows from states and parameters at lag 0, such as the place of a site.
 
     Attributes:
         name: ``"<element>.<attribute>"``.
@@ -123,7 +123,7 @@ class Model:
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
         inputs: The components of a command, in order.
-        readouts: What follows at once from the others; those that were asked for.
+        readouts: What follows at lag 0 from the others; those that were asked for.
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
         notes: What acts without having a variable (plugins, flex), one sentence each.

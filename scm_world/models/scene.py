@@ -24,7 +24,7 @@ class StateLayout:
         names: Of the states, in their order.
         sizes: How many numbers each of them has.
         start: The vector before anything is set, shape (size,).
-        reported: Names of those that the engine reports and nobody can set.
+        reported: Names of those that the engine reports and that cannot be set.
     """
 
     names: tuple[str, ...]

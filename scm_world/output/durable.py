@@ -43,8 +43,8 @@ def is_draft(name: str, of: str = "") -> bool:
 def write_durably(path: Location | str, data: bytes) -> None:
     """Write a file, whole or not at all; it is on the disk when this ends.
 
-    Of several writers at once the last one decides; a reader always finds a whole file. Behind a
-    URL all of this is as fsspec and the store have it.
+    Of several simultaneous writers the last one decides; a reader always finds a whole file.
+    Behind a URL all of this is as fsspec and the store have it.
 
     Raises:
         UnwritableFolder: There is no room, or no permission; what was there is still there.
@@ -137,7 +137,7 @@ def locked(folder: Location | str) -> Iterator[None]:
     of this package is the same, whoever writes it.
 
     Raises:
-        UnreadableFile: Somebody else is writing to it.
+        UnreadableFile: Another process is writing to it.
         UnwritableFolder: There is no permission, or a file in its place.
     """
     path = located(folder)

@@ -100,8 +100,8 @@ def as_policy(given: Any, world: Any = None) -> Policy:
     """Turn what a user gives into a policy for one rollout.
 
     Args:
-        given: A policy, actions, ``"random"``, ``"mpc"`` (plans), or None: the action that lets
-            the system be, as it was in the first step. Of the block-building robot also
+        given: A policy, actions, ``"random"``, ``"mpc"`` (plans), or None: the idle
+            action of the first step. Of the block-building robot also
             ``"sweep"`` (to the middle), ``"across"`` (one finger), ``"grasp"`` (blocks, to their
             goals), ``"hold"`` (likewise, but the last block is not let go of).
         world: In which it acts, if that is known already.
@@ -122,7 +122,7 @@ def as_policy(given: Any, world: Any = None) -> Policy:
 
 
 class _Idle(Blind):
-    """Lets the system be: the same action as when it was asked for the first time."""
+    """The idle policy: the same action as in its first call."""
 
     def __init__(self) -> None:
         self._action: Floats | None = None

@@ -28,7 +28,7 @@ class Consequence:
         before: Its value before the intervention.
         right_after: Right after it.
         after: At the end.
-        without: At the end, had nobody intervened.
+        without: At the end, without the intervention.
         difference: Largest difference of a component between these two.
     """
 

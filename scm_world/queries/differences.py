@@ -16,7 +16,7 @@ from scm_world.queries.outcomes import as_outcome, read
 from scm_world.variables import Draw, Natural
 
 NOISY = ("sensor_noise", "actuator_noise")
-"""Parameters that let noise into an episode while they are not zero."""
+"""Parameters that add noise to an episode while they are not zero."""
 
 
 @final

@@ -1,4 +1,4 @@
-"""Episodes that are remembered whole, and what would have happened otherwise."""
+"""Recorded episodes and their counterfactuals."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from scm_world.world import Audit
 
 @final
 class Episode:
-    """One unit of the world: its noise, its interventions and all that happened.
+    """One unit of the world: its noise, its interventions and its states.
 
-    Everything is exact: an episode can be gone through again, and branched off, bit for bit.
+    Replays and counterfactuals are bit-identical.
 
     Args:
         twins: Twins of the world that it happened in.
-        unit: What was to happen.
-        trace: What it left behind.
+        unit: What was run.
+        trace: What was recorded.
 
     Attributes:
         seed: Of the noise.
@@ -53,7 +53,7 @@ class Episode:
         self.trace = trace
         self._all: Trace | None = None
 
-    # --- looking ------------------------------------------------------------------------------
+    # --- reading ------------------------------------------------------------------------------
 
     @property
     def plan(self) -> Plan:
@@ -115,7 +115,7 @@ class Episode:
         return np.asarray(self[name][-1])
 
     def replay(self) -> Trace:
-        """Go through the episode again, with every variable and every contact written down."""
+        """Replay the episode, and record every variable and every contact."""
         if self._all is None:
             with self.twins.twin() as world:
                 self._all = replace(self._again(), names=(ALL,), contacts=True).run(world)
@@ -131,7 +131,7 @@ class Episode:
         held = ", ".join(f"{name} from {at}" for at, plan in self.layers for name in plan)
         return f"Episode({self.steps} steps, seed {self.seed}, number {self.number}, do({held}))"
 
-    # --- what would have been -----------------------------------------------------------------
+    # --- counterfactuals -----------------------------------------------------------------
 
     def counterfactual(
         self,
@@ -141,16 +141,16 @@ class Episode:
         actions: Any = "replay",
         record: Iterable[str] = (),
     ) -> Episode:
-        """Go back, intervene, and let the same noise happen again.
+        """Restore an instant, intervene, and continue with the same noise.
 
         Args:
-            do: What is done; without a time it is done at the instant ``at``.
+            do: The intervention; without a time it takes place at the instant ``at``.
             at: Number of the control step.
-            actions: ``"replay"`` for the same actions, or a policy that chooses anew from there.
-            record: Variables to write down on the way; others are found by going through again.
+            actions: ``"replay"`` for the same actions, or a policy that acts from there on.
+            record: Variables to record during the run; others are computed by replaying it.
 
         Returns:
-            The episode as it would have been; the same one, bit for bit, if nothing is done.
+            The counterfactual episode; bit-identical to this one without an intervention.
 
         Raises:
             InterventionError: The intervention was refused.
@@ -170,7 +170,7 @@ class Episode:
     def _unit(
         self, do: Mapping[str, Any] | None, at: int, actions: Any, names: tuple[str, ...]
     ) -> Unit:
-        """Say what is to happen from an instant on."""
+        """Return the unit that continues from an instant."""
         before = [d.model for step, d in self.trace.declarations if step < max(at, 1)]
         whole = tuple(name for name in names if all(name in model for model in before))
         past = self.trace.until(at)
@@ -214,7 +214,7 @@ class Episode:
         return near
 
     def _go_through(self, world: System, first: int, last: int) -> Trace:
-        """Let the same happen again, from after what was done at an instant."""
+        """Replay from an instant, after its interventions."""
         running = Running(replace(self._again(), steps=last), world)
         running.trace.fired = dict(self.trace.fired)
         run(running, first, last)
@@ -229,7 +229,7 @@ class Episode:
         record: Iterable[str] = (),
         workers: int | None = None,
     ) -> tuple[Episode, ...]:
-        """Let parallel worlds run with the same noise, one for each intervention.
+        """Run counterfactuals with the same noise, one for each intervention.
 
         Args:
             dos: What is done in each.

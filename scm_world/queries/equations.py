@@ -79,7 +79,7 @@ class Layout(ActionVector):
 @final
 @dataclass(frozen=True)
 class Saved:
-    """An instant of ``Equations``; it decides how they go on."""
+    """An instant of ``Equations``; it decides what follows."""
 
     models: tuple[SCM, ...]
     values: Values
@@ -131,7 +131,7 @@ class Equations:
         self._action: Values = {}
         self._solved: dict[str, Value] | None = None
 
-    # --- what a world tells -------------------------------------------------------------------
+    # --- what a world reports -------------------------------------------------------------------
 
     @property
     def action_low(self) -> Floats:
@@ -261,7 +261,7 @@ class Equations:
         self._solved = None
 
     def snapshot(self) -> Saved:
-        """Save everything that decides how it goes on."""
+        """Save everything that decides what follows."""
         models, noise = tuple(self._models), self.noise
         return Saved(
             models, self._now(), self._before, self._action, self.index, noise.seed, self.episode

@@ -61,7 +61,7 @@ class Experiment:
 
 @final
 class Journal:
-    """Remembers experiments, in a file if there is one.
+    """A log of experiments, in a file if there is one.
 
     Args:
         path: Of the file; what is in it is read.
@@ -119,7 +119,7 @@ class Journal:
         self.records.append(record)
 
     def refuse_others(self) -> None:
-        """Refuse to go on if another laboratory has written to the file.
+        """Refuse to continue if another laboratory has written to the file.
 
         Raises:
             UnreadableFile: The file is not as it was left.
@@ -177,7 +177,7 @@ class Laboratory:
     """Experiments on a world, without a look at its graph.
 
     Every experiment is checked before it begins, and written to the log when it has ended; a
-    laboratory that is opened with the log of an earlier one goes on where that one was.
+    laboratory that is opened with the log of an earlier one continues it.
 
     Args:
         world: Is not touched.
@@ -188,7 +188,7 @@ class Laboratory:
         outcomes: What an experiment reports: names of visible variables (their final values) or
             ``Outcome``; the final values of all that is visible if None.
         log: File to write to; a line of JSON for each experiment. One laboratory at a time.
-        trusted: Packages whose functions may be mechanisms of a log that is gone on with.
+        trusted: Packages whose functions may be mechanisms of a log that is continued.
         setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``. A
             policy that is a function has to be the same one for a log; that cannot be checked.
 
@@ -242,7 +242,7 @@ class Laboratory:
         self._journal = Journal(log, self.terms(), trusted)
 
     def terms(self) -> dict[str, Any]:
-        """Say what has to be the same for a log to be gone on with."""
+        """Return what has to be the same for a log to be continued."""
         setting = self._setting
         given = self._world.task.given
         return {

@@ -35,7 +35,7 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.DiGrap
         world: It is left as it is, bit for bit.
         action: Of the coming control step, which is simulated to see what touches in each of its
             physics steps, and undone. If None, the graph is that of the last physics step: all
-            that an engine remembers of the past.
+            that a backend keeps of the past.
 
     Returns:
         A graph of bodies. Its nodes carry ``moves``; what stands still points at what it touches.

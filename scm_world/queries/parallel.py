@@ -112,7 +112,7 @@ def _in_batches(twins: Twins, units: Sequence[Unit], n: int, threads: int) -> Re
             some = units[first : first + n]
             try:
                 yield from run_together(batch, some)
-            except EngineFailure:  # alone, it ends nothing but the unit in which it happens
+            except EngineFailure:  # run separately, it ends its own unit only
                 yield from _separately(twins, some, lambda _, result: result, 1)
 
 
@@ -131,7 +131,7 @@ def _solved(twins: EquationTwins, units: Sequence[Unit]) -> list[Result]:
     """Run units: together where they can be, else one by one."""
     try:
         together = _solved_together(twins, units)
-    except Exception:  # alone, it ends nothing but the unit in which it happens
+    except Exception:  # run separately, it ends its own unit only
         together = None
     if together is None:
         return [unit.result(Equations(twins.layout)) for unit in units]
@@ -230,7 +230,7 @@ def executor_for(twins: Twins, units: Sequence[Unit], workers: int) -> Executor 
 
     Args:
         twins: Of the world.
-        units: What is to happen.
+        units: What is to be run.
         workers: How many processes there may be.
     """
     steps = sum(unit.steps - unit.first for unit in units)

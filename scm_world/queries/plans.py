@@ -25,8 +25,8 @@ _PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Ti
 class Plan(Mapping[str, tuple[Any, ...]]):
     """What is done to which variable, and when. A plan is a value: nothing changes it.
 
-    Later wins: ``do(a).do(b) == do({**a, **b})``. What is given without a time happens at the
-    beginning: of the episode, or at the instant from which a counterfactual goes on.
+    Later wins: ``do(a).do(b) == do({**a, **b})``. What is given without a time takes place at the
+    beginning: of the episode, or at the instant from which a counterfactual continues.
 
     Args:
         request: By variable, dotted or nested: a value, an intervention, or one with a time
@@ -79,7 +79,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return both
 
     def at_start(self) -> dict[str, Intervention]:
-        """Give what happens at the beginning, by variable."""
+        """Return the interventions at the beginning, by variable."""
         return {
             name: part
             for name, parts in self._parts.items()
@@ -88,7 +88,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         }
 
     def at_first(self) -> dict[str, Intervention]:
-        """Give what happens at the first instant, with or without a time, by variable."""
+        """Return the interventions at the first instant, with or without a time, by variable."""
         found = self.at_start()
         for name, part in self.timed():
             if (isinstance(part, At) and part.step == 0) or (
@@ -98,7 +98,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return found
 
     def timed(self) -> Iterator[tuple[str, Any]]:
-        """List what happens later, or on an event."""
+        """List the interventions at later instants or on events."""
         for name, parts in self._parts.items():
             yield from ((name, part) for part in parts if isinstance(part, TIMED))
 
@@ -128,7 +128,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
         Args:
             data: Plain data.
-            trusted: Packages, besides this one, whose functions may serve as mechanisms.
+            trusted: Packages other than this one whose functions may serve as mechanisms.
 
         Raises:
             ModelError: It is no plan, or it names a function outside of the trusted packages.
@@ -196,7 +196,7 @@ class Schedule:
         layers: In the order of their making.
 
     Raises:
-        InterventionError: Something should happen before its plan begins, or a state is to be
+        InterventionError: An intervention is due before its plan begins, or a state is to be
             held at what is no value.
     """
 
@@ -221,7 +221,7 @@ class Schedule:
         Args:
             world: As it is then; events are looked for in it.
             step: Number of the control step.
-            fired: When events happened; those that happen now are added.
+            fired: When events happened; those of now are added.
         """
         if self._is_simple and step not in self._starts:
             return {}

@@ -51,8 +51,8 @@ class Questions(ABC):
 
         Args:
             policy: A function of the world that gives an action, shape (n_actions,); actions of
-                shape (n_actions,) or (steps, n_actions); ``"random"``; or None: the action that
-                lets the system be. See ``as_policy`` for others that have a name.
+                shape (n_actions,) or (steps, n_actions); ``"random"``; or None: the idle
+                action. See ``as_policy`` for others that have a name.
             seed: Of the noise.
             episode: Number of the episode within that noise.
             do: Interventions, with or without a time.

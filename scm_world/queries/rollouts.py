@@ -1,4 +1,4 @@
-"""How episodes run: the rollout loop, and the trace that it leaves."""
+"""How episodes run: the rollout loop, and its trace."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ALL = "*"
 @final
 @dataclass
 class Trace:
-    """Everything that a rollout leaves behind.
+    """Everything that a rollout records.
 
     Attributes:
         vectors: State of each instant, after what was done then.
@@ -53,7 +53,7 @@ class Trace:
     touching: list[frozenset[tuple[str, str]]] = field(default_factory=list)
 
     def until(self, step: int) -> Trace:
-        """Copy what was before an instant, for a world that goes on otherwise from there."""
+        """Copy what was before an instant, for a run that differs from there on."""
         return Trace(
             vectors=self.vectors[:step],
             statics=[pair for pair in self.statics if pair[0] < step],
@@ -110,7 +110,7 @@ class Unit:
         policy: Who acts; see ``rollout``.
         steps: How many control steps the episode has.
         names: Variables to record at every instant; ``ALL`` for all.
-        first: The control step at which it goes on; 0 for a new episode.
+        first: The control step from which it continues; 0 for a new episode.
         past: What was before that.
         start: The world at that instant, before anything is done then; None for a new episode.
         contacts: Whether to record which bodies touch, where there are bodies.
@@ -236,7 +236,7 @@ class Running:
             trace.touching.append(frozenset((one, other) for one, other in pairs))
 
     def act(self, step: int) -> None:
-        """Let the policy act, and take a control step."""
+        """Ask the policy for an action, and take a control step."""
         action = _chosen(self.policy, self.world)
         self.world.step(action)
         self.trace.actions.append(action)
@@ -304,7 +304,7 @@ class RunningTogether:
         return [self._errors.get(row, one.trace) for row, one in enumerate(self._rows)]
 
     def _alone(self, row: int, step: int) -> None:
-        """Let one world begin or intervene by itself, and record the instant."""
+        """Reset or intervene in one world alone, and record the instant."""
         one = self._rows[row]
         self._flush(row)
         self._pending[row] = False

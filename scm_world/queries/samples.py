@@ -1,4 +1,4 @@
-"""Seeing and doing: episodes drawn from a world, as a table."""
+"""Samples: episodes of a world or model, as a table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STEPS = 25
 @final
 @dataclass(frozen=True)
 class Setting:
-    """Under which circumstances episodes happen.
+    """The circumstances of episodes.
 
     Attributes:
         policy: Who acts; see ``rollout``.
@@ -68,7 +68,7 @@ class Setting:
         return found
 
     def plan(self, world: System, do: Mapping[str, Any] | None) -> Plan:
-        """Say what happens to a unit: what is done to it, and what varies by itself.
+        """Combine the intervention on a unit with the context that varies by itself.
 
         Args:
             world: Knows which names are coordinates of one quantity.
@@ -81,7 +81,7 @@ class Setting:
         return Plan(merged(world.model, nature, acts))
 
     def unit(self, world: System, plan: Plan, number: int, names: Iterable[str] = ()) -> Unit:
-        """Say what is to happen in an episode.
+        """Return the unit of an episode.
 
         Args:
             world: Knows how long an episode is.
@@ -104,7 +104,7 @@ class Setting:
     def episode(
         self, twins: AnyTwins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
-        """Let one unit happen.
+        """Run one unit.
 
         Args:
             twins: Of the world.
@@ -192,7 +192,7 @@ def sample(
     first: int = 0,
     progress: Progress | None = None,
 ) -> Samples:
-    """Let episodes happen under an intervention, and read outcomes off them.
+    """Run episodes under an intervention, and read outcomes off them.
 
     Args:
         twins: Of the world.

@@ -1,4 +1,4 @@
-"""When interventions happen: at an instant, over a window, on an event."""
+"""Timed interventions: at an instant, over a window, on an event."""
 
 from __future__ import annotations
 
@@ -139,8 +139,8 @@ class Reaches(Frozen):
 
     Attributes:
         name: Of any variable.
-        above: It happens where the variable is greater.
-        below: It happens where it is smaller.
+        above: The event occurs where the variable is greater.
+        below: The event occurs where it is smaller.
         component: Which number of it, where it has several.
     """
 

@@ -31,7 +31,7 @@ class Twins:
 
     Attributes:
         task: Of the world.
-        options: What a twin is made with besides.
+        options: Further arguments of a twin.
         batches: Whether the engine steps many worlds in one call.
     """
 

@@ -153,11 +153,11 @@ class World(Simulation, Questions):
         return self._standing
 
     def given(self, do: Mapping[str, Any]) -> Self:
-        """Give another world in which this is done too, and leave this one as it is.
+        """Return another world in which this is done too; this one is not changed.
 
-        Every episode of the other world begins with it, as do its answers. If an episode is
-        going on it goes on there as well, bit for bit, and what has no time is done at once. As a
-        context manager the other world is closed at the end.
+        Every episode of the other world begins with it, as do its answers. A running episode
+        continues there bit-identically, and what has no time is done immediately. As a context
+        manager the other world is closed at the end.
 
         Args:
             do: Interventions, with or without a time; ``world.given(a).given(b)`` is

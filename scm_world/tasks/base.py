@@ -131,7 +131,7 @@ class Scenario:
 
     Attributes:
         name: How the state comes about.
-        prepare: Chooses what to set in a world that has just been reset. It may let the world go
+        prepare: Chooses what to set in a world that has just been reset. It may let the world run
             on before. What else it gives is handed to ``act``.
         act: Gives an action, shape (n_actions,).
         steps: How many control steps are taken before the experiments; drawn from 0 to 2 if None.
@@ -147,7 +147,7 @@ class Scenario:
 
 
 class Blind(ABC):
-    """A policy that does not look at what happens: all its actions are known beforehand."""
+    """A policy that ignores the state: all its actions are known beforehand."""
 
     @abstractmethod
     def ahead(self, world: Any, first: int, count: int) -> Floats:
@@ -266,7 +266,7 @@ class Task(ABC):
     conventions: Conventions = CONVENTIONS["scm_world"]
 
     def __new__(cls, *args: Any, **given: Any) -> Self:
-        """Remember what the task was made with, so that it can be made again from a file."""
+        """Keep the arguments of the task, so that it can be made again from a file."""
         task = super().__new__(cls)
         task.given = dict(given)
         task.is_named = not args  # every argument has its name
@@ -365,7 +365,7 @@ class Task(ABC):
         return {}
 
     def idle(self, world: Any) -> Floats:
-        """Give the action that lets a world be: zero, or what is nearest to it.
+        """Return the idle action: zero, or what is nearest to it.
 
         Args:
             world: In this task.

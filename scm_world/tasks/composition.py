@@ -254,7 +254,7 @@ class Composition(ABC):
 
         Args:
             candidates: Draws of an intervention, with ``parameter``, ``state`` and ``keep``.
-            before: The bodies that lie in one another already, and may go on doing so.
+            before: The bodies that lie in one another already, and may continue to.
             whole: Whether all candidates have the blocks and obstacles of this structure.
         """
 

@@ -15,7 +15,7 @@ from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_li
 from scm_world.tasks.model import is_model
 
 OWN_TASKS = ("scm_world.tasks.model:ModelTask",)
-"""What a file may name as its task besides those that are registered: it reads a model."""
+"""What a file may name as its task in addition to registered ones: it reads a model."""
 
 
 def load_factory(reference: str) -> Callable[..., Any]:

@@ -87,7 +87,7 @@ class DeclaredTask(Task):
     Every argument can also be an attribute of a class of your own.
 
     Args:
-        kind: Whose options there are besides those of this class.
+        kind: Whose options there are in addition to those of this class.
         settings: Values of options.
 
     Raises:

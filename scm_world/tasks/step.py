@@ -113,7 +113,7 @@ class StepTask(DeclaredTask):
         states: ``Measured`` variables without a mechanism. ``do`` may set each of them.
         actions: ``Action`` variables. The command is one after another.
         control_dt: What one call of the function advances [s]: a control step.
-        noise: Distributions of what the function is given anew in every step, by name. What is
+        noise: Distributions of the noise that the function is given in every step, by name. What is
             named like a state has its shape; else it is a number, or has the shape of the ends
             of its box.
         outcomes: ``Measured`` or ``Derived`` variables that are computed from others.
@@ -124,7 +124,7 @@ class StepTask(DeclaredTask):
         start: Where episodes begin: for states a value, or a space or distribution to draw from.
         observe: Names of what a policy observes; all states if None.
         seconds: Length of an episode [s]; 100 control steps if None.
-        vectorized: Whether the function takes many systems at once, with a leading axis.
+        vectorized: Whether the function takes many systems together, with a leading axis.
         signature: ``"dicts"``, or ``"arrays"`` for flat arrays in the order of declaration.
 
     Raises:

@@ -201,7 +201,7 @@ class BackendConformance(
             self.explode(backend, state)
 
     def explode(self, backend: Backend, state: PhysicalState) -> None:
-        """Apply a state and go on."""
+        """Apply a state and continue."""
         backend.apply(Difference(state=state))
         play(backend, 1)
 

@@ -53,7 +53,7 @@ def table(kind: str) -> Dataset:
 
 
 def _numpys() -> Any:
-    """Read the global generator of numpy, which nobody should touch."""
+    """Read the global generator of numpy, which must not be touched."""
     state: Any = np.random.get_state()  # noqa: NPY002 # is watched, not used
     return np.array(state[1])
 
@@ -79,7 +79,7 @@ class LearnerConformance:
         return table("interventional" if "interventional" in chosen.takes else "observational")
 
     def found(self, data: Dataset) -> EstimatedGraph:
-        """Let it learn."""
+        """Estimate the graph."""
         return learn(self.learner, data, seed=3, **self.settings)
 
     def test_it_finds_a_collider(self) -> None:

@@ -181,7 +181,7 @@ print(hashlib.sha256(trajectory(world, actions(world, 20, 7)).tobytes()).hexdige
 
 
 def check_snapshot_elsewhere(world: World) -> None:
-    """Check that a snapshot goes on bit-identically in another process."""
+    """Check that a snapshot continues bit-identically in another process."""
     world.reset(seed=2)
     trajectory(world, actions(world, 5, 3))
     snapshot = world.snapshot()

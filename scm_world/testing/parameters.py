@@ -83,7 +83,7 @@ class ParameterConformance(Suite):
         assert same(play(backend, self.long), expected)
 
     def test_the_order_of_changes_is_irrelevant(self, backend: Backend, scene: Scene) -> None:
-        """All at once, one by one, in any order and with detours: the result is the same."""
+        """All together, one by one, in any order and with detours: the result is the same."""
         start = backend.snapshot()
         *_, (_, state) = changed_states(backend.state())
         state.positions[:, 2] += 0.1

@@ -222,7 +222,7 @@ class Suite(ABC):
             backend.close()
 
     def continued(self, backend: Backend, start: EngineSnapshot, steps: int = 10) -> Floats:
-        """Go on from a snapshot."""
+        """Continue from a snapshot."""
         backend.restore(start)
         return play(backend, steps)
 

@@ -1,4 +1,4 @@
-"""What a change of state or structure does, and what a snapshot remembers."""
+"""What a change of state or structure does, and what a snapshot holds."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class StateConformance(Suite):
         yield backend.snapshot()
 
     def test_a_snapshot_continues_bit_for_bit(self, backend: Backend, scene: Scene) -> None:
-        """From a snapshot, this, another and a pickled backend go on alike, again and again."""
+        """From a snapshot, this, another and a pickled backend continue alike, repeatedly."""
         for snapshot in self.snapshots(backend, scene):
             state, touching = backend.state(), backend.contacts()
             bytes_ = pickle.dumps(snapshot)

@@ -75,7 +75,7 @@ class TogetherConformance(Suite):
     def test_bodies_may_come_and_go(
         self, twice: tuple[list[Backend], list[Backend]], scene: Scene
     ) -> None:
-        """One of them may change its structure, and all go on as if alone."""
+        """One of them may change its structure, and all continue as if alone."""
         alone, many = twice
         batch = type(many[0]).batch(many, 2)
         into = _table(many, extra=1)

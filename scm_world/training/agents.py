@@ -302,7 +302,7 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 def write_checkpoint(model: Any, worlds: Episodes, more: Mapping[str, Any], folder: Path) -> None:
-    """Write everything that decides how a training goes on, whole or not at all; keep the last two.
+    """Write everything that a training resumes from, whole or not at all; keep the last two.
 
     It is read with ``torch.load(weights_only=True)``, which executes nothing.
 
@@ -346,7 +346,7 @@ def resume(model: Any, worlds: Episodes, path: Path) -> dict[str, Any]:
     """Take a model and its worlds to where a checkpoint was written, bit for bit.
 
     Returns:
-        What was written besides.
+        What else was written.
 
     Raises:
         UnreadableFile: It is damaged, or of another network.
@@ -453,7 +453,7 @@ class Watch(BaseCallback):
         self.stop = False
 
     def resume(self, model: Any, path: Path) -> None:
-        """Go on where a checkpoint was written, perhaps of a training that has become longer."""
+        """Resume from a checkpoint, perhaps with more steps than before."""
         self.score = resume(model, self._worlds, path)["score"]
         self._seen, self._tries = model.num_timesteps, self._due(model.num_timesteps)
 

@@ -47,7 +47,7 @@ def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
 
 
 def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
-    """Let a model begin with the weights of a policy file.
+    """Initialise a model with the weights of a policy file.
 
     The standard deviations and the value come from it if it has them.
 

@@ -83,7 +83,7 @@ class Lesson(Frozen):
         env: Options of the environment, those that a policy file keeps.
         protocols: Names of what varies while the teacher shows something, in turns.
         episodes: Which the teacher plays alone.
-        rounds: How often the network acts now and then afterwards, and learns anew.
+        rounds: How often the network acts now and then afterwards, and is trained again.
         more: Episodes of each of these rounds.
         noise: Largest standard deviation of what is added to actions, in units of actions; each
             episode has one between 0 and that.
@@ -93,7 +93,7 @@ class Lesson(Frozen):
         observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
         network: What learns.
         updates: Steps of the optimizer, each time.
-        batch: Control steps that each of them sees.
+        batch: Control steps in each of them.
         rate: Of learning at the beginning; it falls as a cosine.
         trials: Evaluations after each round; the best policy is kept.
 
@@ -267,7 +267,7 @@ def demonstrated(
     round_: int = 0,
     learner: MlpPolicy | None = None,
 ) -> Demonstrations:
-    """Let the teacher show some episodes; those that do not end well are left out.
+    """Record episodes of the teacher; those that fail are left out.
 
     An episode follows from the seed, the round and its number.
 
@@ -277,7 +277,7 @@ def demonstrated(
         backend: Name of the engine.
         seed: Of everything that is drawn.
         round_: Of the lesson.
-        learner: Acts now and then; nobody if None.
+        learner: Acts now and then; never if None.
 
     Raises:
         ActionError: The teacher cannot act in this task.
@@ -520,13 +520,13 @@ def clone(
     progress: Progress | None = None,
     tell: Tell | None = None,
 ) -> Cloned:
-    """Let a network learn to do what a teacher does.
+    """Train a network to imitate a teacher.
 
     The teacher shows episodes; those that end well are learned from. In each round after that the
     network acts now and then, the teacher says what it would have done, and the network learns
     anew from all of it.
 
-    If ``out`` holds a part of the same work, it goes on after the last whole file of episodes, or
+    If ``out`` holds a part of the same work, it resumes after the last whole file of episodes, or
     the last round. What comes out follows from the lesson, the seed, the engine and the versions.
 
     Args:
@@ -626,7 +626,7 @@ def _checked(lesson: Lesson, backend: str, seed: int) -> str:
 def _collected(
     folder: Path, lesson: Lesson, progress: Progress | None, *, round_: int, **how: Any
 ) -> list[Demonstrations]:
-    """Let a round of episodes be shown, or read what was shown before."""
+    """Record a round of demonstrations, or read the ones of an earlier call."""
     first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
     stop = first + (lesson.episodes if round_ == 0 else lesson.more)
     found = []

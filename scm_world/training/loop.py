@@ -72,11 +72,11 @@ def train(
     """Train an agent.
 
     What is learned follows from the recipe, the seed, the engine, ``threads`` and the versions.
-    If ``out`` holds a part of the same training, it goes on from its last checkpoint, also with
+    If ``out`` holds a part of the same training, it resumes from its last checkpoint, also with
     more steps than before if neither the learning rate nor the ceiling of the standard deviations
     depends on how many there are; on a CPU the weights in the end are, bit for bit, those of a
-    training that was not interrupted. Ctrl-C lets it write a checkpoint after the present round,
-    and end; a second one ends it at once.
+    training that was not interrupted. After Ctrl-C it writes a checkpoint at the end of the
+    present round and ends; a second one ends it immediately.
 
     Args:
         recipe: How it is trained.
@@ -97,7 +97,7 @@ def train(
     Raises:
         MissingExtra: Stable-Baselines3 is not installed.
         UnknownOption: Something is asked for that does not exist.
-        UnreadableFile: Another training is in the folder, somebody else is writing to it, or its
+        UnreadableFile: Another training is in the folder, another process is writing to it, or its
             last checkpoint is damaged.
         UnwritableFolder: There is no room; the last checkpoint is still whole.
         Diverged: Weights are not finite any more.
@@ -153,7 +153,7 @@ def train(
 
 
 def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
-    """Learn; the first Ctrl-C ends it after the present round, and the second one at once."""
+    """Learn; the first Ctrl-C ends it after the present round, and the second one immediately."""
     logger: Any = load("stable_baselines3.common.logger", "stable-baselines3", "train")
     after = f"-{model.num_timesteps}" if model.num_timesteps else ""
     outputs = [
@@ -167,7 +167,7 @@ def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
     def stop(*_: Any) -> None:
         watch.stop = True
         signal.signal(signal.SIGINT, before)
-        tell("stops after this round with a checkpoint; Ctrl-C again stops at once")
+        tell("stops after this round with a checkpoint; Ctrl-C again stops immediately")
 
     try:
         if is_main:
@@ -186,7 +186,7 @@ def _learn(model: Any, watch: Any, left: int, folder: Path, tell: Tell) -> None:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch have so many threads for a while; its last bits depend on them."""
+    """Set the number of threads of torch for a while; its last bits depend on it."""
     torch: Any = load("torch", "torch", "train")
     before = torch.get_num_threads()
     torch.set_num_threads(count)
@@ -226,7 +226,7 @@ def open_folder(
     tell: Tell,
     may_grow: bool = False,
 ) -> None:
-    """Begin in a folder, or go on there.
+    """Begin in a folder, or resume there.
 
     Args:
         path: The file that says what is in the folder.

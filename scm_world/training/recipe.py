@@ -78,7 +78,7 @@ class Recipe(Frozen):
         name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
         curriculum: What is done in it; plain data of a ``Curriculum``.
-        worlds: How many are simulated at once.
+        worlds: How many are simulated together.
         steps: Control steps of training, in all worlds together.
         settings: Of the algorithm.
         rate: Of learning.

@@ -32,7 +32,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Observations = Literal["plain", "privileged"]
-"""What a policy observes: its task, or every causal parameter besides."""
+"""What a policy observes: its task, or also every causal parameter."""
 
 
 class AlgorithmSettings(Frozen):
@@ -386,7 +386,7 @@ TUNED: Mapping[str, Mapping[str | None, Fields]] = {
 _PLACED: Fields = {"protocols": ("P1", "P5"), "episodes": 400, "rounds": 0}
 
 LESSONS: Mapping[str, Fields] = {
-    # A block that was let go of is dragged along by fingers that retreat a little too early.
+    # A block that was released is dragged along by fingers that retreat a little too early.
     "pushing": {
         "teacher": "hold",
         "protocols": ("P5",),

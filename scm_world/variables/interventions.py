@@ -50,7 +50,7 @@ class Hard(Frozen):
 
 @final
 class Shift(Frozen):
-    """Add to what a variable would have been. Its parents go on mattering.
+    """Add to what a variable would have been. Its parents remain causes.
 
     Example:
         >>> Shift(0.1)
@@ -66,7 +66,7 @@ class Shift(Frozen):
 
 @final
 class Scale(Frozen):
-    """Multiply what a variable would have been. Its parents go on mattering."""
+    """Multiply what a variable would have been. Its parents remain causes."""
 
     kind: Literal["scale"] = "scale"
     by: Number

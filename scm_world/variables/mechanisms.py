@@ -224,7 +224,7 @@ def check_trusted(functions: Iterable[Function], trusted: Iterable[str]) -> None
 
     Args:
         functions: That the file names.
-        trusted: Packages whose functions may be called, besides those of this package that
+        trusted: Packages whose functions may be called, in addition to those of this package that
             compute numbers.
 
     Raises:

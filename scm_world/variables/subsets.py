@@ -85,7 +85,7 @@ class Subset(Frozen):
         return Subset((*self.parts, *((pattern, None) for pattern in _patterns(patterns))))
 
     def swap(self, patterns: str | tuple[str, ...], other: Subset | str | Space) -> Subset:
-        """Let some variables lie elsewhere.
+        """Return a subset in which some variables have other regions.
 
         Args:
             patterns: Names of variables, or patterns.

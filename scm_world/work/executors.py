@@ -54,7 +54,7 @@ class Bag(Generic[Job]):
         self._aside: dict[int, Exception] = {}
 
     def put_back(self, number: int, ended: Exception) -> None:
-        """Let a job whose process has ended wait once more, behind the others.
+        """Queue a job whose process has ended again, behind the others.
 
         Args:
             number: Of the job.
@@ -68,7 +68,7 @@ class Bag(Generic[Job]):
         self._aside[number] = EngineFailure(said, self._engine)
 
     def put_aside(self, number: int, error: Exception) -> None:
-        """Remember that a job failed: as it gives the same every time, it is not tried again."""
+        """Record that a job failed: as it gives the same every time, it is not tried again."""
         error.add_note(f"in {self.name(number)}")
         self._aside[number] = error
 
@@ -153,7 +153,7 @@ class Executor(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End the work at once, and free what it holds."""
+        """End the work immediately, and free its resources."""
 
     def __enter__(self) -> Self:
         return self
@@ -333,7 +333,7 @@ class Processes(Executor):
 
 
 def _put_back(bag: Bag[Any], number: int, ended: Ended) -> None:
-    """Let a job wait once more, unless no process could do it."""
+    """Queue a job again, unless no process could do it."""
     if ended.cannot_begin:
         raise EngineFailure(str(ended), PROCESS)
     bag.put_back(number, ended)

@@ -89,7 +89,7 @@ def children_single_threaded() -> Iterator[None]:
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Let BLAS and OpenMP use one thread in this process, and in those started meanwhile.
+    """Limit BLAS and OpenMP to one thread in this process, and in those started meanwhile.
 
     Sums in several threads add in another order, so that their last bits differ. It may be nested,
     and used in several threads. A library that is first loaded meanwhile keeps to one thread.
@@ -209,7 +209,7 @@ class Worker:
             return self.answer()
         except Exception:
             raise
-        except BaseException:  # Ctrl-C, at any moment: nobody waits for the answer any more
+        except BaseException:  # Ctrl-C, at any moment: the answer is not read any more
             self.stop()
             raise
 
@@ -337,7 +337,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _serve(pipe: Connection, sign: Connection) -> None:
-    """Answer until nobody asks any more, or until the process that asks has ended."""
+    """Answer until the pipe is closed, or until the calling process has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks ends this one
     threading.Thread(target=_end_with_parent, daemon=True).start()
     things: list[object] = []

@@ -155,7 +155,7 @@ def connected(workers: int | None, address: str | None) -> RayEngine:
 
 
 def _check_answers(address: str | None) -> None:
-    """Refuse an address at which nobody is; Ray would wait for somebody for long."""
+    """Refuse an address without a cluster; Ray would wait for one for long."""
     if address is None:
         return
     where = _remembered() if address == "auto" else str(address)

@@ -60,7 +60,7 @@ class Table:
 class Batch:
     """Worlds of one task, options and engine, advanced in one call.
 
-    What happens in a world is, bit for bit, what happens if it is stepped alone. Between steps,
+    A world in a batch is bit-identical to one that is stepped alone. Between steps,
     ``world`` gives a world as it is now, to ask it or to do something to it: use that, not a
     reference of your own, whose present may be older.
 
@@ -100,8 +100,8 @@ class Batch:
         self._kinds: list[tuple[Any, ...]] = [()] * n  # table, mode and substeps of each world
         self._groups: list[tuple[Any, Integers]] | None = None  # all worlds, by these
         self._stepped = np.zeros(n, dtype=np.bool_)  # the world does not know yet
-        self._ready = np.zeros(n, dtype=np.bool_)  # nobody did anything to it since it was stepped
-        self._fresh = np.zeros(n, dtype=np.bool_)  # what is remembered has been computed
+        self._ready = np.zeros(n, dtype=np.bool_)  # unchanged since it was stepped
+        self._fresh = np.zeros(n, dtype=np.bool_)  # what a step keeps has been computed
         self._all = np.arange(n)
         self._held: set[int] = set()
         self._translating: set[int] = set()
@@ -121,7 +121,7 @@ class Batch:
         return world
 
     def fill(self, rows: Integers) -> None:
-        """Let the present of some worlds be in their rows, with what is computed.
+        """Move the present of some worlds to their rows, with what is computed.
 
         Raises:
             NotReset: A world has no episode yet.
@@ -195,7 +195,7 @@ class Batch:
         self._stepped[rows] = self._ready[rows] = True
         try:
             self._engine.step(rows, mode, self._commands, substeps, matrix)
-        except BaseException as error:  # or somebody interrupts: the others were stepped
+        except BaseException as error:  # or Ctrl-C: the others were stepped
             unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
             for place, row in enumerate(rows.tolist()):
                 if row in unmoved:
@@ -214,7 +214,7 @@ class Batch:
         return [(kind, np.array(members)) for kind, members in found.items()]
 
     def _take(self, row: int) -> None:
-        """Let the present of a world be in its row."""
+        """Move the present of a world to its row."""
         world = self._worlds[row]
         table = self._table(world.compiled)
         world.evaluate(table.names)

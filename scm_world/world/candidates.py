@@ -172,7 +172,7 @@ class Candidates:
         *,
         varies: bool,
     ) -> Value:
-        """Compute a function for each draw; functions of users need not take many at once."""
+        """Compute a function for each draw; functions of users need not take many together."""
         found = np.empty((len(self.attempts) if varies else 1, *shape))
         for i in range(len(found)):
             found[i] = function(*(value[i if len(value) > 1 else 0] for value in values))

@@ -97,7 +97,7 @@ class ActionVector:
 @final
 @dataclass(frozen=True)
 class Options:
-    """What a world is made with besides its task.
+    """The options of a world.
 
     Attributes:
         preset: Numerical settings of the engine at the start of an episode.
@@ -371,7 +371,7 @@ class StepBase:
 
 
 def beginning(compiled: CompiledTask, key: NoiseKey | None) -> tuple[dict[str, Value], State]:
-    """Compute where an episode begins when nobody intervenes.
+    """Compute where an episode begins without interventions.
 
     Args:
         compiled: The task.

@@ -172,7 +172,7 @@ def feasible_plan(
 ) -> tuple[InterventionPlan, Difference]:
     """Plan an intervention that puts no two bodies in one place.
 
-    Bodies that intersect already (a block that is being squeezed) may go on doing so. What is
+    Bodies that intersect already (a block that is being squeezed) may continue to. What is
     drawn is drawn again until the world can be like that: from the feasible part of its space.
     What takes no part in where bodies are is drawn once.
 

@@ -1,7 +1,7 @@
-"""The mechanisms of a structure, evaluated for any number of worlds at once.
+"""The mechanisms of a structure, evaluated for any number of worlds together.
 
 The present of a world is one row of numbers: its state first, then its actions, its clock, every
-other variable, and what it remembers of one control step ago. A single world has a matrix of one
+other variable, and what it keeps of one control step ago. A single world has a matrix of one
 row, a batch one of many; both are computed by the same program, so the bits are the same.
 """
 
@@ -111,7 +111,7 @@ class Mechanisms:
         _execute(program, matrix, rows)
 
     def remember(self, matrix: Floats, rows: Integers) -> None:
-        """Let the present become what was one control step ago."""
+        """Keep the present as the values of one control step ago."""
         _execute(self._memory, matrix, rows)
 
     def view(self, row: Floats, name: str, *, earlier: bool = False) -> Value:

@@ -568,11 +568,11 @@ class Simulation(WorldAttributes):
         self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
 
     def _forget(self) -> None:
-        """Let the present stand in for the step before, where there is none."""
+        """Take the present as the step before, where there is none."""
         self._values.compute(())
         self._values.remember()
 
-    # --- looking at it ------------------------------------------------------------------------
+    # --- state ------------------------------------------------------------------------
 
     @property
     def numbers(self) -> Floats:
@@ -593,7 +593,7 @@ class Simulation(WorldAttributes):
         return self._values.now, self._values.state
 
     def snapshot(self) -> WorldSnapshot:
-        """Save everything that decides how the world goes on. It can be pickled.
+        """Save everything that decides the future of the world. It can be pickled.
 
         Raises:
             NotReset: There is no episode yet.
@@ -638,7 +638,7 @@ class Simulation(WorldAttributes):
             SnapshotMismatch: It is one of another task or engine, or damaged. The world is as it
                 was.
             EngineFailure: The engine failed on the way. Where the snapshot had been checked before,
-                the world goes on only after a reset, or from a snapshot.
+                the world needs a reset or a snapshot.
         """
         known = self._known(snapshot)
         found = known or self._validated(snapshot)
@@ -764,10 +764,10 @@ class Simulation(WorldAttributes):
             raise NotReset
 
     def _require_state(self) -> None:
-        """Refuse to go on from a state that the engine has lost.
+        """Refuse to continue from a state that the engine has lost.
 
         Raises:
-            EngineFailure: It has; a reset or a snapshot goes on.
+            EngineFailure: It has; a reset or a snapshot is needed.
             NotReset: There is no episode yet.
         """
         self._require_episode()

@@ -23,7 +23,7 @@ from scm_world.world.compiled_task import PendingInterventions, Plan
 @final
 @dataclass(frozen=True, eq=False)
 class WorldSnapshot:
-    """All that decides how a world goes on: physics, causes, noise, clock and memory.
+    """All that decides the future of a world: physics, causes, noise, clock and memory.
 
     A pickled snapshot leaves the model out: the world that goes back to it has the same one.
 
@@ -38,7 +38,7 @@ class WorldSnapshot:
         episode: Number of the episode.
         world: Task, options and names of all variables, to tell worlds apart.
         plan: The structure.
-        memory: What a world of another kind remembers besides.
+        memory: What a subclass keeps.
         base: The world at this control step before anyone intervened; None after a step. Of it,
             only ``kept``, ``interventions``, ``index``, ``plan`` and what follows here count.
         vector: Of a base: where everything is.

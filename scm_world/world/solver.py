@@ -46,7 +46,7 @@ class Solver:
         base: Where the intervention starts from.
         asked: The names of the present request.
         pending: All interventions at this control step, by target. What was asked of bodies that
-            are gone waits for them, should they come back at once.
+            are gone is kept, in case they come back at the same instant.
         key: Where to draw.
         earlier: The solver of another attempt at the same request, if there was one.
 
@@ -142,7 +142,7 @@ class Solver:
         self._earlier = None  # attempts are no chain
 
     def _following(self, targets: tuple[str, ...]) -> tuple[str, ...]:
-        """Name what has to be computed anew, causes first; mechanisms may have added edges."""
+        """Name what has to be computed again, causes first; mechanisms may have added edges."""
         held = self.model.interventions.items()
         actions = self._task.actions
         if not any(isinstance(act, Mechanism) and name not in actions for name, act in held):
@@ -159,7 +159,7 @@ class Solver:
         return found is not None and bool(found.parents())
 
     def same_at(self, key: NoiseKey) -> frozenset[str]:
-        """Name what was computed and does not follow from anything that is drawn anew."""
+        """Name what was computed and does not follow from anything that is drawn again."""
         mine = self._key
         here = (key.noise, key.episode, key.step) == (mine.noise, mine.episode, mine.step)
         kept = key.kept if here else frozenset()
@@ -312,7 +312,7 @@ class Solver:
         return np.asarray(value)
 
     def _carry(self, variable: Measured) -> None:
-        """Let a state follow the parents that act on it when set (a block that grows)."""
+        """Move a state with the parents that act on it when set (a block that grows)."""
         parents = self._task.set_parents[variable.name]
         new = [self._value(parent) for parent in parents]
         where = self._task.slices[variable.name]

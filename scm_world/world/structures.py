@@ -94,7 +94,7 @@ class StructureCache:
         return found
 
     def natural(self, key: NoiseKey | None) -> CompiledTask:
-        """Give the structure that an episode has when nobody intervenes."""
+        """Return the structure of an episode without interventions."""
         return self.compiled(self.plan(self.head.solve(key=key)))
 
     def after(

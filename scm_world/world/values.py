@@ -15,7 +15,7 @@ _ROW = np.zeros(1, dtype=np.int64)  # the only one of a matrix of one row
 
 @final
 class PresentValues:
-    """The values of all variables at one control step, and what is remembered of the last one.
+    """The values of all variables at one control step, and what is kept of the last one.
 
     Args:
         compiled: The task in the structure that there is.
@@ -33,7 +33,7 @@ class PresentValues:
     def __init__(self, compiled: CompiledTask) -> None:
         self.compiled = compiled
         self.static: Values = {}
-        self._fresh = False  # what a step remembers has been computed
+        self._fresh = False  # what a step keeps has been computed
         self._view(compiled.mechanisms.start[None].copy())
 
     def move(self, matrix: Floats) -> None:
@@ -72,7 +72,7 @@ class PresentValues:
         self._count()
 
     def compute(self, names: tuple[str, ...] | None = None) -> None:
-        """Compute variables, and what a step remembers, into the present values; all if None."""
+        """Compute variables, and what a step keeps, into the present values; all if None."""
         mechanisms = self.compiled.mechanisms
         wanted = mechanisms.computed if names is None else names
         mechanisms.evaluate(wanted, self.matrix, _ROW)
@@ -80,7 +80,7 @@ class PresentValues:
         self._count()
 
     def remember(self) -> None:
-        """Let the present become what was one control step ago."""
+        """Keep the present as the values of one control step ago."""
         if not self._fresh:
             self.compute(())
         self.compiled.mechanisms.remember(self.matrix, _ROW)

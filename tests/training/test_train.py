@@ -392,7 +392,7 @@ def test_ctrl_c_writes_a_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run("ppo", tmp_path / "run", tell=said.append, progress=interrupt)
     assert signal.getsignal(signal.SIGINT) is before
-    assert "Ctrl-C again stops at once" in said[0]
+    assert "Ctrl-C again stops immediately" in said[0]
     assert agents.checkpoints(tmp_path / "run")[-1].stem == "96"
     run("ppo", tmp_path / "run", tell=said.append)
     assert "goes on after 96 steps" in said

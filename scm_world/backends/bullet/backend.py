@@ -99,7 +99,7 @@ class Record:
         rows: The same. They are shared, so that taking them costs little: it may go on.
         length: How many of its numbers belong to this record.
         edits: See ``History``.
-        reported: What nobody can set, after the last step.
+        reported: What cannot be set, after the last step.
         present: The world now, if anything was changed since.
         light: Whether the present differs from the last step in nothing but light parameters.
         resting: The state after the last step.
@@ -149,7 +149,7 @@ class BulletBackend(Backend):
         self._before: Values = {}  # parameters of the last step
         self._present: Instant | None = None  # what was made of the last step since
         self._light = True  # whether the base itself holds the present, and not the spare
-        self._reported: list[float] = []  # what nobody can set, after the last step
+        self._reported: list[float] = []  # what cannot be set, after the last step
         self._resting: list[float] | None = None  # state of the base, once it was asked for
         self._saved: SavedState | None = None  # of the base
 

@@ -107,7 +107,7 @@ class Client(ABC):
         self.generation = 0
         self._untouched: list[float] | None = None
         self._rotations: Sequence[int] = ()  # where quaternions begin in the state
-        self._reported: Sequence[int] = ()  # where numbers stand that nobody can set
+        self._reported: Sequence[int] = ()  # places of the numbers that cannot be set
         self._saved: dict[int, int] = {}  # ticket to the engine's number, which it uses again
         self._tickets = 0
         self._doomed: list[int] = []
@@ -141,7 +141,7 @@ class Client(ABC):
 
     @classmethod
     def settle(cls, structure: Any, given: State) -> list[float]:
-        """Turn a state into plain numbers: unit quaternions, and 0 for what nobody can set.
+        """Turn a state into plain numbers: unit quaternions, and 0 for what cannot be set.
 
         Raises:
             ValueError: It is a state of another structure.
@@ -182,7 +182,7 @@ class Client(ABC):
     def construct(self, structure: Any, parameters: Values) -> None:
         """Make sure that the bodies are there, with their shapes.
 
-        What is made anew has no parameters in ``applied``.
+        What is made again has no parameters in ``applied``.
         """
 
     @abstractmethod
@@ -211,11 +211,11 @@ class Client(ABC):
 
     @abstractmethod
     def advance(self, mode: ControlMode, command: Sequence[float], substeps: int) -> list[float]:
-        """Hold a command for some physics steps, and return the numbers that nobody can set."""
+        """Hold a command for some physics steps, and return the numbers that cannot be set."""
 
     @abstractmethod
     def ask(self) -> list[float]:
-        """Ask the engine for the state, with 0 for what nobody can set."""
+        """Ask the engine for the state, with 0 for what cannot be set."""
 
     @abstractmethod
     def owner(self, multibody: int, link: int) -> str:
@@ -258,8 +258,8 @@ class Client(ABC):
     def canonicalize(self, instant: Instant) -> None:
         """Build the one world with these parameters and this state, independently of the past.
 
-        Bodies stay where all their shapes stay; all else that remembers the past, the contact
-        caches, goes when the collision objects are entered anew, always in one order.
+        Bodies stay where all their shapes stay; all else that depends on the past, the contact
+        caches, is cleared by entering the collision objects again, always in one order.
         """
         self.generation += 1
         self._doomed.extend(self._saved)
@@ -292,7 +292,7 @@ class Client(ABC):
         return self.advance(mode, command, substeps)
 
     def read(self, reported: list[float]) -> list[float]:
-        """Read the present state; the numbers that nobody can set are given.
+        """Read the present state; the numbers that cannot be set are given.
 
         A state that was set and not stepped yet reads as it was set; ``canonicalize`` has made
         sure that the engine agrees up to rounding.

@@ -85,7 +85,7 @@ class Payload:
         structure: Of the scene.
         parameters: All of them, as they were applied.
         numbers: ``mjSTATE_INTEGRATION``.
-        memory: What the realization remembers besides.
+        memory: What the realization keeps.
         touches: The contacts of the last physics step.
         again: What takes that step again if they are not known: see ``Realization``.
     """
@@ -151,7 +151,7 @@ class MujocoBackend(Backend):
 
         Raises:
             UnknownOption: There is no such parameter. Nothing has changed.
-            Infeasible: MuJoCo could not go on with these parameters. Nothing has changed.
+            Infeasible: MuJoCo could not continue with these parameters. Nothing has changed.
         """
         self._return()
         now, structure = self._now, difference.structure

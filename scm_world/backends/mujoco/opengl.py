@@ -71,7 +71,7 @@ def _works(library: str) -> bool:
 def draw_scene(
     scene: Scene, camera: Camera, sky: tuple[int, int, int], library: str
 ) -> NDArray[np.uint8]:
-    """Let MuJoCo draw the scene of a ``Model``, shape (h, w, 3).
+    """Draw with MuJoCo the scene of a ``Model``, shape (h, w, 3).
 
     Args:
         scene: What to show. Its light shines if the model has none; the headlight always does.
@@ -102,7 +102,7 @@ def draw_scene(
 
 
 def _light(abstract: mujoco.MjvScene, light: Light, camera: Camera, extent: float) -> None:
-    """Let a light shine from one direction, with shadows around what the camera looks at."""
+    """Add a light from one direction, with shadows around what the camera looks at."""
     towards = np.divide(light.direction, math.hypot(*light.direction))
     lamp = abstract.lights[abstract.nlight]
     lamp.id, lamp.texid, lamp.headlight, lamp.castshadow = -1, -1, 0, 1

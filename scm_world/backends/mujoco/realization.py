@@ -136,7 +136,7 @@ def sensible(
 
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-"""Everything that decides how MuJoCo goes on."""
+"""Everything that decides the future of a simulation of MuJoCo."""
 
 FULL = (
     "MuJoCo has no memory for all contacts and constraints of this state; give it more in the file "
@@ -215,7 +215,7 @@ class Realization(ABC):
         edited: Whether the model has changed since someone last cleared this.
         staged: Whether a physics step has stages, each with contacts of its own.
         began: ``mjSTATE_INTEGRATION`` before the last step, if it had stages and was taken alone.
-        lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to remember.
+        lean: Whether ``mjSTATE_INTEGRATION`` is all that a scene has to keep.
         replay: ``mjSTATE_INTEGRATION`` before the last steps and how many these were, if they were
             taken elsewhere, so that their contacts are not in the data.
     """
@@ -337,21 +337,21 @@ class Realization(ABC):
         return numbers
 
     def memory(self) -> Any:
-        """Give what there is to remember besides ``mjSTATE_INTEGRATION``; it can be pickled."""
+        """Return what has to be kept in addition to ``mjSTATE_INTEGRATION``; it can be pickled."""
         return None
 
     def recall(self, numbers: Floats, memory: Any) -> None:
-        """Go on from what was remembered."""
+        """Restore what was kept."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
         self.began = self.replay = None
 
     def follow(self, before: Realization) -> None:
-        """Go on after the last step of another realization; then the state is written."""
+        """Continue after the last step of another realization; then the state is written."""
         self.data.time = before.data.time
 
     def switch(self, mode: ControlMode) -> None:
-        """Let commands mean something else.
+        """Change the meaning of commands.
 
         Raises:
             UnknownOption: This structure has no such mode.
@@ -370,7 +370,7 @@ class Realization(ABC):
         return moments
 
     def fingerprint(self) -> tuple[Any, ...]:
-        """Sum up what the model is made of besides its structure: models of one sum are alike."""
+        """Return a digest of the model without its structure: models of one digest are alike."""
         if self._numbers is None:
             self._numbers = b"".join(value.tobytes() for value in self.kept.values())
         return self.mode, tuple(self.kept), self._numbers

@@ -57,8 +57,8 @@ class Canvas(NamedTuple):
 
     Attributes:
         depth: Shape (h, w).
-        owners: Shape (h, w), or (0, 0) if nobody wants to know.
-        rgb: Shape (3, h, w), or (3, 0, 0) if nobody wants to know.
+        owners: Shape (h, w), or (0, 0) if they are not needed.
+        rgb: Shape (3, h, w), or (3, 0, 0) if they are not needed.
     """
 
     depth: Depths

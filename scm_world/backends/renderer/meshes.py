@@ -96,7 +96,7 @@ def _projected(mesh: Triangles, view: View) -> Floats:
 
 @njit(cache=True, error_model="numpy")
 def _include(box: Floats, u: float, v: float) -> None:
-    """Let a box (least and greatest column, least and greatest row) hold a pixel."""
+    """Extend a box (least and greatest column, least and greatest row) by a pixel."""
     box[0], box[1] = min(box[0], u), max(box[1], u)
     box[2], box[3] = min(box[2], v), max(box[3], v)
 

@@ -1,4 +1,4 @@
-"""Collecting: episodes under a design, in memory or in a folder that can be gone on with."""
+"""Collecting: episodes under a design, in memory or in a folder that can be resumed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ENOUGH = 20
 
 
 class Circumstances(TypedDict, total=False):
-    """What can be said besides, of a world; of a model only ``steps``, of a laboratory nothing."""
+    """Further arguments for a world; for a model ``steps`` only, for a laboratory none."""
 
     steps: int
     policy: Any
@@ -54,11 +54,11 @@ def collect(
     engine: Executor | str | None = None,
     **circumstances: Unpack[Circumstances],
 ) -> Dataset:
-    """Let episodes happen under a design, and write them down as a table with regimes.
+    """Collect episodes under a design, as a table with regimes.
 
     What is in an episode depends on the seed and on its number only: not on how many there are, on
-    the shards, or on the workers. Interrupted, the same call goes on where it was, and the files
-    are in the end the same, byte for byte. A larger ``n`` goes on, too.
+    the shards, or on the workers. An interrupted call resumes when it is repeated, and the
+    files are then the same, byte for byte. A larger ``n`` adds episodes.
 
     Args:
         source: A model (one row per episode, or one per control step if ``steps`` are given), a

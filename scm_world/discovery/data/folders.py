@@ -233,7 +233,7 @@ class Folder:
 
 
 def _checksum(lines: Mapping[str, Any]) -> str:
-    """Sum up all that a sidecar says besides."""
+    """Return the digest of the rest of a sidecar."""
     rest = {key: value for key, value in lines.items() if key != "checksum"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
@@ -279,7 +279,7 @@ def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool =
 
     Args:
         folder: That ``collect`` or ``save`` wrote; it may be a URL.
-        trusted: Packages, besides this one, whose functions may be mechanisms of its plans.
+        trusted: Packages other than this one whose functions may be mechanisms of its plans.
         partial: Whether files may be missing, since a collection was interrupted.
 
     Raises:

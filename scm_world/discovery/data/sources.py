@@ -60,7 +60,7 @@ class DataSource(Protocol):
     uneven: bool
 
     def part(self, numbers: range, tell: Tell) -> SourceRows:
-        """Let some episodes happen."""
+        """Run some episodes."""
 
 
 def digest_of(model: SCM) -> str | None:

@@ -188,7 +188,7 @@ class Swept:
         return np.flatnonzero(self.data.episode % len(self.points) == point)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Write the table down: a row for each point, in which None is what nobody knows.
+        """Write the table down: a row for each point, in which None is unknown.
 
         Its columns are the values that were set (``name``, or ``name[i]`` of a vector), ``n``, the
         number of ``refused`` episodes, and for each number that was measured its mean with the
@@ -394,7 +394,7 @@ class Grid:
         self.about: dict[str, Any] = {**about, "points": grid}
 
     def part(self, numbers: range, tell: Tell) -> SourceRows:
-        """Let some episodes happen, those of one point together."""
+        """Run some episodes, those of one point together."""
         tables: list[Dataset] = []
         refused: list[tuple[int, str]] = []
         for place, episodes in enumerate(self._points):

@@ -120,7 +120,7 @@ class WorldSource:
         self.columns: tuple[Column, ...] = tuple(column for part in parts for column in part)
         there = [column.name for column in self.columns]
         twice = sorted({name for name in there if there.count(name) > 1})
-        if twice:  # before episodes happen for them
+        if twice:  # before episodes are run for them
             allowed = ("what is no cause: those have a column already",)
             raise UnknownOption("outcomes", ", ".join(twice), allowed)
         self._half: dict[str, Floats] = {}
@@ -146,7 +146,7 @@ class WorldSource:
         return {**self.__dict__, "_setting": setting}
 
     def part(self, numbers: range, tell: Tell) -> SourceRows:
-        """Let some episodes happen; those that are refused are left out."""
+        """Run some episodes; those that are refused are left out."""
         chosen = self._design.chosen(self._setting.seed, numbers.start, len(numbers))
         regimes = [self._design.regime_of(kind) for kind in chosen]
         lock = threading.Lock()

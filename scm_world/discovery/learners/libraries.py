@@ -210,7 +210,7 @@ def _static(
     *,
     done: bool = False,
 ) -> EstimatedGraph:
-    """Let a library find a static graph; ``search`` gives edges and a note."""
+    """Estimate a static graph with a library; ``search`` gives edges and a note."""
     table, notes = _usable(learner, data, done=done)
     edges, note = np.zeros((len(table.names), len(table.names)), bool), ""
     if len(edges) > 1:  # some libraries fail where there is nothing to find
@@ -323,7 +323,7 @@ def pcmci_plus(
 
     Args:
         data: Rows of episodes in time; those in which something is done are left out, and what
-            comes after begins anew.
+            comes after starts again.
         seed: Not used: nothing is drawn.
         alpha: Level of the tests.
         tau_max: Longest lag [control steps].

@@ -59,7 +59,7 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
 def sparse_pooled(
     simulator: SCMSimulator, *, seed: int = 0, budget: int = 200, unit: int = 0
 ) -> EstimatedGraph:
-    """Find a graph with few causes each by moving all variables at once, at random.
+    """Find a graph with few causes each by moving all variables together, at random.
 
     Every experiment moves each variable a little up or down. An answer is a weighted sum of the
     moves of its causes; few causes are found from few sums. Experiments are added until some in a
@@ -217,7 +217,7 @@ def verified(
     units: int = 4,
     thorough: bool = True,
 ) -> EstimatedGraph:
-    """Check a declared graph by moving all causes of one color at once.
+    """Check a declared graph by moving all causes of one color together.
 
     No effect has two declared causes of one color. So an effect that answers has the one declared
     cause in the color, or one that is not declared, which bisection finds. A cause that is not

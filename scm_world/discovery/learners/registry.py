@@ -118,7 +118,7 @@ def learner(name: str) -> Learner:
 def learn(
     given: Learner | str, data: Any, *, seed: int = 0, level: Level = "variable", **settings: Any
 ) -> EstimatedGraph:
-    """Let a learner find a graph.
+    """Estimate a graph with a learner.
 
     Args:
         given: A learner, or its name.

@@ -51,7 +51,7 @@ class PairedSimulator(Protocol):
 class SCMSimulator:
     """Paired experiments in a causal model without physics, whose variables are numbers.
 
-    It can move several at once. All others are held while some are moved: answers are those of
+    It can move several together. All others are held while some are moved: answers are those of
     direct effects.
 
     Attributes:
@@ -233,7 +233,7 @@ class EpisodeSimulator:
     ) -> None:
         """Give a cause another value, and record what follows.
 
-        What the unit drew is set to what it drew, so that nothing is drawn anew where the other
+        What the unit drew is set to what it drew, so that nothing is drawn again where the other
         value makes a draw infeasible.
         """
         drawn = self._held(begin, (name for name in self._drawn if name != cause))

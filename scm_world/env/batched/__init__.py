@@ -1,4 +1,4 @@
-"""Many environments at once."""
+"""Vectorised environments."""
 
 from scm_world.env.batched.buffers import Buffers, Form
 from scm_world.env.batched.loop import LoopExecutor

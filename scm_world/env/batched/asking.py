@@ -1,4 +1,4 @@
-"""What is asked of many environments at once, spread over each of them."""
+"""Arguments of vectorised calls, split into those of each environment."""
 
 from __future__ import annotations
 

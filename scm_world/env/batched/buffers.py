@@ -35,7 +35,7 @@ class Form:
         goals: How many numbers ``achieved_goal`` and ``desired_goal`` have, if there are goals.
         counted: Which of the variables that count there are.
         terms: Names of the reward terms.
-        metadata: As Gymnasium wants it.
+        metadata: As in Gymnasium.
         render_mode: Of all of them.
     """
 

@@ -24,10 +24,10 @@ SNAPSHOT = "the snapshot"
 class LoopExecutor:
     """Environments that are made alike, each with its own parameters, noise and clock; in turns.
 
-    Each does, bit for bit, what it would do alone. The result of each is in its row
-    of the buffers afterwards. ``reset``, ``do`` and ``restore`` happen in all of those that are
-    named or in none; so does what makes one unlike the others (see ``Form.check``). The message of
-    an error says in which environment it happened. All other executors do the same.
+    Each is bit-identical to an environment alone. Its result is in its row of the buffers
+    afterwards. ``reset``, ``do`` and ``restore`` take effect in all environments that are named or
+    in none; what makes one unlike the others is refused (see ``Form.check``). The message of an
+    error names the environment. All other executors do the same.
 
     Args:
         make: Makes one of them.

@@ -115,7 +115,7 @@ class NativeExecutor(LoopExecutor):
         return self._commands
 
     def _act(self, row: int, step: int) -> None:
-        """Let a member that acts by itself do what is due after a control step."""
+        """Run what is due in one member after a control step."""
         buffers, infos = self.buffers, self.buffers.infos
         over = bool(buffers.terminations[row] or buffers.truncations[row])
         success: Any = infos.get(FLAGS[0])

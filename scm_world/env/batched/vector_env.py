@@ -46,7 +46,7 @@ class VectorSnapshot:
 
     Attributes:
         worlds: One snapshot for each.
-        ended: Which of them are done, and begin anew with the next step.
+        ended: Which of them are done, and are reset with the next step.
     """
 
     worlds: tuple[EnvSnapshot, ...]
@@ -54,7 +54,7 @@ class VectorSnapshot:
 
 
 class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
-    """Many environments at once, each one with its own parameters, noise and clock.
+    """Vectorised environments, each with its own parameters, noise and clock.
 
     Made by ``gymnasium.make_vec("scm_world/Pushing-v0", num_envs=64)``. What comes out is, bit
     for bit, what Gymnasium's ``SyncVectorEnv`` makes of as many single environments, whichever
@@ -63,7 +63,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
 
     Args:
         num_envs: How many.
-        autoreset_mode: When one that is done begins anew: ``"NextStep"``, ``"SameStep"`` or
+        autoreset_mode: When one that is done is reset: ``"NextStep"``, ``"SameStep"`` or
             ``"Disabled"``, as in Gymnasium.
         copy: Give observations that are yours; else the next step overwrites them.
         executor: ``"loop"``: one after another in this process; ``"processes"``: several processes;
@@ -127,7 +127,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in all environments, or in some; it happens in all of those or in none.
+        """Begin an episode in all environments, or in some; all of those are reset, or none.
 
         Args:
             seed: Of the first environment, the next one gets the next number; or a list.
@@ -245,10 +245,10 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         """Free what simulates."""
         self.executor.close()
 
-    # --- what a causal world can do besides -------------------------------------------------------
+    # --- interventions and snapshots -------------------------------------------------------
 
     def do(self, requests: Any, *, space: AnyRegion | None = None) -> dict[int, Audit]:
-        """Intervene now; it happens in all environments that are meant, or in none.
+        """Intervene now, in all environments that are named or in none.
 
         Args:
             requests: An intervention for all of them, a list with one or None for each, or a
@@ -268,7 +268,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
         return self._observations(), self._infos(self._everyone)
 
     def snapshot(self) -> VectorSnapshot:
-        """Save everything that decides how the episodes go on.
+        """Save everything that decides the future of the episodes.
 
         Raises:
             NotReset: One of them has none yet.

@@ -235,7 +235,7 @@ def _labels(words: Mapping[str, str]) -> list[str]:
 
 
 def _protocol_axis(ax: Axes, words: Mapping[str, str]) -> None:
-    """Let protocol of number i be at y = i, the first one above."""
+    """Put protocol i at y = i, the first one above."""
     ax.set_yticks(range(len(words)), _labels(words))
     ax.set_ylim(len(words) - 0.5, -0.5)
     ax.grid(visible=False, axis="y")

@@ -64,7 +64,7 @@ def record_videos(
 
     Raises:
         MissingExtra: moviepy is not installed.
-        SnapshotMismatch: An episode did not happen as it did in the evaluation.
+        SnapshotMismatch: The rerun of an episode differs from the evaluation.
         UnknownOption: There is no such agent, engine or metric.
         UnwritableFolder: There is no room, or no permission.
     """

@@ -29,7 +29,7 @@ LEVEL = 0.95
 RESAMPLES = 2000
 FEWEST_RUNS = 3
 """With fewer runs there is no interval over runs."""
-BLOCK = 1_000_000  # numbers that are resampled at once, some ten megabytes
+BLOCK = 1_000_000  # numbers that are resampled together, some ten megabytes
 
 
 @final
@@ -96,7 +96,7 @@ def mean_interval(
             interval is about other episodes of the same strata; those of failures and successes,
             and of strata of which one has a single number, leave the strata out and are wider.
         level: Confidence.
-        proportion: Whether the values are rates, which lie in [0, 1] whatever happens. By default
+        proportion: Whether the values are rates, which always lie in [0, 1]. By default
             they are if all of them do.
 
     Returns:
@@ -526,7 +526,7 @@ def _interval(
         level: Confidence.
         resamples: Of the bootstrap within strata.
         seed: Of the bootstrap.
-        is_share: Whether the numbers lie between 0 and ``most`` whatever the scores are.
+        is_share: Whether the numbers lie between 0 and ``most`` for all scores.
 
     Source:
         Tukey's jackknife: Efron and Tibshirani, 11.

@@ -142,7 +142,7 @@ class PlanningModel:
 @final
 @dataclass(frozen=True)
 class Score:
-    """A function of the values of some variables, for many rollouts at once.
+    """A function of the values of some variables, for many rollouts together.
 
     Attributes:
         names: Of the variables.

@@ -236,7 +236,7 @@ class _WorldPlans:
     def _searched(self, world: Simulation, mean: Floats, kept: Floats) -> Floats:
         """Return the best sequence that was tried, shape (horizon, n_actions).
 
-        The last mean is tried, too; it and the elites are where a search that goes on begins.
+        The last mean is tried, too; it and the elites are where the next search begins.
 
         Args:
             world: At present.

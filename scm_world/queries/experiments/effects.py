@@ -84,7 +84,7 @@ class Effects:
     _answered: set[EdgeKey] = field(default_factory=set)
 
     def see(self, cause: str, effect: str, lag: int, after: Value, before: Value) -> None:
-        """Remember a difference if it is the largest of its pair."""
+        """Keep a difference if it is the largest of its pair."""
         key, size = (cause, effect, lag), gap(after, before)
         if size > self.largest.get(key, -1.0):
             self.largest[key] = size
@@ -96,7 +96,7 @@ class Effects:
             self._respond(self.responses, key, np.ravel(after), np.ravel(before))
 
     def see_nothing(self, cause: str, effect: str, lag: int) -> None:
-        """Remember that a pair was looked at, and that nothing differed."""
+        """Count a pair that was observed without a difference."""
         self.largest.setdefault((cause, effect, lag), 0.0)
 
     def end_of_probe(self) -> None:

@@ -182,7 +182,7 @@ class Paired:
         return {name: [np.asarray(v).tolist() for v in seen] for name, seen in self._pool.items()}
 
     def remember(self, effects: Effects, memory: Mapping[str, Iterable[Any]]) -> None:
-        """Go on from what earlier probes found."""
+        """Continue from the results of earlier probes."""
         self.effects = effects
         model = self._world.model
         self._pool = {
@@ -197,7 +197,7 @@ class Paired:
         self.effects.setting = ProbeSetting(self._number, self._probe.kind, change)
 
     def _advanced(self, action: Floats) -> dict[str, Value]:
-        """Step once; give the values that are remembered of the instant before."""
+        """Step once; give the values that are kept of the instant before."""
         self._world.step(action)
         self.effects.rollouts += 1
         return self._world.previous()

@@ -3,7 +3,7 @@
 A task may know where causes show; see ``Task.scenarios``. Of any other system, states are drawn:
 where episodes begin, where random actions lead, anywhere that can be, and where bodies touch, with
 parameters as they are and with others. All choices are drawn from keyed noise: probe i of a seed is
-the same, whatever ran before.
+the same, regardless of earlier probes.
 """
 
 from __future__ import annotations
@@ -75,10 +75,10 @@ def probes(
 def _prepared(
     world: Simulation, scenario: Scenario, noise: Noise, number: int, settled: bool
 ) -> Probe:
-    """Prepare a state from which the world can go on; the beginning where nothing else is one.
+    """Prepare a state from which the world can continue; the beginning where nothing else is one.
 
     Raises:
-        EngineFailure: It cannot go on from the beginning either.
+        EngineFailure: It cannot continue from the beginning either.
     """
     for attempt in range(ATTEMPTS):
         world.reset(seed=number)
@@ -281,7 +281,7 @@ def _at_random(world: Simulation, extra: None, dice: Dice) -> Floats:
 
 
 def _at_rest(world: Simulation, extra: None, dice: Dice) -> Floats:
-    """Let the system be."""
+    """Return the idle action."""
     return world.task.idle(world)
 
 

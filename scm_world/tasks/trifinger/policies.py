@@ -25,7 +25,7 @@ class Sweep(Blind):
     """The fingertips sweep over the floor to its middle, and stay there.
 
     What lies in their way is pushed. It depends on nothing but the control step, so that it adds
-    no cause and no noise to what happens.
+    no cause and no noise to the episode.
 
     Args:
         across: Whether one of them goes through the middle to the other side, so that what it

@@ -32,7 +32,7 @@ GOAL = "goal_block"
 
 
 class Alike(Common, total=False):
-    """Options of tasks with one block and one goal, besides those of every task.
+    """Options of tasks with one block and one goal, in addition to those of every task.
 
     Attributes:
         shape: Of block and goal; a box if None. The size of a shape cannot change.

@@ -108,7 +108,7 @@ def _realization(backend: str) -> Any:
 
 
 SURFACE = ("size", "friction", "color")
-"""What every obstacle has besides its pose, and every block that is a box besides its mass."""
+"""Parameters of every obstacle without its pose, and of every box without its mass."""
 
 
 def parameter_keys(structure: TriFingerStructure) -> Iterator[ParameterKey]:

@@ -140,7 +140,7 @@ def build(engine: Any, client: int, bodies: ModelBodies) -> Built:
 
 
 def matrix_of(turn: Sequence[float] | Floats) -> Floats:
-    """Give the rotation matrix of a quaternion, which is remembered: it must not be changed."""
+    """Give the rotation matrix of a quaternion, which is cached: it must not be changed."""
     return _matrix_of(*map(float, turn))
 
 
@@ -293,7 +293,7 @@ def _settle(engine: Any, client: int, made: int, joints: list[tuple[Joint, int]]
 
 
 def _couple(engine: Any, client: int, bodies: ModelBodies, built: Built) -> None:
-    """Let joints follow others."""
+    """Couple joints to others."""
     for coupling in bodies.couplings:
         multibody, link = built.joints[coupling.joint]
         gear = engine.createConstraint(

@@ -203,7 +203,7 @@ class ModelClient(Client):
     # --- bodies ----------------------------------------------------------------------------------
 
     def construct(self, structure: Model, parameters: Values) -> None:
-        """Make everything anew, unless only other parameters differ from what is there."""
+        """Make everything again, unless only other parameters differ from what is there."""
         inside = {key: parameters[key] for key in self.heavy(structure)}
         if self._model == structure and self._inside == inside:
             return
@@ -225,7 +225,7 @@ class ModelClient(Client):
         self._follow()
 
     def _find(self, bodies: ModelBodies, built: Built, size: int) -> None:
-        """Remember how states are written and read."""
+        """Prepare writing and reading of states."""
         self._size = size
         self._frames: list[Frame] = []
         self._ball_joints: dict[int, Ball] = {}
@@ -299,7 +299,7 @@ class ModelClient(Client):
             self._set_world()
 
     def written(self, keys: Iterable[ParameterKey]) -> None:
-        """Compute forces and frictions anew."""
+        """Compute forces and frictions again."""
         self._follow()
 
     def _weigh(self, body: int) -> None:
@@ -341,7 +341,7 @@ class ModelClient(Client):
                 self._limit(number)
 
     def _follow(self) -> None:
-        """Let forces and frictions follow from the parameters."""
+        """Derive forces and frictions from the parameters."""
         bodies, built = self._bodies, self._built
         numbers = shares(bodies, usual_friction(self._model.bodies))
         for number, (handle, share) in enumerate(zip(built.geoms, numbers, strict=True)):

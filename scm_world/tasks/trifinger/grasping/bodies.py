@@ -136,7 +136,7 @@ LEAST_FRICTION = 0.05
 
 FIRM = 0.6  # [N] with which even a block without weight is pressed
 MARGIN = 2.0
-"""How many times the force that just carries a block it is pressed with, besides."""
+"""Pressing force, as a multiple of the force that just carries a block."""
 
 _POSE = ("size", "cartesian_position", "orientation")
 

@@ -141,7 +141,7 @@ class Choice:
         return None
 
     def _detour(self, tool: str, ways: list[Way], *, release: bool = True) -> Move | None:
-        """Find a way to put a block down from where it can go on, or out of the way.
+        """Find a way to put a block down from where it can be carried on, or out of the way.
 
         Args:
             tool: The block.

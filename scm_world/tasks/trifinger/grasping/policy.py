@@ -221,7 +221,7 @@ class Grasp:
     It is meant for picking, pick and place, stacking two and pushing. Where there are dozens of
     blocks it begins, and mostly does not finish.
 
-    It depends on nothing but the world, without noise, and begins anew with every episode: one
+    It depends on nothing but the world, without noise, and starts again with every episode: one
     instance serves any number of episodes and of worlds.
 
     Args:

@@ -292,7 +292,7 @@ class TriFinger(Realization):
         return self._torques.copy(), self._last, self._written
 
     def recall(self, numbers: Floats, memory: Any) -> None:
-        """Go on from what was remembered."""
+        """Restore what was kept."""
         super().recall(numbers, memory)
         self._torques[:], self._last, self._written = memory
         if self._last is not None:
