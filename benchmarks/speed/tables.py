@@ -160,7 +160,7 @@ SECTIONS: dict[str, tuple[Callable[[Figures], list[str]], str]] = {
     ),
     "Scenes": (
         growth,
-        "Control steps of 10 × 4 ms, random actions over their full range. *Engine alone* lives "
+        "Control steps of 10 × 4 ms, random actions over their full range. *Engine alone* runs "
         "through the same episode without anything around it; the log is a `Recorder`. *First "
         "build* is construction and reset in a fresh process, after the imports.",
     ),
