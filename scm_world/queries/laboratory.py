@@ -1,4 +1,4 @@
-"""A world with permissions, a budget and a log: what a discovery algorithm or an agent gets."""
+"""A world with permissions, a budget and a log, for discovery algorithms and agents."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Experiment:
 
     Attributes:
         kind: ``"see"``, ``"do"`` or ``"counterfactual"``, after ``"refused "`` where it failed.
-        samples: What was done, to which units, and what came out.
+        samples: Interventions, units and outcomes.
         at: From which control step a counterfactual differs.
         row: Of a protocol, if it belongs to one.
     """
@@ -174,7 +174,7 @@ QUESTIONS = ("see", "do", "counterfactual")
 
 @final
 class Laboratory:
-    """Experiments on a world, without a look at its graph.
+    """Experiments on a world whose graph is hidden.
 
     Every experiment is checked before it begins, and written to the log when it has ended; a
     laboratory that is opened with the log of an earlier one continues it.
@@ -257,7 +257,7 @@ class Laboratory:
             "outcomes": [outcome.model_dump() for outcome in self.outcomes],
         }
 
-    # --- the books ----------------------------------------------------------------------------
+    # --- budget and log -------------------------------------------------------------------
 
     @property
     def spent(self) -> int:
@@ -277,7 +277,7 @@ class Laboratory:
     # --- experiments --------------------------------------------------------------------------
 
     def see(self, n: int) -> Samples:
-        """Watch new episodes.
+        """Observe new episodes.
 
         Raises:
             Forbidden: This question is not allowed.
@@ -297,7 +297,7 @@ class Laboratory:
             Forbidden: This question is not allowed, or something may not be set.
             BudgetExhausted: There are fewer episodes left.
             InterventionError: The intervention was refused. That costs nothing if it could be seen
-                beforehand, else all the episodes: how far they came may tell something.
+                beforehand, else all the episodes: how far they came is information.
             ModelError: With a log: a mechanism has no name under which it can be found again.
         """
         return self._experiment("do", request, n, row=row)
@@ -305,7 +305,7 @@ class Laboratory:
     def counterfactual(
         self, unit: int, request: Mapping[str, Any], *, at: int = 0
     ) -> dict[str, Floats]:
-        """Ask what a unit that was seen would have come to under another intervention.
+        """Run the counterfactual of a unit under another intervention.
 
         Args:
             unit: Number of an episode of an earlier experiment.
@@ -313,7 +313,7 @@ class Laboratory:
             at: From which control step on.
 
         Returns:
-            The reported outcomes of that unit as it would have been.
+            The reported outcomes of that unit under the intervention.
 
         Raises:
             Forbidden: As in ``do``, or the unit was never seen.
@@ -350,7 +350,7 @@ class Laboratory:
         return Samples(columns, tuple(units), self._setting.seed, Plan(request))
 
     def run(self, protocol: Path | str | Iterable[Mapping[str, Any]]) -> tuple[Samples, ...]:
-        """Carry out a protocol: a table of settings in, a data set out.
+        """Run a protocol: a table of settings in, a data set out.
 
         Args:
             protocol: A CSV file whose columns are variables (``name[i]`` for a component) and,
@@ -405,7 +405,7 @@ class Laboratory:
                     setting=self._setting,
                     first=units.start,
                 )
-            except Exception:  # how far it came may tell something: it is paid
+            except Exception:  # how far it came is information: it costs an episode
                 held = self._samples({}, units, request)
                 self._journal.write(f"refused {kind}", held, row=row)
                 raise

@@ -1,4 +1,4 @@
-"""What a verification found, as data."""
+"""Reports of verification."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class Fired(Report):
 
     Attributes:
         cause: The variable that was changed.
-        effect: The variable that answered.
+        effect: The variable that responded.
         lag: 0 or 1.
         after: How many probe states it took.
-        largest: Largest effect seen, in the unit of the child.
-        states: In how many probe states it was seen.
+        largest: Largest effect observed, in the unit of the child.
+        states: In how many probe states it was observed.
     """
 
     cause: str
@@ -71,13 +71,13 @@ class Undeclared(Report):
 
     Attributes:
         cause: The variable that was changed.
-        effect: The variable that should not have answered.
+        effect: The variable that should not have responded.
         lag: 0 or 1.
-        size: Largest effect seen, in the unit of the child.
-        probe: Number of the probe state in which it was seen.
+        size: Largest effect observed, in the unit of the child.
+        probe: Number of the probe state in which it was observed.
         kind: How this probe state came about.
         change: By how much the cause was moved, flattened; empty if no world was intervened on.
-        again: Whether it was seen in the held-out probe states, too; None if there were none.
+        again: Whether it was observed in the held-out probe states, too; None if there were none.
     """
 
     cause: str
@@ -108,7 +108,7 @@ class Verification(Report):
         format: Of the file.
         task: Name of the task.
         arguments: What the task was made with, each as ``name=value``, where that is known.
-        backend: Name of the engine.
+        backend: Its name.
         preset: Its numerical settings.
         seed: Of the experiments.
         generated: Whether the graph follows from structure: then an edge that never fired is a
@@ -161,17 +161,17 @@ class Verification(Report):
 
     @property
     def found(self) -> tuple[EdgeKey, ...]:
-        """List the edges that were seen, declared or not."""
+        """List the edges that were observed, declared or not."""
         return (*(edge.key for edge in self.fired), *(edge.key for edge in self.undeclared))
 
     @property
     def share(self) -> float:
-        """Declared edges that were seen, as a fraction; 1 if none is declared."""
+        """Declared edges that were observed, as a fraction; 1 if none is declared."""
         return len(self.fired) / len(self.declared) if self.declared else 1.0
 
     @property
     def coverage(self) -> tuple[int, ...]:
-        """How many declared edges had been seen after each probe state, those held out last."""
+        """How many declared edges had been observed after each probe state, those held out last."""
         new = [0] * (self.probes + self.held_out)
         for edge in self.fired:
             new[edge.after - 1] += 1

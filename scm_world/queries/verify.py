@@ -28,7 +28,7 @@ from scm_world.variables import Measured
 from scm_world.world import Simulation
 
 MOST, LEAST = 200, 16
-"""How many probe states there are at most, and how many even if every edge was seen before."""
+"""Largest and least number of probe states."""
 
 QUIET = 4
 """After how many probe states without a new edge it ends, of a generated graph."""
@@ -104,20 +104,20 @@ def verify_engines(
     progress: Callable[[str], Progress | None] | None = None,
     **options: Any,
 ) -> Agreement:
-    """Verify a task on two engines, and compare the signs of its effects.
+    """Verify a task on two backends, and compare the signs of its effects.
 
     It may be interrupted (Ctrl-C); the report then has what is finished.
 
-    Signs are compared from probe states that are made of the same numbers on both engines, over
-    one control step. Two engines differ by something even where nothing was changed; only effects
-    well above this are comparable.
+    Signs are compared from probe states that are made of the same numbers on both backends, over
+    one control step. Two backends differ even where nothing was changed (their noise floor); only
+    effects well above this are comparable.
 
     Args:
         task: A task, or the name of one.
-        backends: Names of the engines.
+        backends: Their names.
         probes: How many states to experiment in at most.
-        least: How many even if every declared edge has been seen before; signs are compared in
-            as many.
+        least: How many at least, even if every declared edge has been observed before; signs are
+            compared in as many.
         seed: Of states and values.
         progress: Called with the name of each engine, and last with ``"signs"``; gives what is
             called with (finished, planned) after each probe state.
@@ -156,7 +156,7 @@ def verify_engines(
 
 @final
 class _Watch:
-    """Notes after how many probe states each declared edge was first seen.
+    """Records after how many probe states each declared edge was first observed.
 
     Args:
         declared: The edges.
@@ -170,7 +170,7 @@ class _Watch:
         self.ended = False
 
     def __call__(self, effects: Effects, done: int) -> bool:
-        """Look for edges that are seen now; tell whether it is enough."""
+        """Record the edges that are observed now; tell whether to stop."""
         new = self.missing & effects.found(effects.threshold)
         self.missing -= new
         self.after.update(dict.fromkeys(new, done))

@@ -1,4 +1,4 @@
-"""Imitation: a network learns to do what a teacher does, a scripted policy or a recording."""
+"""Imitation: a network is fitted to demonstrations of a scripted policy or of a recording."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ SHARD = 25
 """Episodes in a file."""
 
 SEED = 5_000_003
-"""Added to seeds, so that no evaluation has the episodes of the lesson."""
+"""Added to seeds, so that no evaluation has the episodes of the demonstrations."""
 
 CORRELATION = 0.8
 """Of the noise of actions, from a control step to the next one."""
@@ -81,8 +81,8 @@ class Lesson(Frozen):
         task: Name of the task.
         teacher: Name of a policy that reads the world's state.
         env: Options of the environment, those that a policy file keeps.
-        protocols: Names of what varies while the teacher shows something, in turns.
-        episodes: Which the teacher plays alone.
+        protocols: Names of protocols that vary the demonstrations, in turns.
+        episodes: Number of those in which the teacher acts alone.
         rounds: How often the network acts now and then afterwards, and is trained again.
         more: Episodes of each of these rounds.
         noise: Largest standard deviation of what is added to actions, in units of actions; each
@@ -145,7 +145,7 @@ class Lesson(Frozen):
         return observed(self.env, self.observations)
 
     def __str__(self) -> str:
-        """Say in a few words what is shown and learned."""
+        """Summarise the demonstrations and the fit in a line."""
         return (
             f"{self.task} by imitation: {self.episodes} episodes in {', '.join(self.protocols)}, "
             f"with noise up to {self.noise:g}, then {self.rounds} rounds of {self.more}; "
@@ -196,7 +196,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
 @final
 @dataclass(frozen=True)
 class Demonstrations:
-    """Episodes that ended well, as pairs, and how all of them ended.
+    """Successful episodes, as pairs, and the scores of all.
 
     Attributes:
         observations: Shape (n, k).
@@ -272,9 +272,9 @@ def demonstrated(
     An episode follows from the seed, the round and its number.
 
     Args:
-        lesson: What is shown.
+        lesson: How demonstrations are made.
         numbers: Of the episodes, within the noise.
-        backend: Name of the engine.
+        backend: Its name.
         seed: Of everything that is drawn.
         round_: Of the lesson.
         learner: Acts now and then; never if None.
@@ -351,13 +351,13 @@ def given_demonstrations(
 
     Args:
         source: A recording, its file, or a folder of such files.
-        lesson: What should be learned from them.
+        lesson: How they are used.
 
     Raises:
         UnknownOption: They are of another task, their actions are not in [-1, 1], or they lack what
             privileged observations have.
         UnreadableFile: There are none.
-        ModelError: None ended well.
+        ModelError: None was successful.
     """
     recordings = [source] if isinstance(source, Recording) else []
     if not isinstance(source, Recording):
@@ -412,8 +412,8 @@ def fitted(
     first layer of the result has this turned back.
 
     Args:
-        shown: What is learned.
-        lesson: How it is learned.
+        shown: The demonstrations.
+        lesson: Network and optimiser.
         seed: Of everything that is drawn.
 
     Returns:
@@ -491,14 +491,14 @@ def whitening(observations: NDArray[Any]) -> tuple[Floats, Floats]:
 @final
 @dataclass(frozen=True)
 class Cloned:
-    """A network that has learned from a teacher.
+    """A network that was fitted to demonstrations.
 
     Attributes:
         folder: Of its files.
-        lesson: How it learned.
+        lesson: How it was made.
         seed: Of everything that was drawn.
         policy: The file of the policy after the last round.
-        best: The file of the one that was best in the evaluations; the last one without them.
+        best: The file of the best one in the evaluations; the last one without them.
         score: Of that one, mean last fractional success; None without evaluations.
     """
 
@@ -522,12 +522,12 @@ def clone(
 ) -> Cloned:
     """Train a network to imitate a teacher.
 
-    The teacher shows episodes; those that end well are learned from. In each round after that the
-    network acts now and then, the teacher says what it would have done, and the network learns
-    anew from all of it.
+    The network is fitted to the successful episodes of the teacher. In each further round the
+    network acts now and then, the actions of the teacher are recorded (DAgger), and the network is
+    fitted to all demonstrations.
 
     If ``out`` holds a part of the same work, it resumes after the last whole file of episodes, or
-    the last round. What comes out follows from the lesson, the seed, the engine and the versions.
+    the last round. The result follows from the lesson, the seed, the backend and the versions.
 
     Args:
         source: Where demonstrations come from: None for the teacher of the lesson; a recording,
@@ -536,7 +536,7 @@ def clone(
         lesson: What is shown, and how it is learned.
         out: Folder for all files.
         seed: Of everything that is drawn.
-        backend: Name of the engine.
+        backend: Its name.
         progress: Called with how many episodes have been shown, and how many will be.
         tell: Called with a sentence about each event.
 
@@ -609,7 +609,7 @@ def clone(
 
 
 def _checked(lesson: Lesson, backend: str, seed: int) -> str:
-    """Check that the teacher can act before a folder is made; return the engine's version.
+    """Check that the teacher can act before a folder is made; return the version of the backend.
 
     Raises:
         ActionError: It cannot.

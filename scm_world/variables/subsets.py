@@ -114,10 +114,10 @@ def _pair(pair: Any) -> tuple[str, Any]:
 
 
 def refuse_infinite(option: str, region: Any) -> None:
-    """Refuse a box from which one cannot draw.
+    """Refuse a box that cannot be drawn from.
 
     Args:
-        option: Of whom it is, for the error.
+        option: Its name, for the error.
         region: Anything.
 
     Raises:

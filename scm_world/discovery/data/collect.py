@@ -74,7 +74,7 @@ def collect(
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
         engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
-            ``engine_of``. A laboratory, which keeps books, has the first one only.
+            ``engine_of``. A laboratory, which keeps a log, has the first one only.
         circumstances: ``steps`` of an episode, 25 in a world. Of a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
             or ``Outcome``), and ``every_step``: a row for each control step, with the action.
@@ -117,7 +117,7 @@ def collect(
         folder = Folder(out, head, design.modules)
     with opened(engine, workers) as executor:
         if isinstance(source, Laboratory) and not isinstance(executor, Serial):
-            allowed = ("'serial' with one worker: a laboratory keeps its books in one process",)
+            allowed = ("'serial' with one worker: a laboratory keeps its log in one process",)
             raise UnknownOption("engine of work", executor.engine, allowed)
         with nullcontext() if folder is None else folder.opened():
             parts = _gathered(made, head, folder, executor, progress)
