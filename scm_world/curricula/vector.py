@@ -40,7 +40,7 @@ def make_vec(
         env_id: Such as ``"scm_world/Pushing-v0"``.
         num_envs: How many.
         curriculum: What is done in each of them; see ``CurriculumEnv``.
-        vectorization_mode: ``"native"``: many in one call of the engine; ``"processes"``:
+        vectorization_mode: ``"native"``: many in one call of the backend; ``"processes"``:
             several in each of some processes; ``"loop"``: in this process, one after another;
             None: the fastest that there is. What comes out does not depend on it.
         autoreset_mode: When a member that is done is reset, as in Gymnasium.

@@ -114,7 +114,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
         ModelError: The task has no reward.
-        EngineError: The engine is not installed, or there is no screen for ``"human"``.
+        EngineError: The backend is not installed, or there is no screen for ``"human"``.
 
     Example:
         >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
@@ -418,7 +418,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         return picture(scene, self._camera_of(scene))
 
     def close(self) -> None:
-        """Free the engine and the window."""
+        """Free the backend and the window."""
         if self._window is not None:
             self._window.close()
         self.world.close()

@@ -55,7 +55,7 @@ def model_env(model: Any = None, **options: Any) -> ScmWorldEnv:
 
 
 def model_vector_env(num_envs: int = 1, model: Any = None, **options: Any) -> ScmWorldVectorEnv:
-    """Make many environments of a model, stepped in one call where the engine can.
+    """Make many environments of a model, stepped in one call where the backend can.
 
     Args:
         num_envs: How many.

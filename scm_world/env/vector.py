@@ -306,7 +306,7 @@ def box(low: Floats, high: Floats) -> gymnasium.Space[NDArray[np.float32]]:
 def _signs(turns: NDArray[np.float32]) -> Floats:
     """Give the signs with which quaternions (x, y, z, w) are read from a rotation matrix.
 
-    The predecessor's engine does so: w is positive where the trace of the matrix is, which is up
+    The predecessor's backend does so: w is positive where the trace of the matrix is, which is up
     to 120°; beyond, the greatest of the other three is.
 
     Args:

@@ -55,7 +55,7 @@ def _checksum(data: Mapping[str, Any]) -> str:
 
 
 def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """List the scores with their intervals: one row for each agent, engine and protocol."""
+    """List the scores with their intervals: one row for each agent, backend and protocol."""
     return [
         {
             "agent": agent,

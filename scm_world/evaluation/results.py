@@ -209,7 +209,7 @@ class Evaluation:
         return Evaluation(self.about, columns, self.policies)
 
     def the(self, name: str, given: str | None) -> str:
-        """Choose an agent or an engine; where there is only one it need not be named.
+        """Choose an agent or a backend; where there is only one it need not be named.
 
         Raises:
             UnknownOption: There are several, or none of this name.
@@ -232,7 +232,7 @@ class Evaluation:
             in the order of seed and number.
 
         Raises:
-            UnknownOption: There is no such metric, agent or engine, or protocols do not have the
+            UnknownOption: There is no such metric, agent or backend, or protocols do not have the
                 same episodes.
         """
         metric = self.metric(metric)
@@ -309,7 +309,7 @@ class Evaluation:
         *,
         agent: str | None = None,
     ) -> Interval:
-        """Estimate by how much an agent does better on an engine than on another one.
+        """Estimate by how much an agent does better on a backend than on another one.
 
         Raises:
             UnknownOption: It did not play the same episodes on both.

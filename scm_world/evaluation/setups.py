@@ -107,7 +107,7 @@ class EvaluationPlace:
 @final
 @dataclass(frozen=True)
 class Shard:
-    """Some episodes in a row of one policy on one engine in one protocol.
+    """Some episodes in a row of one policy on one backend in one protocol.
 
     Attributes:
         agent: Place of the policy among the policies.
@@ -150,7 +150,7 @@ class Setup:
     versions: Mapping[str, Mapping[str, str]]
 
     def env(self, shard: Shard) -> ScmWorldEnv:
-        """Make the environment of a shard: on its engine, in the form of its agent."""
+        """Make the environment of a shard: on its backend, in the form of its agent."""
         return self.place.env(shard.engine, self.agents[shard.agent].form)
 
     def where(self, shard: Shard) -> str:
@@ -233,7 +233,7 @@ def prepare(
         task: Name, or a task; if None the one that the policies were trained for, else pushing.
         n: Episodes of each protocol, for each seed.
         seeds: One or several; also as a text with commas.
-        backend: One engine or several.
+        backend: One backend or several.
         env: Options of the environment.
         trusted: Packages whose functions may be policies, if named by a text.
 
@@ -274,7 +274,7 @@ def prepare(
             for protocol in wanted:
                 runner.try_out(protocol, seed=noises[0])
             found[engine] = versions(runner.env.world.engine)
-            for agent in loaded if len(agents) < len(loaded) else ():  # on the first engine
+            for agent in loaded if len(agents) < len(loaded) else ():  # on the first backend
                 own = runner.env if agent.form is None else place.env(engine, agent.form)
                 try:
                     agents += (agent.tried_out(own),)

@@ -1,4 +1,4 @@
-"""An engine-free description of any system: what moves, what can be set, what can be commanded."""
+"""A backend-free description of any system: what moves, what can be set, what can be commanded."""
 
 from scm_world.models.model import Input, Model, Parameter, Readout, Row, StateRow
 from scm_world.models.scene import (

@@ -1,4 +1,4 @@
-"""The bodies of a model, for engines that do not read its file: what moves how, and is driven how.
+"""The bodies of a model, for backends that do not read its file: what moves how, and is driven how.
 
 Frames, axes and joint coordinates are as in MJCF: bodies are given in the frame of their parent,
 with every joint at its reference; joints of one body act one after another, each in the frame
@@ -200,7 +200,7 @@ class Place(NamedTuple):
 @final
 @dataclass(frozen=True, eq=False)
 class ModelBodies:
-    """All of a model that an engine needs to build and to drive it.
+    """All of a model that a backend needs to build and to drive it.
 
     Attributes:
         bodies: In an order in which parents come before their children; the world first.

@@ -1,6 +1,6 @@
 """The description of any articulated system: typed tables of what can be set, read and commanded.
 
-Engine-free. ``backends.mujoco.reading`` makes it from a file, for every engine; an engine realises
+Engine-free. ``backends.mujoco.reading`` makes it from a file, for every backend; a backend realises
 it. The tables say on which kinematic trees each quantity acts, always or
 while there is contact: the causal graph follows from them and from nothing else.
 """
@@ -55,7 +55,7 @@ class Parameter(Row):
     """A property of an element that holds until it is set again.
 
     Attributes:
-        key: The element and the property, as engines know it.
+        key: The element and the property, as backends know it.
         kind: ``"real"``, ``"rotation"`` (unit quaternion) or ``"inertia"`` (principal moments,
             which obey the triangle inequality).
         visual: Whether it acts on pictures only.
@@ -111,14 +111,14 @@ class Readout:
 @final
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A system: what an engine compiles, and the tables of what there is.
+    """A system: what a backend compiles, and the tables of what there is.
 
-    Two models are equal if their engines would compile the same from them.
+    Two models are equal if their backends would compile the same from them.
 
     Attributes:
         name: Of the system.
         digest: Hash of everything that decides what is compiled.
-        source: What an engine compiles: only the reader and its engine look into it.
+        source: What a backend compiles: only the reader and its backend look into it.
         timestep: Physics step [s].
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
@@ -127,7 +127,7 @@ class Model:
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
         notes: What acts without having a variable (plugins, flex), one sentence each.
-        describe: Gives the ``ModelBodies`` of the model, for engines that do not read its file. It
+        describe: Gives the ``ModelBodies`` of the model, for backends that do not read its file. It
             can be pickled.
     """
 

@@ -1,4 +1,4 @@
-"""Scenes: the input of an engine and of a picture."""
+"""Scenes: the input of a backend and of a picture."""
 
 from __future__ import annotations
 
@@ -197,14 +197,14 @@ class GoalRegion:
 @final
 @dataclass(frozen=True)
 class Scene:
-    """Everything an engine needs to know, and everything a picture shows.
+    """Everything a backend needs to know, and everything a picture shows.
 
     Attributes:
         structure: The bodies there are.
         parameters: Their properties, complete.
         state: Where everything is and how it moves.
         goals: Silhouettes, for pictures and rewards.
-        light: Of pictures; no engine knows it.
+        light: Of pictures; no backend knows it.
     """
 
     structure: Any
@@ -243,7 +243,7 @@ class Overlap:
 @final
 @dataclass(frozen=True)
 class Difference:
-    """What an engine has to change.
+    """What a backend has to change.
 
     Attributes:
         structure: The new structure, or None where it stays.
@@ -262,7 +262,7 @@ class Difference:
 def diff(now: Scene, then: Scene) -> Difference:
     """Compare two scenes, and give the smallest set of changes from one to the other.
 
-    Goals are not compared: no engine knows them. Neither are states that cannot be set.
+    Goals are not compared: no backend knows them. Neither are states that cannot be set.
 
     Example:
         >>> from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene

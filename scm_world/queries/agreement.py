@@ -1,4 +1,4 @@
-"""In what two engines agree, as data."""
+"""In what two backends agree, as data."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SAME = 0.95
 """Share of the comparable edges whose sign must be the same."""
 
 FACTORS = (0.0, 1.0, 3.0, FACTOR)
-"""How far effects lie above the floor between the engines, in the shares that are reported."""
+"""Multiples of the noise floor between the backends, for which shares are reported."""
 
 
 @final
@@ -48,9 +48,9 @@ class Sign(Report):
         lag: 0 or 1.
         probe: Number of the probe state.
         component: Of the effect, flattened: the one that answered most.
-        moves: Whether the engine decides the effect; else it is computed, alike on both.
-        answers: Difference of this component on each engine, for an increase of the cause.
-        apart: By how much the engines differ in this effect without any change: their floor.
+        moves: Whether the backend decides the effect; else it is computed, alike on both.
+        answers: Difference of this component on each backend, for an increase of the cause.
+        apart: By how much the backends differ in this effect without any change: their noise floor.
     """
 
     cause: str
@@ -73,7 +73,7 @@ class Sign(Report):
         return (self.answers[0] > 0) == (self.answers[1] > 0)
 
     def clear(self, factor: float = FACTOR) -> bool:
-        """Tell whether both answers lie well above what the engines differ by anyway."""
+        """Tell whether both answers lie well above what the backends differ by anyway."""
         return min(map(abs, self.answers)) > factor * self.apart
 
 
@@ -105,10 +105,10 @@ class EdgeSigns(Report):
 
 @final
 class Share(Report):
-    """Equal signs of what the engine decides, among effects of some clarity.
+    """Equal signs of what the backend decides, among effects of some clarity.
 
     Attributes:
-        factor: How far above the floor between the engines both effects lie.
+        factor: How far above the noise floor between the backends both effects lie.
         compared: Comparisons, one per edge and probe state.
         equal: Those with one sign.
         edges: Edges with such a comparison.
@@ -130,7 +130,7 @@ class Agreement(Report):
         format: Of the file.
         task: Name of the task.
         backends: Names of the engines.
-        verifications: Of each engine that was reached: both, unless it was interrupted.
+        verifications: Of each backend that was reached: both, unless it was interrupted.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
         probes: In how many probe states signs were compared.
         signs: Every comparison.
@@ -148,7 +148,7 @@ class Agreement(Report):
 
     @property
     def only(self) -> dict[str, tuple[EdgeKey, ...]]:
-        """List edges that were seen on one engine only, by its name."""
+        """List edges that were seen on one backend only, by its name."""
         if len(self.verifications) < 2:
             return {}
         one, other = (set(found.found) for found in self.verifications)
@@ -159,7 +159,7 @@ class Agreement(Report):
         """Make the table of edges.
 
         Args:
-            factor: How far above the floor between the engines an effect is clear.
+            factor: How far above the noise floor between the backends an effect is clear.
             moving: Whether to leave out effects that are computed, alike on both engines.
         """
         by_edge: dict[EdgeKey, list[Sign]] = {}
@@ -174,7 +174,7 @@ class Agreement(Report):
         return tuple(edges)
 
     def at(self, factor: float) -> Share:
-        """Count equal signs of what the engine decides, among effects of some clarity."""
+        """Count equal signs of what the backend decides, among effects of some clarity."""
         clear = [edge for edge in self.edges(factor, moving=True) if edge.clear]
         return Share(
             factor=factor,
@@ -186,7 +186,7 @@ class Agreement(Report):
 
     @property
     def share(self) -> float:
-        """Comparable edges into what the engine decides with the same sign; 1 if there is none."""
+        """Comparable edges into what the backend decides with the same sign; 1 if there is none."""
         found = self.at(FACTOR)
         return found.edges_equal / found.edges if found.edges else 1.0
 
@@ -254,7 +254,7 @@ def compare_signs(
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[Sign, ...]:
-    """Experiment on two engines from the same numbers, and compare how effects answer.
+    """Experiment on two backends from the same numbers, and compare how effects answer.
 
     Args:
         task: A task, or the name of one.

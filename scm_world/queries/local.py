@@ -109,9 +109,9 @@ def _body_of(name: str, bodies: Iterable[str]) -> str:
 
 @final
 class _Listener:
-    """Stands in for an engine: takes physics steps one by one, and notes what touches in each.
+    """Stands in for a backend: takes physics steps one by one, and notes what touches in each.
 
-    An engine lists the contacts of its last physics step only.
+    A backend lists the contacts of its last physics step only.
     """
 
     def __init__(self, backend: Any) -> None:

@@ -207,7 +207,7 @@ def run_together(batch: Batch, units: Sequence[Unit]) -> list[Result]:
         What each leaves behind, or the exception that stopped it.
 
     Raises:
-        EngineFailure: The engine lost one of the states; that stops all of them.
+        EngineFailure: The backend lost one of the states; that stops all of them.
     """
     running = RunningTogether(batch, units)
     running.begin()

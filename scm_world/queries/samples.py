@@ -39,11 +39,11 @@ class Setting:
             beginning, such as ``{"tool_block.mass": "A"}``. What is done counts more.
         steps: Control steps of an episode; as many as the task has if None.
         seed: Of the noise; episode i of one seed is the same unit in every question.
-        workers: Threads; the result does not depend on how many. Where the engine steps many
+        workers: Threads; the result does not depend on how many. Where the backend steps many
             worlds in one call, and the policy does not look at the world (``"random"``,
-            ``"sweep"``, ``"across"``, given actions, None), these are threads of the engine; None
+            ``"sweep"``, ``"across"``, given actions, None), these are threads of the backend; None
             is as many as there are cores, or one in a worker process. Else None is one. On an
-            engine that steps one world at a time, two or more stand for processes as soon as
+            backend that steps one world at a time, two or more stand for processes as soon as
             these pay; a script needs ``if __name__ == "__main__"`` then.
     """
 

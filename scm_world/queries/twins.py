@@ -24,7 +24,7 @@ R = TypeVar("R")
 
 @final
 class Twins:
-    """Twins of one world: same task, options and engine, but none of its present.
+    """Twins of one world: same task, options and backend, but none of its present.
 
     Args:
         world: Is never touched.
@@ -32,7 +32,7 @@ class Twins:
     Attributes:
         task: Of the world.
         options: Further arguments of a twin.
-        batches: Whether the engine steps many worlds in one call.
+        batches: Whether the backend steps many worlds in one call.
     """
 
     def __init__(self, world: Simulation) -> None:
@@ -119,7 +119,7 @@ class Twins:
 def threaded(work: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
     """Do a piece of work for each item.
 
-    The engines compute without Python's lock, so that threads are worth it. The result does not
+    The backends compute without Python's lock, so that threads are worth it. The result does not
     depend on how many there are.
     """
     todo: Sequence[T] = list(items)

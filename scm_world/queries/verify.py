@@ -119,13 +119,13 @@ def verify_engines(
         least: How many at least, even if every declared edge has been observed before; signs are
             compared in as many.
         seed: Of states and values.
-        progress: Called with the name of each engine, and last with ``"signs"``; gives what is
+        progress: Called with the name of each backend, and last with ``"signs"``; gives what is
             called with (finished, planned) after each probe state.
         options: Arguments of ``World``, without ``backend``.
 
     Raises:
         UnknownOption: See ``verify``.
-        MissingEngine: One of the engines is not installed.
+        MissingEngine: One of the backends is not installed.
     """
     started = time.perf_counter()
 

@@ -233,7 +233,7 @@ class Task(ABC):
         plan: What there is, as ``arrange`` has it; None where that is always the same.
         absent: Entities that an intervention took away.
         checks_functions: Whether what functions of users give is checked when a world begins.
-        backend: Name of the engine that realises it, where none is asked for.
+        backend: Name of the backend that realises it, where none is asked for.
         generated_graph: Whether edges follow from structure, so that some may never show.
         conventions: Ours or the predecessor's.
         given: What it was made with.

@@ -198,7 +198,7 @@ class Commands(ABC):
 
 
 class Composition(ABC):
-    """What the variables of a world mean to an engine: where causal and physical column meet.
+    """What the variables of a world mean to a backend: where causal and physical column meet.
 
     Attributes:
         entities: In the order of the observation.
@@ -220,7 +220,7 @@ class Composition(ABC):
 
     @abstractmethod
     def structure(self, values: Values) -> Structure:
-        """Say what the engine has to compile; equal values give the same object."""
+        """Say what the backend has to compile; equal values give the same object."""
 
     @abstractmethod
     def parameters(self) -> Mapping[str, ParameterKey]:

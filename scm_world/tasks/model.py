@@ -55,7 +55,7 @@ def same_value(value: Any) -> Any:
 
 @final
 class ModelComposition(Composition):
-    """What the variables of a model mean to an engine: rows of its tables.
+    """What the variables of a model mean to a backend: rows of its tables.
 
     Args:
         model: The system.

@@ -129,11 +129,11 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     Args:
         recipe: How an agent is trained.
         backend: Name of the engine.
-        threads: Of an engine that steps many worlds in one call, or processes of another one; as
+        threads: Of a backend that steps many worlds in one call, or processes of another one; as
             many as there are cores if None. What comes out does not depend on it.
 
     Raises:
-        UnknownOption: There is no such engine, or an option of the environment does not exist.
+        UnknownOption: There is no such backend, or an option of the environment does not exist.
         InterventionError: The curriculum names something that does not exist.
     """
     kind = fastest(backend, recipe.worlds, workers=None)
@@ -422,7 +422,7 @@ class Watch(BaseCallback):
         recipe: How the agent is trained.
         worlds: In which it learns.
         folder: Of the run.
-        backend: Name of the engine, for evaluations.
+        backend: Name of the backend, for evaluations.
         card: What is said of the policy.
         progress: Called with how many steps are done.
         tell: Called with a sentence about each event.

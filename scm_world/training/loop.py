@@ -71,7 +71,7 @@ def train(
 ) -> Trained:
     """Train an agent.
 
-    What is learned follows from the recipe, the seed, the engine, ``threads`` and the versions.
+    What is learned follows from the recipe, the seed, the backend, ``threads`` and the versions.
     If ``out`` holds a part of the same training, it resumes from its last checkpoint, also with
     more steps than before if neither the learning rate nor the ceiling of the standard deviations
     depends on how many there are; on a CPU the weights in the end are, bit for bit, those of a
@@ -87,7 +87,7 @@ def train(
         progress: Called with how many steps are done, and how many there are.
         tell: Called with a sentence about each event.
         device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one.
-        threads: Of the engine and of torch. None: as many as there are cores for the engine,
+        threads: Of the backend and of torch. None: as many as there are cores for the backend,
             whose results do not depend on it, and one for torch, whose last bits do.
         every: Seconds between checkpoints.
 

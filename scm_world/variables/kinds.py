@@ -330,7 +330,7 @@ class Measured(Variable):
     Attributes:
         parents: Its causes.
         mechanism: The function of the parents, for a readout that is computed; None where the
-            engine itself is the mechanism.
+            backend itself is the mechanism.
         settable_state: Whether ``do`` may set it at an instant.
         default: The value at the start of an episode, for a state without ``start``.
         start: The value at the start as a function of the parents with ``when="set"``.

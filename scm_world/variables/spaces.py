@@ -417,7 +417,7 @@ class Rotations(_Space):
     """All unit quaternions (x, y, z, w); q and -q are one rotation, written with w >= 0.
 
     Attributes:
-        keeps_sign: Whether q and -q are distinguished, for engines that keep what they were given.
+        keeps_sign: Whether q and -q are distinguished, for backends that keep what they were given.
 
     Example:
         >>> Rotations().nearest(np.array([0.0, 0.0, 0.0, -2.0]))

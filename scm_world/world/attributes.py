@@ -39,7 +39,7 @@ class WorldAttributes:
         return self.structures.natural(None)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle through a snapshot: another engine, the same future bit for bit."""
+        """Copy and pickle through a snapshot: another backend, the same future bit for bit."""
         world: Any = self
         try:
             snapshot = world.snapshot()

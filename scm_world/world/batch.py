@@ -58,7 +58,7 @@ class Table:
 
 @final
 class Batch:
-    """Worlds of one task, options and engine, advanced in one call.
+    """Worlds of one task, options and backend, advanced in one call.
 
     A world in a batch is bit-identical to one that is stepped alone. Between steps,
     ``world`` gives a world as it is now, to ask it or to do something to it: use that, not a
@@ -66,7 +66,7 @@ class Batch:
 
     Args:
         worlds: They belong to the batch from now on.
-        threads: Of the engine, if it can use several; as many as there are cores if None.
+        threads: Of the backend, if it can use several; as many as there are cores if None.
         names: What is computed after every step.
 
     Raises:
@@ -153,7 +153,7 @@ class Batch:
 
         Raises:
             NotReset: A world has no episode yet.
-            EngineFailure: The engine lost a state, or a step function failed, whose world is as it
+            EngineFailure: The backend lost a state, or a step function failed, whose world is as it
                 was. All other worlds are one step further.
         """
         rows = self._all if which is None else np.flatnonzero(which)
@@ -245,6 +245,6 @@ class Batch:
         return found
 
     def close(self) -> None:
-        """Free the engines of all worlds."""
+        """Free the backends of all worlds."""
         for world in self._worlds:
             world.close()

@@ -100,7 +100,7 @@ class Options:
     """The options of a world.
 
     Attributes:
-        preset: Numerical settings of the engine at the start of an episode.
+        preset: Numerical settings of the backend at the start of an episode.
         action_mode: How the system is commanded.
         resolution: How finely the variables are cut.
         frame_skip: Length of a control step in units of the task.
@@ -241,7 +241,7 @@ class CompiledTask(ActionVector):
         }
 
     def structure(self, values: Values) -> Structure:
-        """Say what the engine has to compile."""
+        """Say what the backend has to compile."""
         return self.composition.structure(values)
 
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ from scm_world.world.structures import CheckedSnapshot, StructureCache, as_struc
 from scm_world.world.values import PresentValues
 
 _INTERVENTIONS = get_args(get_args(Intervention)[0])
-READ_BACK = 1e-6  # how far an engine may report a number from what it was given
+READ_BACK = 1e-6  # how far a backend may report a number from what it was given
 
 
 class Simulation(WorldAttributes):
@@ -67,7 +67,7 @@ class Simulation(WorldAttributes):
     Args:
         task: A registered name, a task, or the ``structures`` of a world that was made with the
             same options: then they share what is compiled.
-        backend: ``"mujoco"``, ``"bullet"``, ``"step"``, ``"fake"``, or an engine that is not used
+        backend: ``"mujoco"``, ``"bullet"``, ``"step"``, ``"fake"``, or a backend that is not used
             elsewhere; that of the task if None.
         preset: Of the robot's tasks: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
         action_mode: Of the robot's tasks: ``"joint_positions"``, ``"joint_torques"`` or
@@ -85,7 +85,7 @@ class Simulation(WorldAttributes):
 
     Raises:
         UnknownOption: One of the names does not exist.
-        MissingEngine: The engine is not installed.
+        MissingEngine: The backend is not installed.
 
     Example:
         >>> world = Simulation("pushing", backend="fake")
@@ -301,7 +301,7 @@ class Simulation(WorldAttributes):
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
             NotReset: There is no episode yet.
-            EngineFailure: The engine lost the state.
+            EngineFailure: The backend lost the state.
         """
         self.advance(self.compiled.clipped(action))
 
@@ -460,7 +460,7 @@ class Simulation(WorldAttributes):
         """Apply a plan, read it back, and report; or put everything back and raise.
 
         Raises:
-            EngineFailure: The engine does not report what it was given.
+            EngineFailure: The backend does not report what it was given.
         """
         values = self._values
         before = Present(self.compiled, self.structure, dict(values.now), values.state.copy())
@@ -480,7 +480,7 @@ class Simulation(WorldAttributes):
         """Put everything back, should something fail half way.
 
         Args:
-            undo: Puts the engine back.
+            undo: Puts the backend back.
         """
         kept, numbers, index = self._values, self._values.matrix.copy(), self._index
         model, static, state = self._held, kept.static, kept.state.copy()
@@ -504,7 +504,7 @@ class Simulation(WorldAttributes):
         """Read back what was applied.
 
         Raises:
-            EngineFailure: The engine did not take it over.
+            EngineFailure: The backend did not take it over.
         """
         reported = self.backend.parameters(change.parameters)
         values = change.parameters.items()
@@ -527,7 +527,7 @@ class Simulation(WorldAttributes):
         index: int,
         state: State | None = None,
     ) -> None:
-        """Take over what an intervention decided; the engine has taken over its part.
+        """Take over what an intervention decided; the backend has taken over its part.
 
         Args:
             compiled: The task in the structure that there is now.
@@ -597,7 +597,7 @@ class Simulation(WorldAttributes):
 
         Raises:
             NotReset: There is no episode yet.
-            EngineFailure: The engine has lost the state.
+            EngineFailure: The backend has lost the state.
         """
         self._require_state()
         base = self._base
@@ -635,10 +635,10 @@ class Simulation(WorldAttributes):
         What a snapshot holds is checked when a world of this process meets it for the first time.
 
         Raises:
-            SnapshotMismatch: It is one of another task or engine, or damaged. The world is as it
+            SnapshotMismatch: It is one of another task or backend, or damaged. The world is as it
                 was.
-            EngineFailure: The engine failed on the way. Where the snapshot had been checked before,
-                the world needs a reset or a snapshot.
+            EngineFailure: The backend failed on the way. If the snapshot had been checked before, the
+                world needs a reset or a snapshot.
         """
         known = self._known(snapshot)
         found = known or self._validated(snapshot)
@@ -744,7 +744,7 @@ class Simulation(WorldAttributes):
         )
 
     def _check_restored(self, present: StepBase) -> None:
-        """Refuse an engine's part that does not belong to the rest of a snapshot."""
+        """Refuse a backend's part that does not belong to the rest of a snapshot."""
         if self.backend.structure != present.compiled.structure(present.static):
             raise SnapshotMismatch("the snapshot is damaged: the engine has another structure")
         keys = {key: name for name, key in present.compiled.parameter_keys.items()}
@@ -764,7 +764,7 @@ class Simulation(WorldAttributes):
             raise NotReset
 
     def _require_state(self) -> None:
-        """Refuse to continue from a state that the engine has lost.
+        """Refuse to continue from a state that the backend has lost.
 
         Raises:
             EngineFailure: It has; a reset or a snapshot is needed.

@@ -81,7 +81,7 @@ class WorldSnapshot:
         return self  # nothing writes into it
 
     def unpacked(self, structure: Any) -> EngineSnapshot:
-        """Give the engine's part.
+        """Give the backend's part.
 
         Args:
             structure: What the world compiles.

@@ -36,7 +36,7 @@ KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
 
 CheckedSnapshot = tuple[str, EngineSnapshot, StepBase, StepBase | None]
-"""Name and version of the engine, its part, what holds, and the world before an intervention."""
+"""Name and version of the backend, its part, what holds, and the world before an intervention."""
 
 
 @final

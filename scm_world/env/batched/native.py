@@ -1,4 +1,4 @@
-"""Many environments whose engine steps all of them in one call."""
+"""Many environments whose backend steps all of them in one call."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from scm_world.world.mechanisms import FunctionFailure, places
 
 @final
 class NativeExecutor(LoopExecutor):
-    """Environments that are stepped by threads of the engine, and read in compiled loops.
+    """Environments that are stepped by threads of the backend, and read in compiled loops.
 
     Pictures, the corners of blocks and the noise of sensors are read in one environment
     after another.
@@ -35,7 +35,7 @@ class NativeExecutor(LoopExecutor):
         make: Makes one of them. What it makes may have methods ``stepped`` and ``act``, as members
             of a curriculum have: they are used after each control step.
         num_envs: How many.
-        threads: Of the engine; as many as there are cores if None. Results do not depend on it.
+        threads: Of the backend; as many as there are cores if None. Results do not depend on it.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class EnvWorker:
 
 @final
 class ProcessExecutor:
-    """Environments in several processes: how engines without threads use all cores.
+    """Environments in several processes: how backends without threads use all cores.
 
     Each process has some neighbors. What comes out does not depend on the number of processes.
     The methods are those of ``LoopExecutor``.

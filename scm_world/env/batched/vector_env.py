@@ -67,7 +67,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
             ``"Disabled"``, as in Gymnasium.
         copy: Give observations that are yours; else the next step overwrites them.
         executor: ``"loop"``: one after another in this process; ``"processes"``: several processes;
-            ``"native"``: many in one call of the engine; None: the fastest that there is.
+            ``"native"``: many in one call of the backend; None: the fastest that there is.
         threads: Of the native executor; as many as there are cores if None.
         workers: How many processes; as many as there are cores if None.
         member: Makes one of them from the options: something that can do what a ``ScmWorldEnv``
@@ -284,7 +284,7 @@ class ScmWorldVectorEnv(VectorEnv[Any, Any, Any]):
                 environment that goes there.
 
         Raises:
-            SnapshotMismatch: It is one of another task or engine, or of another number.
+            SnapshotMismatch: It is one of another task or backend, or of another number.
         """
         if isinstance(snapshot, VectorSnapshot):
             if len(snapshot.worlds) != self.num_envs:

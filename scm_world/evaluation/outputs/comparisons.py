@@ -34,14 +34,14 @@ WORDS: Mapping[str, str] = {
 @final
 @dataclass(frozen=True)
 class Line:
-    """An agent on an engine: one line of a figure, or one bar of each protocol."""
+    """An agent on a backend: one line of a figure, or one bar of each protocol."""
 
     agent: str
     engine: str
 
 
 def lines_of(evaluation: Evaluation) -> list[Line]:
-    """List which agent acted on which engine, agents in their order and then engines."""
+    """List which agent acted on which backend, agents in their order and then backends."""
     columns = evaluation.columns
     there = set(zip(columns["agent"].tolist(), columns["engine"].tolist(), strict=True))
     every = (Line(a, e) for a in evaluation.agents for e in evaluation.engines)
@@ -92,9 +92,9 @@ def _varies(protocol: Mapping[str, Any]) -> str:
 Scores = Mapping[tuple[Line, str], Interval]
 """By line and protocol; a line has no entry for a protocol in which it did not act."""
 Gaps = Mapping[tuple[str, str, str, str], Interval]
-"""By one engine, the other, agent and protocol."""
+"""By one backend, the other, agent and protocol."""
 Pairs = Mapping[tuple[str, str, str, str], Interval | str]
-"""Paired differences by engine, protocol, one agent and another, or why there is none."""
+"""Paired differences by backend, protocol, one agent and another, or why there is none."""
 
 
 def scores_of(evaluation: Evaluation, metric: str) -> Scores:
@@ -137,10 +137,11 @@ def best(pairs: Pairs) -> set[tuple[Line, str]]:
 
 
 def gaps_of(evaluation: Evaluation, metric: str) -> Gaps:
-    """Estimate all gaps between engines, of the agents that acted on both in a protocol.
+    """Estimate all gaps between backends, of the agents that acted on both in a protocol.
 
     Raises:
-        UnknownOption: There is one engine only, or an agent did not play the same episodes on both.
+        UnknownOption: There is one backend only, or an agent did not play the same episodes on
+            both.
     """
     if len(evaluation.engines) < 2:
         allowed = ("an evaluation on two engines or more, such as backend='mujoco,bullet'",)
@@ -175,7 +176,7 @@ def is_flat(found: Causes) -> bool:
 @final
 @dataclass(frozen=True)
 class Comparison:
-    """Agents on an engine compared as rliable defines it.
+    """Agents on a backend compared as rliable defines it.
 
     Attributes:
         over: ``"runs"`` if each agent has several of them, else ``"episodes"``.
@@ -189,7 +190,7 @@ class Comparison:
 
 
 def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, Comparison]:
-    """Compare the agents on each engine over all protocols.
+    """Compare the agents on each backend over all protocols.
 
     Raises:
         UnknownOption: Agents have not played the same protocols, or one episode only.

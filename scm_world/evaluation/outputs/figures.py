@@ -1,4 +1,4 @@
-"""Figures of evaluations: bars, radars, profiles, gaps between engines, causes.
+"""Figures of evaluations: bars, radars, profiles, gaps between backends, causes.
 
 Each function returns a matplotlib figure; ``save`` writes it, with the same bytes for the same
 evaluation. matplotlib is loaded when one is drawn.
@@ -55,7 +55,7 @@ DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 
 @final
 @dataclass(frozen=True)
 class Look:
-    """How a line looks: agents differ in color and marker, engines in dashes and hatches.
+    """How a line looks: agents differ in color and marker, backends in dashes and hatches.
 
     Attributes:
         label: In legends.
@@ -175,12 +175,12 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
 def gap_figure(
     evaluation: Evaluation, metric: str | None = None, gaps: Gaps | None = None
 ) -> Figure:
-    """Draw the gap between engines in each protocol, with paired 95 % intervals.
+    """Draw the gap between backends in each protocol, with paired 95 % intervals.
 
-    Each pair of engines gets a panel. ``gaps`` are given if they are known already.
+    Each pair of backends gets a panel. ``gaps`` are given if they are known already.
 
     Raises:
-        UnknownOption: There is one engine only, no such metric, or an agent did not play the same
+        UnknownOption: There is one backend only, no such metric, or an agent did not play the same
             episodes on both.
     """
     from matplotlib.lines import Line2D
@@ -259,7 +259,7 @@ def profile_figure(
 ) -> Figure:
     """Draw the share of scores above each threshold, and who is better with what probability.
 
-    For each engine one panel of profiles with their 95 % bands, and with several agents one of
+    For each backend one panel of profiles with their 95 % bands, and with several agents one of
     pairs. Where every agent has several training runs a score is that of a run in a protocol, else
     that of an episode; the figure says which. ``found`` are comparisons that are known already.
 
@@ -333,11 +333,11 @@ def causes_figure(
     A bar is the share of the score's variance that a variable explains, with its 95 % interval. It
     is blue with a star if the effect is significant (Holm p at most 0.05 within the protocol).
     Below the name stands how much higher the score is in the upper third of the drawn values than
-    in the lower third: ▲ if it rises, ▼ if it falls. Agent and engine need not be named if there
+    in the lower third: ▲ if it rises, ▼ if it falls. Agent and backend need not be named if there
     is only one; ``found`` are effects by protocol that are known already.
 
     Raises:
-        UnknownOption: There is no such agent, engine or metric, or it has to be named.
+        UnknownOption: There is no such agent, backend or metric, or it has to be named.
     """
     metric = evaluation.metric(metric)
     agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)

@@ -68,7 +68,7 @@ def write_report(
 ) -> dict[str, Figure]:
     """Write the report as one HTML file: scores, figures, differences, causes, how to check them.
 
-    What cannot be computed, such as a gap with one engine, is left out or says why. The same
+    What cannot be computed, such as a gap with one backend, is left out or says why. The same
     evaluation gives the same bytes.
 
     Args:

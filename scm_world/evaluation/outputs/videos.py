@@ -52,7 +52,7 @@ def record_videos(
         shard_runner: Of the evaluation; see ``checking.shard_runner_of``.
         evaluation: Its results.
         folder: Where the videos are put, under names such as ``worst-P6-episode17.mp4``, with run,
-            seed, agent and engine if there are several.
+            seed, agent and backend if there are several.
         agent: Who acts; need not be named if there is only one.
         engine: Where; need not be named if there is only one.
         metric: By which episodes are chosen; one of ``METRICS``.
@@ -65,7 +65,7 @@ def record_videos(
     Raises:
         MissingExtra: moviepy is not installed.
         SnapshotMismatch: The rerun of an episode differs from the evaluation.
-        UnknownOption: There is no such agent, engine or metric.
+        UnknownOption: There is no such agent, backend or metric.
         UnwritableFolder: There is no room, or no permission.
     """
     metric = evaluation.metric(metric)
@@ -156,11 +156,11 @@ def choose(
     """Return places of episodes among the rows of the evaluation, each once; see ``record_videos``.
 
     Raises:
-        UnknownOption: There is no such agent, engine or metric.
+        UnknownOption: There is no such agent, backend or metric.
     """
     metric, columns = evaluation.metric(metric), evaluation.columns
     agent, engine = evaluation.the("agent", agent), evaluation.the("engine", engine)
-    evaluation.only(agent=agent, engine=engine)  # refuses an agent that was not on this engine
+    evaluation.only(agent=agent, engine=engine)  # refuses an agent that was not on this backend
     mine = np.flatnonzero((columns["agent"] == agent) & (columns["engine"] == engine))
     order = mine[np.lexsort([-mine, columns["return"][mine], columns[metric][mine]])]
     found: dict[str, int] = {}

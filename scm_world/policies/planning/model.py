@@ -30,14 +30,14 @@ class PlanningModel:
         world: What is modelled.
         n: How many sequences are tried out together.
         names: Variables that are wanted after every control step.
-        backend: The engine of the copies, by name; that of the world if None. Where it is another
+        backend: The backend of the copies, by name; that of the world if None. Where it is another
             one, the physical state is carried over, but no memory of contacts.
         do: What the model believes to be different, as in ``World.do``: the true model if None.
         foresees: Whether the copies have the noise of the world, and so know what will be drawn.
-        threads: Of the engine; as many as there are cores if None.
+        threads: Of the backend; as many as there are cores if None.
 
     Raises:
-        UnknownOption: There is no such engine, or a number is none.
+        UnknownOption: There is no such backend, or a number is none.
         UnknownVariable: A name does not exist.
 
     Example:
@@ -114,7 +114,7 @@ class PlanningModel:
 
         Raises:
             ActionError: Actions have another shape.
-            EngineFailure: The engine lost a state.
+            EngineFailure: The backend lost a state.
         """
         size = self._copies[0].compiled.n_actions
         if actions.ndim != 3 or actions.shape[2] != size or len(actions) > len(self):

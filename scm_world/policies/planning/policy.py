@@ -121,10 +121,10 @@ class CrossEntropy:
         every: For how many control steps a plan is followed.
         do: What the planner wrongly believes, as in ``World.do``: ``{"tool_block.friction": 0.2}``.
             With None it plans with the true model.
-        backend: The engine that it plans with, by name; that of the world if None.
+        backend: The backend that it plans with, by name; that of the world if None.
         foresees: Whether it knows the noise that is still to come.
         seed: Of the sampling.
-        threads: Of the engine; as many as there are cores if None.
+        threads: Of the backend; as many as there are cores if None.
         numbers: Of the search: ``samples``, ``horizon``, ``iterations`` …; see ``Search``.
 
     Raises:

@@ -5,7 +5,7 @@ differs afterwards, bit by bit, is an effect of X. A difference is a *direct* ef
 remains while every other variable that X moved is held at its old value.
 
 Within the instant, variables that can be set are held by the intervention itself, and computed
-ones by handing their old value to their children. Over one control step the engine is one joint
+ones by handing their old value to their children. Over one control step the backend is one joint
 mechanism, so a difference in a state is a direct effect of the differences before; a
 computed variable has a lagged cause if it still differs while all present values are held.
 """

@@ -1,12 +1,12 @@
 """The TriFinger robot: its published constants, its joint controller, and how finely time is cut.
 
-Nothing of it is what an engine would call its own; every engine realises the controller and must
+Nothing of it is what a backend would call its own; every backend realises the controller and must
 match it.
 
 Three fingers hang from a base above the table. Each is a chain of three hinges; the axes of the
 second and third are parallel. All numbers are those of the TriFinger-edu description as
 CausalWorld 1.2 ships it; the link inertias are the ones that are in force there after the first
-reset (computed by the engine from the collision hulls), which scale with the mass of the link.
+reset (computed by the backend from the collision hulls), which scale with the mass of the link.
 
 Frames: the world's z axis points up and the table top is at z = 0. The nominal robot height of
 0.34 m was measured from a plane 0.011 m below the table top.
@@ -182,7 +182,7 @@ class ControllerSpec:
 
 @dataclass(frozen=True)
 class Preset:
-    """Numerical settings that every engine understands in its own way.
+    """Numerical settings that every backend understands in its own way.
 
     Attributes:
         name: ``"fast"`` or ``"precise"``.

@@ -89,7 +89,7 @@ def _pile(
 @lru_cache(maxsize=512)
 def _dropped(lone: bytes, each: bytes) -> bytes:
     """Simulate a pile once, and cache it: poses of the blocks, shape (n, 7)."""
-    from scm_world.backends import make_backend  # it loads an engine
+    from scm_world.backends import make_backend  # it loads a backend
 
     size, mass, floor, *gravity = np.frombuffer(lone).tolist()
     drops = np.frombuffer(each).reshape(-1, 7)

@@ -1,4 +1,4 @@
-"""An engine-free description of what stands in the world."""
+"""A backend-free description of what stands in the world."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ _REALIZATIONS = {
 
 @cache
 def _realization(backend: str) -> Any:
-    """Import a realisation, so that no engine is loaded before it is used."""
+    """Import a realisation, so that no backend is loaded before it is used."""
     if backend not in _REALIZATIONS:
         return None
     module, name = _REALIZATIONS[backend]

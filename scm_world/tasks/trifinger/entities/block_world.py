@@ -74,7 +74,7 @@ class BlockWorld(Composition):
             object.__setattr__(self, name, value)
 
     def structure(self, values: Values) -> TriFingerStructure:
-        """Say which bodies the engine has to build, and how finely it cuts time."""
+        """Say which bodies the backend has to build, and how finely it cuts time."""
         name = PRESET_NAMES[int(values[PRESET])]
         if name not in self._structures:
             published = self.conventions.published_physics
