@@ -637,8 +637,8 @@ class Simulation(WorldAttributes):
         Raises:
             SnapshotMismatch: It is one of another task or backend, or damaged. The world is as it
                 was.
-            EngineFailure: The backend failed on the way. If the snapshot had been checked before, the
-                world needs a reset or a snapshot.
+            EngineFailure: The backend failed on the way. If the snapshot had been checked before,
+                the world needs a reset or a snapshot.
         """
         known = self._known(snapshot)
         found = known or self._validated(snapshot)
