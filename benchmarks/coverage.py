@@ -302,9 +302,10 @@ def page(found: dict[str, list[dict[str, Any]]], about: dict[str, Any]) -> str:
         "The criterion was fixed before: an interval *holds* if it contains the truth in 0.93 of",
         "the samples. Where a sample can show that its interval is too short, the package says so:",
         "it gives a word of caution, or no interval at all. Then at most 0.05 of all samples may",
-        f"miss the truth without it. {held} of {len(rows)} rows hold. **The others are where an",
-        "interval should not be trusted.** Among them are training runs that either learn or fail,",
-        "returns with heavy tails over few runs, and effects that a regression cannot follow.",
+        f"miss the truth without it. {held} of {len(rows)} rows hold. **In the others an interval",
+        "should not be trusted.** Most of them are training runs that either learn or fail, and",
+        "returns with heavy tails; no interval over three runs can know of a failure that it did",
+        "not see.",
     ]
     for part, some in found.items():
         lines += [

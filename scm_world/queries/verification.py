@@ -114,8 +114,13 @@ class Verification(Report):
         generated: Whether the graph follows from structure: then an edge that never fired is a
             finding (the mass of what falls freely moves nothing), and no failure.
         probes: Probe states that were used.
-        held_out: Further ones, of another seed, in which what never fired and what is undeclared
-            was looked for again.
+        held_out: Further ones, of another seed and without the task's scenarios, in which effects
+            without an edge were looked for; of a generated graph, what never fired and what is
+            undeclared.
+        seen_held_out: How many declared edges were seen in the held-out states; None of a generated
+            graph, of which not all are looked for.
+        provenance: How many declared edges were seen and how many there are, by what decides the
+            effect: ``"engine"``, ``"readout"`` (computed from states) or ``"definition"``.
         planned: How many probe states there may have been, without those.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
         rollouts: Control steps simulated in an experiment of their own.
@@ -140,6 +145,8 @@ class Verification(Report):
     generated: bool = False
     probes: int
     held_out: int = 0
+    seen_held_out: int | None = None
+    provenance: dict[str, tuple[int, int]] = {}
     planned: int
     interrupted: bool
     rollouts: int
@@ -196,6 +203,16 @@ class Verification(Report):
             f"{len(self.fired)} of {len(self.declared)} ({100 * self.share:.2f} %)",
             unseen,
         )
+        more: list[Row] = [
+            (f"of these, by {by}", f"{seen} of {all_}", None)
+            for by, (seen, all_) in self.provenance.items()
+            if all_
+        ]
+        if self.seen_held_out is not None:
+            text = (
+                f"{self.seen_held_out} of {len(self.declared)} in {self.held_out} held-out states"
+            )
+            more.append(("without the task's scenarios", text, None))
         return (
             ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
             ("preset, seed", f"{self.preset}, {self.seed}", None),
@@ -205,6 +222,7 @@ class Verification(Report):
             ("settable variables", str(self.settable), None),
             ("never feasible", listed(self.untried), None),
             ("declared edges seen", *found),
+            *more,
             ("never seen", listed(map(arrow, self.never_fired)), unseen),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
             ("colors that move something", listed(map(arrow, self.colors)), not self.colors),

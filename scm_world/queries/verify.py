@@ -34,7 +34,7 @@ QUIET = 4
 """After how many probe states without a new edge it ends, of a generated graph."""
 
 HELD_OUT = 8
-"""How many further ones there are for what a generated graph leaves open."""
+"""How many further probe states of another seed there are, whatever was seen before."""
 
 OTHER = 1_000_003
 """What is added to the seed for these."""
@@ -45,6 +45,7 @@ def verify(
     *,
     probes: int = MOST,
     least: int = LEAST,
+    held_out: int = HELD_OUT,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Any,
@@ -52,13 +53,18 @@ def verify(
     """Check a declared graph against the physics or the equations that realise it.
 
     From many probe states one variable at a time is changed, everything else kept, and all
-    differences afterwards are compared with the declared edges. It ends when every declared edge
-    was observed. It may be interrupted (Ctrl-C); the report then covers the probe states that were
-    finished.
+    differences afterwards are compared with the declared edges. The search for declared edges ends
+    when each of them was observed. It may be interrupted (Ctrl-C); the report then covers the probe
+    states that were finished.
+
+    Effects without an edge are looked for in further states, which are held out: of another seed,
+    half of them with other parameters, where random actions lead, anywhere that is feasible, and
+    where bodies touch. A task's own scenarios are not used there, so the report says how much of
+    the graph shows without them.
 
     A graph that was generated from a model says what can act on what; some of its edges may never
-    show. So it ends when nothing new is seen any more, and what was never seen, or seen without
-    an edge, is looked for again in probe states of another seed.
+    show. So its search ends when nothing new is seen any more, and in the held-out states only
+    what was never seen, or seen without an edge, is looked for.
 
     A causal model without a backend is its own physics: each mechanism is evaluated with one
     variable changed. A declared parent that its mechanism ignores never shows. An effect without
@@ -68,13 +74,14 @@ def verify(
         system: A world, a causal model, a task, the name of one, or a model file.
         probes: How many states to experiment in at most.
         least: How many even if every declared edge has been seen before.
+        held_out: How many further ones for effects without an edge.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
         options: Arguments of ``World``, such as ``backend``, unless ``system`` is one.
 
     Raises:
-        UnknownOption: ``probes`` or ``least`` is not a positive whole number, there are options
-            for a world that is made, or a name does not exist.
+        UnknownOption: ``probes`` or ``least`` is not a positive whole number, ``held_out`` is not
+            a whole number, there are options for a world that is made, or a name does not exist.
 
     Example:
         >>> found = verify("reaching", backend="fake", probes=1)
@@ -83,13 +90,14 @@ def verify(
     """
     whole_number("number of probes", probes, least=1)
     whole_number("least number of probes", least, least=1)
+    whole_number("number of held-out probes", held_out, least=0)
     if isinstance(system, Simulation | SCM):
         if options:
             raise UnknownOption("option for a world that is made", next(iter(options)), ())
-        return _verified(system, probes, least, seed, progress)
+        return _verified(system, probes, least, held_out, seed, progress)
     world = Simulation(system, **options)
     try:
-        return _verified(world, probes, least, seed, progress)
+        return _verified(world, probes, least, held_out, seed, progress)
     finally:
         world.close()
 
@@ -154,6 +162,25 @@ def verify_engines(
     )
 
 
+def _provenance(
+    model: SCM, declared: Iterable[EdgeKey], found: set[EdgeKey]
+) -> dict[str, tuple[int, int]]:
+    """Count the edges that were seen and those that are declared, by what decides the effect.
+
+    The engine decides states and what it reports. What is computed from them is a readout, and
+    everything else follows by definition: its edges hold because the mechanism is what it is.
+    """
+    counted = {"engine": (0, 0), "readout": (0, 0), "definition": (0, 0)}
+    for key in declared:
+        effect: Any = model.declared(key[1])
+        by = "definition"
+        if isinstance(effect, Measured):
+            by = "engine" if effect.mechanism is None else "readout"
+        seen, all_ = counted[by]
+        counted[by] = seen + (key in found), all_ + 1
+    return counted
+
+
 @final
 class _Watch:
     """Records after how many probe states each declared edge was first observed.
@@ -181,7 +208,12 @@ class _Watch:
 
 
 def _verified(
-    system: Simulation | SCM, probes: int, least: int, seed: int, progress: Progress | None
+    system: Simulation | SCM,
+    probes: int,
+    least: int,
+    held_out: int,
+    seed: int,
+    progress: Progress | None,
 ) -> Verification:
     started = time.perf_counter()
     world = system if isinstance(system, Simulation) else None
@@ -197,17 +229,17 @@ def _verified(
     found = effects.edges(set(declared))
     interrupted = done < probes and not watch.ended
     open_ = found.symmetric_difference(declared)
-    held_out: Series | None = None
+    further: Series | None = None
     again: set[EdgeKey] | None = None
-    if world and generated and open_ and not interrupted:
-        causes = {cause for cause, _, _ in open_}
-        held_out = Series(Paired(world, seed + OTHER, causes=causes), HELD_OUT)
+    if world and held_out and not interrupted and (open_ or not generated):
+        causes = {cause for cause, _, _ in open_} if generated else None
+        further = Series(Paired(world, seed + OTHER, causes=causes), held_out)
         with contextlib.suppress(KeyboardInterrupt):
-            states = probe_states(world, HELD_OUT, seed + OTHER)
-            held_out.run(states, lambda new, more: watch(new, done + more) and False)
-        interrupted = held_out.done < HELD_OUT
-        again = held_out.effects.edges(set(declared))
-        effects.take(held_out.effects, done)
+            states = probe_states(world, held_out, seed + OTHER, scenarios=False)
+            further.run(states, lambda new, more: watch(new, done + more) and False)
+        interrupted = further.done < held_out
+        again = further.effects.edges(set(declared))
+        effects.take(further.effects, done)
         found = effects.edges(set(declared))
     undeclared = []
     for key in sorted(found - set(declared)):
@@ -229,7 +261,9 @@ def _verified(
         seed=seed,
         generated=generated,
         probes=done,
-        held_out=0 if held_out is None else held_out.done,
+        held_out=0 if further is None else further.done,
+        seen_held_out=None if again is None or generated else len(again & set(declared)),
+        provenance=_provenance(model, declared, found),
         planned=probes,
         interrupted=interrupted,
         rollouts=effects.rollouts,

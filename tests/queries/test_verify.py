@@ -49,10 +49,23 @@ def test_pushing_has_no_undeclared_effect(pushing: Verification) -> None:
 
 def test_coverage_ends_with_what_was_seen(pushing: Verification) -> None:
     """The curve has one number per probe state, never falls, and ends with all that fired."""
-    assert len(pushing.coverage) == pushing.probes == 4
+    assert (pushing.probes, pushing.held_out) == (4, 8)
+    assert len(pushing.coverage) == 12
     assert list(pushing.coverage) == sorted(pushing.coverage)
     assert pushing.coverage[-1] == len(pushing.fired)
     assert len(pushing.fired) + len(pushing.never_fired) == len(pushing.declared)
+
+
+def test_the_graph_shows_without_scenarios(pushing: Verification) -> None:
+    """Random states of the model itself see seven tenths of the edges; edges are counted apart."""
+    assert pushing.seen_held_out is not None
+    assert pushing.seen_held_out > 0.7 * len(pushing.declared)
+    engine, readout, definition = (
+        pushing.provenance[by] for by in ("engine", "readout", "definition")
+    )
+    assert engine[1] + readout[1] + definition[1] == len(pushing.declared)
+    assert engine[1] > 200
+    assert "of these, by engine" in str(pushing)
 
 
 def test_a_report_survives_json(pushing: Verification) -> None:
@@ -97,7 +110,7 @@ def test_a_missing_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the declaration leaves out is named, with its size and where it was seen."""
     name = "tool_block.linear_velocity"
     world = tampered(monkeypatch, name, lambda parents: [p for p in parents if p.name != "gravity"])
-    found = verify(world, probes=3)
+    found = verify(world, probes=3, held_out=0)
     (edge,) = found.undeclared
     assert edge.key == ("gravity", name, 1)
     assert edge.size > 1e-3
@@ -112,7 +125,9 @@ def test_a_superfluous_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """An edge that physics does not have never fires; one from a color is wrong anyway."""
     name = "tool_block.linear_velocity"
     extra = Parent("tool_block.color", 1)
-    found = verify(tampered(monkeypatch, name, lambda parents: [*parents, extra]), probes=2)
+    found = verify(
+        tampered(monkeypatch, name, lambda parents: [*parents, extra]), probes=2, held_out=0
+    )
     edge = ("tool_block.color", name, 1)
     assert edge in found.never_fired
     assert found.colors == (edge,)
@@ -122,7 +137,7 @@ def test_a_superfluous_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_results_depend_on_the_seed_alone() -> None:
     """Two runs with one seed agree in everything but the time."""
-    one, two = (verify("reaching", probes=2, seed=5) for _ in range(2))
+    one, two = (verify("reaching", probes=2, held_out=1, seed=5) for _ in range(2))
     same = {"seconds": 0.0}
     assert one.model_copy(update=same) == two.model_copy(update=same)
 
@@ -130,7 +145,9 @@ def test_results_depend_on_the_seed_alone() -> None:
 def test_it_ends_early_but_not_too_early() -> None:
     """With everything seen it ends at the least number of probe states."""
     told: list[tuple[int, int]] = []
-    found = verify("reaching", probes=60, least=14, progress=lambda *at: told.append(at))
+    found = verify(
+        "reaching", probes=60, least=14, held_out=0, progress=lambda *at: told.append(at)
+    )
     assert found.never_fired == ()
     assert (found.probes, found.planned, found.interrupted) == (14, 60, False)
     assert told[0] == (1, 60)

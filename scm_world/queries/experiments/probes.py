@@ -53,7 +53,13 @@ class Probe:
 
 
 def probes(
-    world: Simulation, n: int, seed: int, *, settled: bool = True, first: int = 0
+    world: Simulation,
+    n: int,
+    seed: int,
+    *,
+    settled: bool = True,
+    first: int = 0,
+    scenarios: bool = True,
 ) -> Iterator[Probe]:
     """Prepare probe states one after another.
 
@@ -64,10 +70,12 @@ def probes(
         first: Number of the first one.
         settled: Whether control steps may be taken first. Without them a probe state is made of
             the same numbers on every engine.
+        scenarios: Whether the task's own scenarios are used, where it has some.
     """
     noise = Noise(seed)
     world.reset(seed=seed)
-    kinds = tuple(world.task.scenarios(world)) or _kinds(world, settled=settled)
+    known = tuple(world.task.scenarios(world)) if scenarios else ()
+    kinds = known or _kinds(world, settled=settled)
     for number in range(first, n):
         yield _prepared(world, kinds[number % len(kinds)], noise, number, settled)
 
