@@ -57,7 +57,7 @@ def test_coverage_ends_with_what_was_seen(pushing: Verification) -> None:
 
 
 def test_the_graph_shows_without_scenarios(pushing: Verification) -> None:
-    """Random states of the model itself see more than half of the edges; edges are counted apart."""
+    """Random states of the model see more than half of the edges; kinds are counted apart."""
     assert pushing.seen_held_out is not None
     assert pushing.seen_held_out > 0.5 * len(pushing.declared)
     engine, readout, definition = (
