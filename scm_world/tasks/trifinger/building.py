@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -203,6 +203,49 @@ class Building(TriFingerTask):
         if any(fingers_reach(b[0], b[1], b[2], joints, height) for b in boxes):
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
+
+
+class Assembly(Building):
+    """A building of parts: blocks that begin on the floor, each with its place in it.
+
+    The fingers begin raised, out of their way.
+    """
+
+    default_weights: ClassVar[Mapping[str, float]] = {FRACTION: 1.0}
+    rest = hardware.RAISED
+
+    @abstractmethod
+    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
+        """Name the parts, each with what says which it is."""
+
+    @abstractmethod
+    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
+        """Describe the block of a part, and its goal."""
+
+    def wanted(self, which: Mapping[str, float]) -> bool:
+        """Tell whether a part has a goal."""
+        return True
+
+    def tools(self) -> tuple[str, ...]:
+        """Name the blocks, part by part."""
+        return tuple(f"tool_{name}" for name, _ in self.parts())
+
+    def targets(self) -> dict[str, str]:
+        """Name the goals, part by part."""
+        return {
+            f"goal_{name}": f"tool_{name}" for name, which in self.parts() if self.wanted(which)
+        }
+
+    def causes(self) -> Iterable[Entity]:
+        """List what the places of the parts follow from, besides shared variables."""
+        return ()
+
+    def entities(self) -> Iterable[Entity]:
+        """A block, and perhaps a goal, for each part."""
+        pieces = [(self.piece(name, which), which) for name, which in self.parts()]
+        yield from (tool for (tool, _), _ in pieces)
+        yield from self.causes()
+        yield from (goal for (_, goal), which in pieces if self.wanted(which))
 
 
 def _split(boxes: Floats) -> tuple[Floats, Floats, Floats]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Any, Unpack, final
 
@@ -12,10 +12,10 @@ import numpy as np
 from scm_world._types import Floats, Values
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, Common
+from scm_world.tasks.rewards import Common
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import hardware, piles
-from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger import piles
+from scm_world.tasks.trifinger.building import Assembly
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
@@ -121,7 +121,7 @@ class Pile(Entity):
 
 
 @final
-class General(Building):
+class General(Assembly):
     """Blocks on the floor, and the places where such blocks came to lie that were dropped.
 
     From where they are dropped is a variable: draw it for another goal. What the blocks are like,
@@ -143,10 +143,8 @@ class General(Building):
     """
 
     name = "general"
-    default_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
     decided_by = (COUNT,)
     goal_causes = (COUNT, MASS, SIZE, PLACES, TURNS)
-    rest = hardware.RAISED
 
     def __init__(
         self,
@@ -165,24 +163,18 @@ class General(Building):
         """Count the blocks."""
         return int(values[COUNT])
 
-    def _indices(self) -> range:
-        return range(self.plan if isinstance(self.plan, int) else self._number)
+    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
+        """Number the blocks."""
+        count = self.plan if isinstance(self.plan, int) else self._number
+        return ((str(index), {"index": float(index)}) for index in range(count))
 
-    def tools(self) -> tuple[str, ...]:
-        """Name the blocks."""
-        return tuple(f"tool_{index}" for index in self._indices())
+    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
+        """Describe a block, and its place in the pile."""
+        return block(int(name), airborne=self.conventions.published_spaces)
 
-    def targets(self) -> dict[str, str]:
-        """Name the goals."""
-        return {f"goal_{index}": f"tool_{index}" for index in self._indices()}
-
-    def entities(self) -> Iterable[Entity]:
-        """Blocks, the pile, and a goal for each block of it."""
-        airborne = self.conventions.published_spaces
-        dropped = [block(index, airborne=airborne) for index in self._indices()]
-        yield from (tool for tool, _ in dropped)
-        yield Pile(len(dropped))
-        yield from (goal for _, goal in dropped)
+    def causes(self) -> Iterable[Entity]:
+        """The pile."""
+        yield Pile(len(self.tools()))
 
     def shared(self) -> Iterable[Variable]:
         """Declare the blocks, and how they are dropped."""

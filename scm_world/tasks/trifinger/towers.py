@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any, Unpack, final
 
@@ -11,10 +11,9 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, Common
+from scm_world.tasks.rewards import Common
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.building import Assembly
 from scm_world.tasks.trifinger.entities.block_world import lowest_point
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
@@ -126,12 +125,11 @@ def piece(
 
 
 @final
-class Towers(Building):
+class Towers(Assembly):
     """A cuboid on the floor, cut into equal blocks.
 
     Its size, its place and into how many blocks it is cut along each axis are variables. The
     blocks begin beside one another on the floor, and do so again whenever their size changes.
-    The fingers begin raised, out of their way.
 
     Reward terms:
         fractional_success: How much of the tower the blocks fill.
@@ -148,11 +146,9 @@ class Towers(Building):
     """
 
     name = "towers"
-    default_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
     decided_by = (NUMBER,)
     goal_causes = (NUMBER, MASS, DIMS, CENTER)
     interleaved = True
-    rest = hardware.RAISED
 
     def __init__(
         self,
@@ -175,26 +171,16 @@ class Towers(Building):
         x, y, z = (int(count) for count in values[NUMBER])
         return x, y, z
 
-    def _parts(self) -> Iterable[tuple[str, dict[str, float]]]:
+    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
+        """Name the blocks, level by level, column by column."""
         plan: Any = self.plan or self._number
         for level, col, row in np.ndindex(*(int(count) for count in reversed(plan))):
             which = {"level": float(level), "col": float(col), "row": float(row)}
             yield f"level_{level}_col_{col}_row_{row}", which
 
-    def tools(self) -> tuple[str, ...]:
-        """Name the blocks, level by level, column by column."""
-        return tuple(f"tool_{name}" for name, _ in self._parts())
-
-    def targets(self) -> dict[str, str]:
-        """Name the parts of the tower."""
-        return {f"goal_{name}": f"tool_{name}" for name, _ in self._parts()}
-
-    def entities(self) -> Iterable[Entity]:
-        """A block and a goal for each part of the tower."""
-        airborne = self.conventions.published_spaces
-        parts = [piece(name, **which, airborne=airborne) for name, which in self._parts()]
-        yield from (tool for tool, _ in parts)
-        yield from (goal for _, goal in parts)
+    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
+        """Describe a block of the tower, and its place in it."""
+        return piece(name, **which, airborne=self.conventions.published_spaces)
 
     def shared(self) -> Iterable[Variable]:
         """Declare the tower."""

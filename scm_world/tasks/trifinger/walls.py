@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any, ClassVar, Unpack, final
 
@@ -12,10 +12,10 @@ from scm_world._types import Value, Values
 from scm_world.errors import InterventionError
 from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
-from scm_world.tasks.rewards import FRACTION, Common
+from scm_world.tasks.rewards import Common
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware, layouts
-from scm_world.tasks.trifinger.building import Building
+from scm_world.tasks.trifinger.building import Assembly
 from scm_world.tasks.trifinger.entities.blocks import ToolBlock
 from scm_world.tasks.trifinger.entities.goals import GoalBlock
 from scm_world.tasks.trifinger.scattered import COUNT, obstacle_names, scattered, scattering
@@ -61,7 +61,7 @@ def brick(name: str, *, level: float, num: float, airborne: bool) -> tuple[ToolB
     )
 
 
-class Walls(Building):
+class Walls(Assembly):
     """A wall of blocks.
 
     How many levels it has, how wide it is and how small its blocks are, are variables, and so is
@@ -83,11 +83,9 @@ class Walls(Building):
         UnknownOption: An argument is out of the bounds of its variable.
     """
 
-    default_weights = {FRACTION: 1.0}  # noqa: RUF012 # a constant
     decided_by: ClassVar[tuple[str, ...]] = (LAYOUT,)
     goal_causes = (LEVELS, MASS, SIZE, WIDTH, NOISE)
     interleaved = True
-    rest = hardware.RAISED
     levels: ClassVar[numbers.Range] = numbers.STACK_LEVELS
 
     def __init__(
@@ -127,37 +125,20 @@ class Walls(Building):
         unused = np.zeros((layouts.MAX_LEVELS, 3))
         return layouts.counts(layouts.layout(levels, size, width, np.array(0), unused))
 
-    def _bricks(self) -> Iterable[tuple[str, dict[str, float]]]:
+    def parts(self) -> Iterable[tuple[str, dict[str, float]]]:
+        """Name the blocks, level by level."""
         for level, count in enumerate(self.counts()):
             for num in range(count):
                 yield f"level_{level}_num_{num}", {"level": float(level), "num": float(num)}
 
-    def wanted(self, level: int) -> bool:
-        """Tell whether the blocks of a level have goals."""
-        return True
-
-    def tools(self) -> tuple[str, ...]:
-        """Name the blocks, level by level."""
-        return tuple(f"tool_{name}" for name, _ in self._bricks())
-
-    def targets(self) -> dict[str, str]:
-        """Name the goals, level by level."""
-        bricks = self._bricks()
-        return {f"goal_{n}": f"tool_{n}" for n, which in bricks if self.wanted(int(which["level"]))}
-
-    def entities(self) -> Iterable[Entity]:
-        """A block, and perhaps a goal, for each place in the wall."""
-        airborne = self.conventions.published_spaces
-        bricks = [
-            (brick(name, **which, airborne=airborne), which) for name, which in self._bricks()
-        ]
-        yield from (tool for (tool, _), _ in bricks)
-        yield from (goal for (_, goal), which in bricks if self.wanted(int(which["level"])))
+    def piece(self, name: str, which: Mapping[str, float]) -> tuple[Entity, Entity]:
+        """Describe a block of the wall, and its place in it."""
+        return brick(name, **which, airborne=self.conventions.published_spaces)
 
     def solution(self, values: Values) -> dict[str, Value]:
         """Build the wall: all of it, so that it stands, with the fingers out of its way."""
         found = {}
-        for name, which in self._bricks():
+        for name, which in self.parts():
             place = layouts.brick_place(values[LAYOUT], values[SIZE], **which)
             found[f"tool_{name}.cartesian_position"] = place
             found[f"tool_{name}.orientation"] = np.array(numbers.IDENTITY)
@@ -301,9 +282,9 @@ class CreativeStackedBlocks(Walls):
         """Say how many blocks each level has."""
         return self._arranged()[0]
 
-    def wanted(self, level: int) -> bool:
-        """Tell whether a level is the first or the last."""
-        return level in (0, len(self.counts()) - 1)
+    def wanted(self, which: Mapping[str, float]) -> bool:
+        """Tell whether a block is in the first level or the last."""
+        return which["level"] in (0, len(self.counts()) - 1)
 
     def obstacles(self) -> tuple[str, ...]:
         """Name the small boxes."""
