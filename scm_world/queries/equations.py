@@ -224,8 +224,9 @@ class Equations:
         if not self._is_one:
             return Audit({}, {}, {})
         flat, now = flatten(request), self._now()
+        waiting = self._action if self.model.is_temporal else {}
         targets = {
-            name: Applied(name, act, None if name in self._action else self[name], None)
+            name: Applied(name, act, None if name in waiting else self[name], None)
             for name, act in flat.items()
         }
         moved = {
@@ -245,17 +246,14 @@ class Equations:
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        low, high = self.compiled.action_bounds
         rows = np.asarray(action, dtype=np.float64) if not self._is_one else None
         if rows is not None and rows.ndim == 2:
-            given = np.clip(rows, low, high)
+            given = np.clip(rows, *self.compiled.action_bounds)
         else:
             given = self.compiled.clipped(action)
         now = {**self._now(), **self._split(given)}
-        for name, where in self.compiled.actions.items():
-            shape = self.model.declared(name).shape
-            ends = (low[where].reshape(shape), high[where].reshape(shape))
-            now[name] = np.clip(self._computed(name, now, self.index), *ends)
+        for name in self.compiled.actions:
+            now[name] = self._taken(name, now, self.index)
         self._before, self._action = now, {name: now[name] for name in self.compiled.actions}
         self.index += 1
         self._solved = None
@@ -302,12 +300,21 @@ class Equations:
             values: dict[str, Value] = dict(self._action)
             starts = self.index == 0 and self.model.is_temporal
             for name in self._in_order():
-                if name not in values:
+                if name in values and not self.model.is_temporal:  # there is no step that takes it
+                    values[name] = self._taken(name, values, self.index)
+                elif name not in values:
                     values[name] = self._computed(
                         name, values, self.index - (self.index > 0), starts
                     )
             self._solved = values
         return self._solved
+
+    def _taken(self, name: str, values: Values, step: int) -> Value:
+        """Compute the action that is taken, in its range: as chosen, or by an intervention."""
+        shape = self.model.declared(name).shape
+        where = self.compiled.actions[name]
+        low, high = (end[where].reshape(shape) for end in self.compiled.action_bounds)
+        return np.clip(self._computed(name, values, step), low, high)
 
     def _computed(self, name: str, values: Values, step: int, starts: bool = False) -> Value:
         """Compute one variable: by the declared model, and by that of groups that differ."""

@@ -232,6 +232,31 @@ def test_a_model_without_lags_has_episodes_of_one_instant() -> None:
         model.rollout(steps=3)
 
 
+@pytest.mark.parametrize(
+    ("act", "push"),
+    [
+        (0.5, 0.5),
+        (Shift(0.25), 0.25),
+        (Shift(3.0), 1.0),
+        (Mechanism(np.negative, parents=("x",)), -0.75),
+    ],
+    ids=repr,
+)
+def test_actions_of_a_model_without_lags_are_intervened_on(act: Any, push: float) -> None:
+    """Within their range; alone, among other units, and in a counterfactual."""
+    model = SCM(
+        [
+            Exogenous(name="x", default=0.75),
+            PUSH,
+            Derived(name="y", parents=("push", "x"), mechanism=Linear(weights=(2.0, 1.0))),
+        ]
+    )
+    found = model.rollout(do={"push": act})
+    assert (found.final("push"), found.final("y")) == (push, 2.0 * push + 0.75)
+    assert model.rollout().counterfactual({"push": act}) == found
+    assert model.sample(3, {"push": act})["y"].tolist() == [found.final("y")] * 3
+
+
 def test_counterfactuals_of_a_model_keep_its_noise() -> None:
     """What is not intervened on answers with the noise that it had."""
     episode = chain().rollout(seed=0)
