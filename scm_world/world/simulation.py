@@ -133,6 +133,7 @@ class Simulation(WorldAttributes):
         self._origin_static: Values = {}
         self._lost = ""
         self._index = 0
+        self._offset = 0  # by how much interventions have moved control_index
         self._base: StepBase | None = None
         self._earlier: CarriedOut | None = None
         compiled = self.structures.natural(None)
@@ -244,7 +245,7 @@ class Simulation(WorldAttributes):
         return self.do(do) if do else None
 
     def _begin(self) -> None:
-        self._lost = ""
+        self._lost, self._offset = "", 0
         origin = self.structures.natural(None)
         if self._started and self._origin is not None:
             self.backend.restore(self._origin)
@@ -286,8 +287,11 @@ class Simulation(WorldAttributes):
         self._adopt(compiled, compiled.model, static, 0)
 
     def noise_key(self, index: int) -> NoiseKey:
-        """Return the noise key of a control step of this episode."""
-        return NoiseKey(self.noise, self.episode, index, origin=0)
+        """Return the noise key of a control step of this episode.
+
+        Noise follows the steps that were taken: an intervention on ``control_index`` leaves it.
+        """
+        return NoiseKey(self.noise, self.episode, index - self._offset, origin=0)
 
     # --- a control step -----------------------------------------------------------------------
 
@@ -400,7 +404,7 @@ class Simulation(WorldAttributes):
         base = self._base or self._step_base()
         twice += self._wrong_actions(flat)
         region = self.variables_space if space is None else space
-        key = self.noise_key(base.index)
+        key = self.noise_key(self._index)
         earlier = self._earlier
         if earlier is not None and (twice or not earlier.is_again(base, flat, region)):
             earlier = None
@@ -471,9 +475,12 @@ class Simulation(WorldAttributes):
             if change:
                 self.backend.apply(change)
                 reported = self._applied(change)
+            moved = plan.index - self._index
             self._adopt(plan.compiled, plan.model, plan.static, plan.index)
             now = self._present()
-            return report(request, plan, change, before, now, inertia, reported, self.backend)
+            audit = report(request, plan, change, before, now, inertia, reported, self.backend)
+        self._offset += moved
+        return audit
 
     @contextmanager
     def _all_or_nothing(self, undo: Callable[[], None]) -> Iterator[None]:
@@ -619,6 +626,7 @@ class Simulation(WorldAttributes):
             previous=self.previous(),
             action=np.array(self._values.action),
             index=self._index,
+            offset=self._offset,
             seed=self.noise.seed,
             episode=self.episode,
             world=self.identity,
@@ -666,7 +674,7 @@ class Simulation(WorldAttributes):
             if isinstance(error, ScmWorldError):
                 raise
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
-        self._lost = ""
+        self._lost, self._offset = "", snapshot.offset
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self._base = base
         self.structures.checked[snapshot] = found
@@ -697,6 +705,7 @@ class Simulation(WorldAttributes):
             base = None if saved is None else self._checked_base(saved, is_present=False)
             if base and base.index != present.index and CONTROL_INDEX not in base.pending:
                 raise ValueError(f"its base is of control step {base.index}")
+            whole_number("steps taken", snapshot.index - snapshot.offset, least=0)
             whole_number("seed", snapshot.seed, least=0)
             whole_number("episode", snapshot.episode, least=0)
         except Exception as error:

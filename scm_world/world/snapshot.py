@@ -34,6 +34,7 @@ class WorldSnapshot:
         previous: Values of one control step ago.
         action: The last action.
         index: The control step.
+        offset: By how much interventions have moved ``index``; noise follows the steps taken.
         seed: Of the noise.
         episode: Number of the episode.
         world: Task, options and names of all variables, to tell worlds apart.
@@ -52,6 +53,7 @@ class WorldSnapshot:
     previous: Mapping[str, Value] = field(default_factory=dict)
     action: Floats = field(default_factory=lambda: np.zeros(0))
     index: int = 0
+    offset: int = 0
     seed: int = 0
     episode: int = 0
     world: tuple[Any, ...] = ()

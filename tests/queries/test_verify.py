@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
+from scm_world.backends import make_backend
+from scm_world.backends.base import BackendWrapper
 from scm_world.cli import app
 from scm_world.cli.arguments import load_task
 from scm_world.cli.discovery import SMALL
 from scm_world.discovery.plots import draw_verification
 from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.models import Difference
 from scm_world.queries.agreement import Agreement, Sign
 from scm_world.queries.verification import Verification
 from scm_world.queries.verify import verify, verify_engines
@@ -133,6 +137,47 @@ def test_a_superfluous_edge_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.colors == (edge,)
     assert not found.passed
     assert "tool_block.color -> tool_block.linear_velocity (lag 1)" in str(found)
+
+
+FLOOR, GRAVITY = ("floor", "friction"), ("world", "gravity")
+
+
+class _Wearing(BackendWrapper):
+    """Loses friction of the floor with every step."""
+
+    name: ClassVar[str] = "wearing"
+
+    def step(self, mode: Any, command: Any, substeps: int) -> None:
+        super().step(mode, command, substeps)
+        self.apply(Difference(parameters={FLOOR: 0.99 * self.parameters([FLOOR])[FLOOR]}))
+
+
+class _Spilling(BackendWrapper):
+    """Changes the friction of the floor together with gravity."""
+
+    name: ClassVar[str] = "spilling"
+
+    def apply(self, difference: Difference) -> None:
+        given = dict(difference.parameters)
+        if GRAVITY in given:
+            size = float(np.linalg.norm(given[GRAVITY]))
+            given[FLOOR] = np.asarray(0.5 + 0.001 * (size - 9.81))
+        super().apply(replace(difference, parameters=given))
+
+
+def test_a_parameter_that_wears_is_no_parameter() -> None:
+    """What the engine has after a step is read: it changes though nobody has changed it."""
+    world = Simulation("pushing", backend=_Wearing(make_backend("fake")))
+    found = verify(world, probes=1, held_out=0)
+    assert found.floor > 1e-3
+    assert not found.passed
+
+
+def test_a_write_that_changes_two_parameters_is_caught() -> None:
+    """The engine has another value of what the world says is the same."""
+    world = Simulation("pushing", backend=_Spilling(make_backend("fake")))
+    found = verify(world, probes=1, held_out=0)
+    assert ("gravity", "floor_friction", 0) in {edge.key for edge in found.undeclared}
 
 
 def test_results_depend_on_the_seed_alone() -> None:

@@ -160,10 +160,14 @@ class Paired:
         self._number, self._probe = number, probe
         self._world.restore(probe.snapshot)
         self._before = _Kept(self._world)
+        at_first = self._engine_values()
         self._at_once, self._earlier = self._before.values, self._world.previous()
         self._memory = self._advanced(probe.action)
         self._after = _Kept(self._world)
         self._later = self._after.values
+        self._reported = self._engine_values()
+        worn = max((gap(value, at_first[n]) for n, value in self._reported.items()), default=0.0)
+        self.effects.floor = max(self.effects.floor, worn)  # nothing but time has passed
         for target in self.targets:
             self._experiment(target)
         for action in self.actions:
@@ -343,6 +347,23 @@ class Paired:
             else:
                 self.effects.see_nothing(cause, name, 1)
         self._see_memory(cause, memory)
+        self._see_engine(cause)
+
+    def _engine_values(self) -> dict[str, Value]:
+        """Read the parameters that the engine has now, by variable."""
+        names = {key: name for name, key in self._world.compiled.parameter_keys.items()}
+        found = self._world.backend.parameters(names)
+        return {names[key]: np.array(value) for key, value in found.items()}
+
+    def _see_engine(self, cause: str) -> None:
+        """Find parameters of the engine that differ where the world says that they do not."""
+        if self._world.compiled is not self._declaration:
+            return
+        now = self._world.current()[0]
+        for name, value in self._engine_values().items():
+            is_other = name != cause and gap(now[name], self._later[name]) == 0.0
+            if is_other and value.tobytes() != self._reported[name].tobytes():
+                self.effects.see(cause, name, 0, value, self._reported[name])
 
     def _see_memory(self, cause: str, memory: Values) -> None:
         """Find computed variables that depend on the cause one step ago.
