@@ -217,12 +217,15 @@ def _with_others(prepare: Any) -> Any:
 def set_others(world: Simulation, dice: Dice) -> None:
     """Set about half of the parameters to values of their spaces, or near those that they have.
 
-    What cannot be set together with the rest stays as it is.
+    What cannot be set together with the rest stays as it is. So does what decides which bodies
+    there are: the graph that is declared is that of the present structure.
     """
+    deciding = frozenset(world.task.decided_by)
     drawn = (
         (v.name, _jittered(v, world, dice))
         for v in world.model.variables
         if isinstance(v, Exogenous) and v.settable and v.dtype == "real"
+        if not deciding or deciding.isdisjoint(world.static_order((v.name,)))
     )
     request = {name: value for name, value in drawn if value is not None}
     while request:
