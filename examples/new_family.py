@@ -1,4 +1,4 @@
-"""A goal family of one's own: a pyramid, with as many levels as a variable says.
+"""A custom goal family: a pyramid, with as many levels as a variable says.
 
 Run it with ``python examples/new_family.py [mujoco|bullet|fake]``.
 """
@@ -45,7 +45,7 @@ class Pyramid(Building):
     rest = hardware.RAISED  # the fingers begin out of the way
 
     def __init__(self, *, levels: int = 2, **common: Unpack[Common]) -> None:
-        super().__init__(**common)  # weights, terms of one's own, where the robot begins
+        super().__init__(**common)  # weights, custom terms, where the robot begins
         self._levels = levels
 
     def arrange(self, values: dict[str, np.ndarray]) -> int:
@@ -67,7 +67,7 @@ class Pyramid(Building):
         return {f"goal_{brick}": f"tool_{brick}" for brick, _ in self._bricks()}
 
     def shared(self) -> Iterable[Variable]:
-        """Declare what several entities have in common, whatever the plan."""
+        """Declare what several entities have in common, for every plan."""
         yield block_size(SIZE)
         yield Exogenous(
             name=LEVELS,

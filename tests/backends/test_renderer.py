@@ -340,9 +340,9 @@ SNIPPET = """
 import hashlib
 from dataclasses import replace
 from scm_world.backends.renderer import render
-from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
 from scm_world.tasks.trifinger.cameras import OVERVIEW
-image = render(default_scene(Structure(blocks=("tool_block",))), OVERVIEW)
+image = render(default_scene(TriFingerStructure(blocks=("tool_block",))), OVERVIEW)
 print(hashlib.sha256(image.rgb.tobytes() + image.depth.tobytes()).hexdigest())
 """
 

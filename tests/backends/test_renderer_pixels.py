@@ -285,10 +285,10 @@ def test_scene_is_left_alone(scene: Scene) -> None:
 SNIPPET = """
 import hashlib, numpy
 from scm_world.backends.renderer import now_pixels
-from scm_world.tasks.trifinger.structure import Structure, default_scene
+from scm_world.tasks.trifinger.structure import TriFingerStructure, default_scene
 from scm_world.tasks.trifinger.cameras import CAMERAS
 pixels = numpy.empty((3, 3, 128, 128), numpy.uint8)
-now_pixels(default_scene(Structure(("a", "b"))), CAMERAS, pixels)
+now_pixels(default_scene(TriFingerStructure(("a", "b"))), CAMERAS, pixels)
 print(hashlib.sha256(pixels.tobytes()).hexdigest())
 """
 

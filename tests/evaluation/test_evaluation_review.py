@@ -30,7 +30,7 @@ def test_what_else_would_have_been_drawn_is_no_answer() -> None:
     found = tiny(task="stacking2", protocols="P6", n=10, backend="mujoco")
     told = why(found, "P6", 9)
     reasons = told.left_out.values()
-    assert any("would have been drawn anew with it" in reason for reason in reasons)
+    assert any("would have been drawn again with it" in reason for reason in reasons)
     assert {one.variable for one in told.others}.isdisjoint(told.left_out)
 
 

@@ -290,7 +290,7 @@ def do_order(
     if not isinstance(features, int) or features not in POWERS:
         raise UnknownOption("features", features, map(str, POWERS))
     rows, still = _rows(data, blocks), _still(data)
-    hidden = _hidden(rows)
+    hidden = _hidden(rows, data)
     causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
     if not causes.any():
         raise ModelError(
@@ -383,15 +383,18 @@ def _tested(rows: Rows, effects: Bools, causes: Bools, form: _Form) -> Floats:
     return found
 
 
-def _hidden(rows: Rows) -> Bools:
+def _hidden(rows: Rows, data: Dataset) -> Bools:
     """Return which columns may act unseen on a cause and its effect, shape (p,).
 
     These are the columns that were never set, where a cause was free in some row and there are no
-    earlier control steps, whose order says what acts on what.
+    earlier control steps, whose order says what acts on what. An outcome of an episode is none: it
+    comes after all that was set.
     """
     set_ = rows.targeted.any(axis=0)
     free = bool((rows.targeted[:, set_] < 1).any())
-    return rows.alive & ~set_ & bool(free and set_.any() and not rows.past.any())
+    early = np.array([column.how in ("value", "first") for column in data.columns])
+    is_open = free and bool(set_.any()) and not rows.past.any()
+    return np.asarray(rows.alive & ~set_ & early & is_open)
 
 
 def _instrumented(rows: Rows, causes: Bools, form: _Form) -> Floats:
