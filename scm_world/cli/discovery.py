@@ -297,6 +297,7 @@ def verify(
     backend: options.Backend = None,
     both: bool = False,
     probes: options.Count = 200,
+    held_out: options.NotNegative = 8,
     seed: options.Seed = 0,
     preset: options.Preset = None,
     out: options.Out = None,
@@ -312,6 +313,7 @@ def verify(
     Args:
         both: On MuJoCo and Bullet; compare.
         probes: Largest number of probe states.
+        held_out: Further ones, in which effects without an edge are looked for.
     """
     from scm_world.discovery.plots import draw_verification
     from scm_world.queries import SCM
@@ -334,6 +336,7 @@ def verify(
     for name, given in systems.items():
         system = load_system(name, given)
         settings: dict[str, Any] = {"probes": probes, "least": min(LEAST, probes), "seed": seed}
+        settings["held_out"] = held_out
         if not isinstance(system, SCM):
             settings |= {"preset": preset, "resolution": resolution}
             settings |= {} if both else {"backend": backend}

@@ -108,6 +108,7 @@ def verify_engines(
     backends: tuple[str, str] = ("mujoco", "bullet"),
     probes: int = MOST,
     least: int = LEAST,
+    held_out: int = HELD_OUT,
     seed: int = 0,
     progress: Callable[[str], Progress | None] | None = None,
     **options: Any,
@@ -126,6 +127,7 @@ def verify_engines(
         probes: How many states to experiment in at most.
         least: How many at least, even if every declared edge has been observed before; signs are
             compared in as many.
+        held_out: How many further ones for effects without an edge.
         seed: Of states and values.
         progress: Called with the name of each backend, and last with ``"signs"``; gives what is
             called with (finished, planned) after each probe state.
@@ -142,6 +144,7 @@ def verify_engines(
 
     compared = min(least, probes)
     limits: dict[str, Any] = {"probes": probes, "least": least, "seed": seed}
+    limits["held_out"] = held_out
     reports: list[Verification] = []
     for name in backends:
         reports.append(verify(task, progress=told(name), **limits, backend=name, **options))

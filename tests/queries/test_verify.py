@@ -236,7 +236,7 @@ def agreement() -> Agreement:
     """Verify pushing on both engines with few probe states."""
     if not HAS_BULLET:
         pytest.skip("Bullet is not installed")
-    return verify_engines("pushing", probes=2)
+    return verify_engines("pushing", probes=2, held_out=0)
 
 
 def test_engines_agree_on_the_sign_of_clear_effects(agreement: Agreement) -> None:
@@ -268,7 +268,7 @@ def test_an_agreement_survives_json_and_prints(agreement: Agreement) -> None:
 
 def test_an_engine_agrees_with_itself() -> None:
     """The same engine twice: every edge on both, every sign the same, no floor between them."""
-    found = verify_engines("reaching", backends=("mujoco", "mujoco"), probes=2)
+    found = verify_engines("reaching", backends=("mujoco", "mujoco"), probes=2, held_out=0)
     share = found.at(10.0)
     assert all(edges == () for edges in found.only.values())
     assert all(sign.apart == 0.0 for sign in found.signs)
@@ -310,13 +310,13 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("_elsewhere")
 def test_the_command_writes_a_report_and_a_picture() -> None:
     """Without physics edges are never seen: it says so, writes both files and exits 1."""
-    arguments = ("verify", "reaching", "--backend", "fake", "--probes", "1", "--seed", "3")
-    result = CliRunner().invoke(app, arguments)
+    limits = ("--probes", "1", "--held-out", "1", "--seed", "3")
+    result = CliRunner().invoke(app, ("verify", "reaching", "--backend", "fake", *limits))
     assert result.exit_code == 1, result.output
     assert "Verification of reaching on fake" in result.stdout
     folder = Path("scm-world-results/verify-reaching-fake-seed3")
     found = Verification.from_json((folder / "report.json").read_text())
-    assert (found.seed, found.probes) == (3, 1)
+    assert (found.seed, found.probes, found.held_out) == (3, 1, 1)
     assert imread(folder / "verify.png").shape[:2] == (900, 1600)
 
 
@@ -332,7 +332,8 @@ def test_the_command_exits_0_where_all_is_well() -> None:
 @pytest.mark.usefixtures("_elsewhere")
 def test_the_command_compares_engines() -> None:
     """With --both the report is that of two engines."""
-    result = CliRunner().invoke(app, ["verify", "reaching", "--both", "--probes", "2"])
+    limits = ("--probes", "2", "--held-out", "1")
+    result = CliRunner().invoke(app, ("verify", "reaching", "--both", *limits))
     report = Path("scm-world-results/verify-reaching-both-seed0/report.json")
     found = Agreement.from_json(report.read_text())
     assert found.backends == ("mujoco", "bullet")
@@ -358,8 +359,10 @@ def test_the_command_verifies_all_tasks_and_keeps_what_is_finished(
 
     seen: set[int] = set()
     monkeypatch.setattr(Paired, "run", interrupted)
-    arguments = ["verify", "all", "--backend", "fake", "--probes", "1", "--out", "here"]
-    result = CliRunner().invoke(app, arguments)
+    limits = ("--probes", "1", "--held-out", "0")
+    result = CliRunner().invoke(
+        app, ("verify", "all", "--backend", "fake", *limits, "--out", "here")
+    )
     assert result.exit_code == 130, result.output
     assert sorted(path.name for path in Path("here").iterdir()) == ["pushing", "reaching"]
     assert "All verifications" in result.stdout
