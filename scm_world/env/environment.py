@@ -362,13 +362,7 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
             ModelError: A function of the reward fails where it was done; nothing has changed.
         """
         wanted = asked(request)
-        kept = self.world.snapshot()
-        audit = self.world.do(wanted, space=space)
-        try:
-            self._look()
-        except BaseException:
-            self.world.restore(kept)
-            raise
+        audit = self.world.do(wanted, space=space, check=self._look)
         self._done.append((self.world.index, wanted))
         return audit
 

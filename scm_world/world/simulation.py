@@ -380,7 +380,13 @@ class Simulation(WorldAttributes):
 
     # --- interventions ------------------------------------------------------------------------
 
-    def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
+    def do(
+        self,
+        request: Mapping[str, Any],
+        *,
+        space: AnyRegion | None = None,
+        check: Callable[[], object] | None = None,
+    ) -> Audit:
         """Intervene now, without advancing time. All of it happens, or none of it.
 
         A parameter holds until the reset; a state is set at this instant and physics carries it
@@ -390,6 +396,7 @@ class Simulation(WorldAttributes):
             request: Values, ``Shift``, ``Scale`` or ``Draw`` by name, dotted or nested.
             space: If given, every target must lie in this space: ``"A"``, ``"B"``, ``"A|B"`` or
                 a ``Subset``; ``variables_space`` of the world if None.
+            check: Called when it is done. If it raises, nothing is done, and the error goes on.
 
         Returns:
             What was requested, applied and read back, and what followed.
@@ -411,11 +418,9 @@ class Simulation(WorldAttributes):
         plan, change = feasible_plan(
             self.structures, base, self._present(), flat, region, key, twice, earlier
         )
-        audit = self._commit(plan, change, flat)
+        audit = self._commit(plan, change, flat, check, at_start=base.at_start)
         self._earlier = earlier or carried_out(self.structures, base, flat, region, plan)
         self._base = replace(base, pending=plan.pending)
-        if base.at_start:
-            self._forget()
         return audit
 
     def _wrong_actions(self, request: Mapping[str, Any]) -> list[InterventionError]:
@@ -459,7 +464,13 @@ class Simulation(WorldAttributes):
         return Present(self.compiled, self.structure, values.now, values.state)
 
     def _commit(
-        self, plan: InterventionPlan, change: Difference, request: Mapping[str, Any]
+        self,
+        plan: InterventionPlan,
+        change: Difference,
+        request: Mapping[str, Any],
+        check: Callable[[], object] | None,
+        *,
+        at_start: bool,
     ) -> Audit:
         """Apply a plan, read it back, and report; or put everything back and raise.
 
@@ -479,7 +490,11 @@ class Simulation(WorldAttributes):
             self._adopt(plan.compiled, plan.model, plan.static, plan.index)
             now = self._present()
             audit = report(request, plan, change, before, now, inertia, reported, self.backend)
-        self._offset += moved
+            self._offset += moved
+            if at_start:
+                self._forget()
+            if check is not None:
+                check()
         return audit
 
     @contextmanager
@@ -490,7 +505,7 @@ class Simulation(WorldAttributes):
             undo: Puts the backend back.
         """
         kept, numbers, index = self._values, self._values.matrix.copy(), self._index
-        model, static, state = self._held, kept.static, kept.state.copy()
+        model, static, state, offset = self._held, kept.static, kept.state.copy(), self._offset
         try:
             yield
         except BaseException:
@@ -498,6 +513,7 @@ class Simulation(WorldAttributes):
             self._values = kept
             self._adopt(kept.compiled, model, static, index, state)
             kept.matrix[...] = numbers
+            self._offset = offset
             raise
 
     def _inertia(self, change: Difference) -> dict[str, Value]:

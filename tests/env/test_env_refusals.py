@@ -170,6 +170,32 @@ def test_a_term_that_is_no_number_is_refused() -> None:
         env.step(np.zeros(9, np.float32))
 
 
+@pytest.mark.parametrize("steps", [0, 3])
+@pytest.mark.parametrize("backend", ["mujoco", "bullet"])
+def test_an_intervention_after_which_the_reward_fails_is_undone(backend: str, steps: int) -> None:
+    """Bit for bit, at the start of an episode and later."""
+
+    def fails(mass: Any) -> float:
+        return float("nan") if mass > 0.05 else float(mass)
+
+    own = term("reward.x", fails, ("tool_block.mass",), "x")
+    options = {"terms": [own], "weights": {"reward.x": 1.0}}
+    env, twin = (make(task_options=options, backend=backend) for _ in range(2))
+    for each in (env, twin):
+        each.reset(seed=0)
+        each.unwrapped.do({"tool_block.mass": 0.03})
+        for _ in range(steps):
+            each.step(np.zeros(9, np.float32))
+    with pytest.raises(ModelError, match=r"reward\.x"):
+        env.unwrapped.do({"tool_block.mass": 0.08, "control_index": 7})
+    assert env.unwrapped.interventions == twin.unwrapped.interventions
+    for _ in range(2):
+        for name, value in twin.unwrapped.world.values().items():
+            assert np.array_equal(env.unwrapped.world[name], value), name
+        env.step(np.zeros(9, np.float32))
+        twin.step(np.zeros(9, np.float32))
+
+
 def test_relative_actions_are_listed_too() -> None:
     """Where an action mode is unknown."""
     with pytest.raises(UnknownOption, match="delta_joint_positions"):
