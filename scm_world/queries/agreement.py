@@ -31,8 +31,14 @@ from scm_world.tasks import Task
 from scm_world.variables import Measured
 from scm_world.world import Simulation
 
+SEEDS = 10
+"""How many seeds signs are compared with, the given one and those after it."""
+
 SAME = 0.95
-"""Share of the comparable edges whose sign must be the same."""
+"""Share of the comparable edges whose sign must be the same, over all seeds."""
+
+SURE = 0.9
+"""What this share must exceed with a confidence of 95 % if other seeds were taken."""
 
 FACTORS = (0.0, 1.0, 3.0, FACTOR)
 """Multiples of the noise floor between the backends, for which shares are reported."""
@@ -47,6 +53,7 @@ class Sign(Report):
         effect: The variable that answered.
         lag: 0 or 1.
         probe: Number of the probe state.
+        seed: Of the state and of the values.
         component: Of the effect, flattened: the one that answered most.
         moves: Whether the backend decides the effect; else it is computed, alike on both.
         answers: Difference of this component on each backend, for an increase of the cause.
@@ -57,6 +64,7 @@ class Sign(Report):
     effect: str
     lag: int
     probe: int
+    seed: int = 0
     component: int
     moves: bool
     answers: tuple[float, float]
@@ -104,6 +112,25 @@ class EdgeSigns(Report):
 
 
 @final
+class Magnitude(Report):
+    """How large the clear effects of one cause are on the second engine, by those on the first.
+
+    Attributes:
+        cause: The variable that was changed.
+        compared: How many effects there are, one per edge and probe state, with one sign on both.
+        ratio: Median of the second effect by the first.
+        low: Quantile of 10 % of this ratio.
+        high: Quantile of 90 %.
+    """
+
+    cause: str
+    compared: int
+    ratio: float
+    low: float
+    high: float
+
+
+@final
 class Share(Report):
     """Equal signs of what the backend decides, among effects of some clarity.
 
@@ -132,7 +159,8 @@ class Agreement(Report):
         backends: Names of the engines.
         verifications: Of each backend that was reached: both, unless it was interrupted.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
-        probes: In how many probe states signs were compared.
+        probes: In how many probe states signs were compared, of all seeds.
+        seeds: With how many seeds.
         signs: Every comparison.
         seconds: Wall time, of the verifications too.
     """
@@ -143,6 +171,7 @@ class Agreement(Report):
     verifications: tuple[Verification, ...]
     interrupted: bool
     probes: int
+    seeds: int = 1
     signs: tuple[Sign, ...]
     seconds: float
 
@@ -191,15 +220,77 @@ class Agreement(Report):
         return found.edges_equal / found.edges if found.edges else 1.0
 
     @property
+    def surely(self) -> float:
+        """Lower bound of this share among other seeds, with a confidence of 95 %; 0 if unknown.
+
+        Edges are counted seed by seed, and those of one seed are not taken as independent: the
+        bound of a binomial distribution has the effective number of edges that the variance
+        between seeds leaves.
+
+        Source:
+            Korn and Graubard, *Confidence intervals for proportions with small expected number of
+            positive counts estimated from survey data*, Survey Methodology 24, 1998.
+        """
+        from scipy.stats import beta, t
+
+        counts = np.array(
+            [
+                (found.edges_equal, found.edges)
+                for seed in sorted({sign.seed for sign in self.signs})
+                for found in (self._of_seed(seed).at(FACTOR),)
+                if found.edges
+            ],
+            dtype=float,
+        ).reshape(-1, 2)
+        seeds, (equal, edges) = len(counts), counts.sum(axis=0)
+        if seeds < 2:
+            return 0.0
+        share, effective = equal / edges, edges
+        apart = counts[:, 0] - share * counts[:, 1]
+        variance = seeds / (seeds - 1) * float((apart**2).sum()) / edges**2
+        if variance > 0.0:
+            narrower = (t.ppf(0.95, edges - 1) / t.ppf(0.95, seeds - 1)) ** 2
+            effective = min(edges, share * (1.0 - share) / variance * narrower)
+        if equal == 0.0:
+            return 0.0
+        return float(beta.ppf(0.05, share * effective, (1.0 - share) * effective + 1.0))
+
+    def _of_seed(self, seed: int) -> Agreement:
+        signs = tuple(sign for sign in self.signs if sign.seed == seed)
+        return self.model_copy(update={"signs": signs})
+
+    def magnitudes(self, factor: float = FACTOR) -> tuple[Magnitude, ...]:
+        """Compare how large effects are on both engines, cause by cause.
+
+        Only what the backend decides is compared, where both effects lie well above what the
+        engines differ by anyway, and have one sign.
+
+        Args:
+            factor: How far above.
+        """
+        ratios: dict[str, list[float]] = {}
+        for sign in self.signs:
+            if sign.moves and sign.equal and sign.clear(factor):
+                ratios.setdefault(sign.cause, []).append(sign.answers[1] / sign.answers[0])
+        found = []
+        for cause, each in sorted(ratios.items()):
+            low, ratio, high = np.quantile(each, (0.1, 0.5, 0.9)).tolist()
+            found.append(
+                Magnitude(cause=cause, compared=len(each), ratio=ratio, low=low, high=high)
+            )
+        return tuple(found)
+
+    @property
     def opposite(self) -> tuple[EdgeKey, ...]:
         """List edges whose clear effects do not have the same sign in most probe states."""
         return tuple((e.cause, e.effect, e.lag) for e in self.edges() if e.same is False)
 
     @property
     def passed(self) -> bool:
-        """Whether both verifications passed and signs agree."""
+        """Whether both verifications passed and signs agree: ``SAME`` of them, ``SURE`` surely."""
         verified = all(found.passed for found in self.verifications)
-        return verified and self.share >= SAME and not self.interrupted
+        agree = self.share >= SAME and self.surely >= SURE
+        return verified and agree and not self.interrupted
 
     def rows(self) -> tuple[Row, ...]:
         """List the numbers, what they mean, and whether they are good."""
@@ -208,11 +299,22 @@ class Agreement(Report):
             for name, edges in self.only.items()
         ]
         shares = [_row(self.at(factor), self.share >= SAME) for factor in FACTORS]
+        sizes = [
+            f"{m.cause}: {m.ratio:.2f} (80 % within {m.low:.2f} to {m.high:.2f}, n = {m.compared})"
+            for m in sorted(self.magnitudes(), key=lambda m: -abs(np.log(m.ratio)))
+        ]
+        first, second = self.backends
         return (
             *only,
-            ("probe states with signs", str(self.probes), None),
+            ("probe states with signs", f"{self.probes}, of {self.seeds} seeds", None),
             *shares,
+            (
+                f"at least, if seeds were others (95 %, goal {SURE:g})",
+                f"{100 * self.surely:.1f} % of edges",
+                self.surely >= SURE,
+            ),
             ("sign not the same", listed(map(arrow, self.opposite)), None),
+            (f"effects on {second} by those on {first}, causes", listed(sizes), None),
             *([("interrupted", "yes", False)] if self.interrupted else []),
             ("seconds", f"{self.seconds:.1f}", None),
             ("passed", "yes" if self.passed else "no", self.passed),
@@ -259,32 +361,40 @@ def compare_signs(
     Args:
         task: A task, or the name of one.
         backends: Names of the engines.
-        probes: How many states to experiment in.
-        seed: Of states and values.
+        probes: How many states to experiment in with each of ``SEEDS`` seeds.
+        seed: The first one, of states and values.
         progress: Called with (finished, planned) after each probe state of each engine.
         options: Arguments of ``World``, without ``backend``.
 
     Raises:
         KeyboardInterrupt: It was interrupted.
     """
-    found: list[Responses] = []
+    found: list[list[Responses]] = []
     for number, backend in enumerate(backends):
-        told = part(progress, number * probes, len(backends) * probes)
         world = Simulation(task, backend=backend, **options)
+        measured = [v for v in world.model.variables if isinstance(v, Measured)]
+        found.append([])
         try:
-            series = Series(Paired(world, seed, responses=True), probes, told)
-            series.run(probe_states(world, probes, seed, settled=False))
-            if series.done < probes:
-                raise KeyboardInterrupt
-            found.append(series.effects.responses or {})
-            measured = [v for v in world.model.variables if isinstance(v, Measured)]
+            for turn in range(SEEDS):
+                first, last = turn * probes, (turn + 1) * probes
+                told = part(progress, number * SEEDS * probes, len(backends) * SEEDS * probes)
+                paired = Paired(world, seed + turn, responses=True)
+                series = Series(paired, SEEDS * probes, told, done=first)
+                series.run(probe_states(world, last, seed + turn, settled=False, first=first))
+                if series.done < last:
+                    raise KeyboardInterrupt
+                found[-1].append(series.effects.responses or {})
         finally:
             world.close()
     moves = frozenset(v.name for v in measured if v.mechanism is None)
-    return tuple(_signs(found[0], found[1], moves))
+    return tuple(
+        sign
+        for turn, (one, other) in enumerate(zip(*found, strict=True))
+        for sign in _signs(one, other, moves, seed + turn)
+    )
 
 
-def _signs(one: Responses, other: Responses, moves: frozenset[str]) -> Iterator[Sign]:
+def _signs(one: Responses, other: Responses, moves: frozenset[str], seed: int) -> Iterator[Sign]:
     for key in sorted(one.keys() & other.keys()):
         edge, probe = key
         first, second = one[key], other[key]
@@ -300,6 +410,7 @@ def _signs(one: Responses, other: Responses, moves: frozenset[str]) -> Iterator[
         yield Sign(
             **named(edge),
             probe=probe,
+            seed=seed,
             component=component,
             moves=edge[1] in moves and edge[2] == 1,
             answers=(float(np.sign(most) * answers[0]), float(np.sign(most) * answers[1])),

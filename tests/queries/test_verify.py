@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -282,6 +282,55 @@ def test_clear_effects_lie_above_what_engines_differ_by() -> None:
     far = Sign(**about, moves=True, answers=(3.0, 4.0), apart=0.4)
     assert (near.clear(), near.equal) == (True, False)
     assert (far.clear(), far.equal) == (False, True)
+
+
+def _agreement(equal: Sequence[Sequence[bool]], ratio: float = 1.0) -> Agreement:
+    """Make one of clear comparisons: for each seed, whether edges have one sign."""
+    signs = tuple(
+        Sign(
+            cause=f"cause{edge}",
+            effect="y",
+            lag=1,
+            probe=0,
+            seed=seed,
+            component=0,
+            moves=True,
+            answers=(1.0, ratio if same else -ratio),
+            apart=0.0,
+        )
+        for seed, each in enumerate(equal)
+        for edge, same in enumerate(each)
+    )
+    return Agreement(
+        task="x",
+        backends=("mujoco", "bullet"),
+        verifications=(),
+        interrupted=False,
+        probes=len(equal),
+        seeds=len(equal),
+        signs=signs,
+        seconds=0.0,
+    )
+
+
+def test_one_seed_says_nothing_about_others_and_few_edges_little() -> None:
+    """The lower bound is that of Clopper and Pearson where seeds do not differ, else lower."""
+    assert _agreement([[True] * 30]).surely == 0.0
+    assert _agreement([[False] * 5] * 3).surely == 0.0
+    alike = _agreement([[True] * 3] * 10)
+    assert alike.surely == pytest.approx(0.05 ** (1 / 30))
+    assert alike.share == 1.0
+    assert _agreement([[True] * 1] * 10).passed is False  # 0.74
+    spread = _agreement([[True] * 19 + [False]] * 10)
+    bunched = _agreement([[True] * 20] * 9 + [[True] * 10 + [False] * 10])
+    assert spread.surely > bunched.surely
+    assert spread.surely > 0.9
+
+
+def test_magnitudes_are_medians_of_one_engine_by_the_other() -> None:
+    """Effects of opposite sign are left out."""
+    (found, *_) = _agreement([[True, True], [True, False], [False, True]], 3.0).magnitudes()
+    assert (found.cause, found.compared, found.ratio) == ("cause0", 2, 3.0)
 
 
 # --- pictures and commands -----------------------------------------------------------------------
