@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -270,8 +271,11 @@ def _benchmark(
             progress=tell,
         )
     columns = [column for column in COLUMNS if column.key in BRIEF]
-    for name, rows in summary(result).items():
-        truth = result.problems[name]
+    for (name, both), oracles in product(summary(result).items(), (False, True)):
+        truth, rows = result.problems[name], [row for row in both if row.is_oracle == oracles]
+        if not rows:
+            continue
+        size = f"{len(truth.names)} variables, {len(truth.edges)} true edges"
         console.table(
             (*HEADS[1:], *(column.title for column in columns)),
             [  # the means over seeds; the ranges are in report.html
@@ -284,7 +288,7 @@ def _benchmark(
                 )
                 for row in rows
             ],
-            title=f"{truth.name}: {len(truth.names)} variables, {len(truth.edges)} true edges",
+            title=f"{truth.name}: {size}" + "; oracles with access to the simulator" * oracles,
         )
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():

@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, product
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
 import numpy as np
@@ -45,6 +45,11 @@ class ScoreColumn(NamedTuple):
     digits: int | None = None
 
 
+ORACLES = (
+    "Oracles with access to the simulator: they do their own experiments, with the same noise in "
+    "both runs of a pair, which no table of data allows. They show what the physics determines and "
+    "are not ranked among learners from data."
+)
 STANDARDISED = "shd_standardised"
 COLUMNS = (
     ScoreColumn("shd", "SHD", "less"),
@@ -96,6 +101,11 @@ class SummaryRow:
         return self.run.data + ", standardised" * self.run.standardised
 
     @property
+    def is_oracle(self) -> bool:
+        """Whether the learner had the simulator instead of data."""
+        return self.run.data == "paired"
+
+    @property
     def heads(self) -> tuple[str, str, str, str, str]:
         """The cells before the numbers."""
         ended = [f"{self.statuses.count('done')} of {len(self.statuses)}"]
@@ -129,11 +139,12 @@ def summary(result: BenchmarkResult) -> dict[str, list[SummaryRow]]:
 
     The best of a column is the best mean over all seeds that were started: without one of them,
     the hard one may be missing. There are several if they are equally good, none if all are.
+    Oracles with access to the simulator come last, and are compared with one another only.
     """
     rows: dict[str, list[SummaryRow]] = {name: [] for name in result.problems}
 
     def key(run: BenchmarkRun) -> tuple[str, str, str, int]:
-        return (run.problem, run.data, run.learner, run.budget)
+        return (run.problem, run.data, run.learner, run.budget)  # "paired" is the last kind
 
     for _, group in groupby(sorted(result.runs, key=key), key):
         runs = list(group)
@@ -150,11 +161,13 @@ def summary(result: BenchmarkResult) -> dict[str, list[SummaryRow]]:
         statuses = tuple(run.status for run in shown)
         rows[shown[0].problem].append(SummaryRow(shown[0], statuses, spreads))
     for column in (column for column in COLUMNS if column.better):
-        for found in rows.values():
+        for found, is_oracle in product(rows.values(), (False, True)):
             whole = [
                 row
                 for row in found
-                if column.key in row.spreads and row.spreads[column.key].n == len(row.statuses)
+                if row.is_oracle == is_oracle
+                and column.key in row.spreads
+                and row.spreads[column.key].n == len(row.statuses)
             ]
             means = {row.spreads[column.key].mean for row in whole}
             top = min(means, default=0) if column.better == "less" else max(means, default=0)
@@ -232,7 +245,8 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
                     done, count = lines[line].count("done"), len(lines[line])
                     some = f" ({done} of {count} runs)" if done < count else ""
                     drawn = _line(ax, mine, key, aside, who.index(line[0]))
-                    handles[", ".join(line) + some] = drawn
+                    oracle = " (oracle)" * mine[0].is_oracle
+                    handles[", ".join(line) + oracle + some] = drawn
             budgets = sorted({row.run.budget for row in found})
             shown = budgets[:: max(1, math.ceil(len(budgets) / 6))]
             ax.minorticks_off()
@@ -358,12 +372,18 @@ def report(result: BenchmarkResult) -> str:
         ],
         note=NOTE,
         heads=[*HEADS, *(column.title for column in COLUMNS)],
-        rows=[[*row.heads, *(_entry(row, column) for column in COLUMNS)] for row in rows],
+        rows=_entries(row for row in rows if not row.is_oracle),
+        oracles=_entries(row for row in rows if row.is_oracle),
+        oracle_note=ORACLES,
         budgets=small_png(draw_budgets(result)),
         problems=problems,
         verdicts=VERDICTS,
         settings=result.settings,
     )
+
+
+def _entries(rows: Iterable[SummaryRow]) -> list[list[str | Entry]]:
+    return [[*row.heads, *(_entry(row, column) for column in COLUMNS)] for row in rows]
 
 
 def _entry(row: SummaryRow, column: ScoreColumn) -> Entry:

@@ -44,6 +44,7 @@ def test_settings_are_checked(name: str) -> None:
         ("ges", {"penalty": 0}, "a number above 0"),
         ("grasp", {"depth": None}, "any whole number from 1 on"),
         ("gies", {"phases": ["sideways"]}, "a list of forward, backward, turning"),
+        ("gies", {"intercept": "none"}, "regime, shared"),
         ("pcmci+", {"tau_max": 0}, "any whole number from 1 on"),
     ],
 )

@@ -112,6 +112,19 @@ def test_interventions_direct_a_chain() -> None:
     np.testing.assert_array_equal(found.edges[0], graph != 0)
 
 
+def test_a_shared_intercept_uses_means() -> None:
+    """A cause that varies between regimes only is found with one intercept for all of them."""
+    pytest.importorskip("gies")
+    rng = np.random.default_rng(0)
+    x = 0.01 * rng.normal(size=400)
+    x[200:] = 3.0
+    y = x + rng.normal(size=400)
+    targets = [()] * 200 + [("x",)] * 200
+    data = Dataset.of(np.stack([x, y], axis=1), ["x", "y"], targets=targets)
+    assert not learn("gies", data).edges.any()
+    assert learn("gies_shared", data).directed == (("x", "y", 0),)
+
+
 def test_surer_edges_explain_more() -> None:
     """An edge with ten times the weight is surer; where there is no edge, nothing is."""
     draw = np.random.default_rng(0).normal(size=(3, 1000))

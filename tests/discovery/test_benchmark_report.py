@@ -16,6 +16,7 @@ from matplotlib.image import imread
 from scm_world.discovery import BenchmarkResult
 from scm_world.discovery.benchmark_report import (
     NONE,
+    ORACLES,
     STANDARDISED,
     VERDICTS,
     Spread,
@@ -99,12 +100,28 @@ def test_standardised_runs_are_beside_the_others() -> None:
 
 def test_the_best_needs_all_seeds() -> None:
     """A learner that solved the easy seed only is not the best, whatever its mean."""
-    runs = [run(CHAIN, "ours", "paired", 10, seed) for seed in (1, 2)]
+    runs = [run(CHAIN, "ours", "interventional", 10, seed) for seed in (1, 2)]
     lucky = replace(run(CHAIN, "gies", "interventional", 10, 1), scores={"shd": 0})
     late = replace(lucky, seed=2, status="timeout", found=None, scores={})
     bad = [replace(lucky, learner="pc", seed=seed, scores={"shd": 9}) for seed in (1, 2)]
     rows = summary(of(*runs, lucky, late, *bad))["chain"]
     assert [row.run.learner for row in rows if "shd" in row.best] == ["ours"]
+
+
+def test_oracles_are_not_ranked_among_learners_from_data(folder: Path) -> None:
+    """Who had the simulator is best of nothing, and has a table of its own."""
+    oracle = replace(run(CHAIN, "ours", "paired", 10, 1), scores={"shd": 0})
+    runs = [run(CHAIN, name, "interventional", 10, 1) for name in ("ours", "gies")]
+    rows = summary(of(oracle, *runs))["chain"]
+    assert [(row.is_oracle, "shd" in row.best) for row in rows] == [
+        (False, False),
+        (False, True),
+        (True, False),
+    ]
+    text = (folder / "report.html").read_text()
+    before, after = text.split(ORACLES)
+    assert ">paired<" not in before.rpartition("<h3>Oracles")[0].partition("<table")[2]
+    assert ">paired<" in after.partition("</table>")[0]
 
 
 def test_the_csv_has_a_line_per_run(result: BenchmarkResult, folder: Path) -> None:
@@ -302,7 +319,9 @@ def test_the_report_shows_every_kind_of_edge(page: Page, result: BenchmarkResult
         fields = sum(1 + (not link.directed) for link in links if link.verdict == verdict)
         signs = [found for tag, found in page.tags if tag == "b" and found["class"] == verdict]
         assert len(signs) == fields + len(TRUTHS)  # and the legends
-    assert sum(tag == "table" for tag, _ in page.tags) == 1 + len(shown)
+    assert sum(tag == "table" for tag, _ in page.tags) == 2 + len(
+        shown
+    )  # and two summaries: oracles apart
 
 
 def test_the_report_is_the_same_in_any_order(result: BenchmarkResult) -> None:

@@ -10,9 +10,13 @@ from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
 from scm_world.discovery.learners.registry import Learner, register
 
 OURS = (
-    Learner("paired", paired, ("paired",), doc="one variable at a time, same noise: exact"),
     Learner(
-        "pooled", sparse_pooled, ("paired",), "models", doc="all numbers at once: few causes each"
+        "paired", paired, ("paired",),
+        doc="oracle with the simulator: one variable at a time, same noise, exact",
+    ),
+    Learner(
+        "pooled", sparse_pooled, ("paired",), "models",
+        doc="oracle with the simulator: all numbers at once, few causes each",
     ),
     Learner(
         "coloring", verified, ("paired",), "models", claims=True,
@@ -37,6 +41,11 @@ OTHERS = (
     Learner(
         "gies", libraries.gies, ("observational", "interventional"), extra="discovery",
         package="gies", doc="greedy search over interventional equivalence classes by BIC",
+    ),
+    Learner(
+        "gies_shared", partial(libraries.gies, intercept="shared"),
+        ("observational", "interventional"), extra="discovery", package="gies",
+        doc="gies with one intercept in all regimes: means count",
     ),
     Learner(
         "pcmci+", libraries.pcmci_plus, ("observational",), temporal=True, extra="tigramite",

@@ -43,6 +43,7 @@ STILL = 1e-12
 DEPENDENT = 1e-7
 """A column with this part of its spread left after regression on the earlier ones adds nothing."""
 SHOWN = 10  # columns that a note names
+INTERCEPTS = ("regime", "shared")
 PHASES = ("forward", "backward", "turning")
 
 # --- settings -------------------------------------------------------------------------------------
@@ -172,6 +173,7 @@ def gies(
     penalty: float = 0.5,
     phases: Sequence[str] = PHASES,
     iterate: bool = True,
+    intercept: str = "regime",
 ) -> EstimatedGraph:
     """Find a graph by greedy search over interventional equivalence classes.
 
@@ -181,19 +183,27 @@ def gies(
         penalty: Of an edge, times log(n); 0.5 is the Bayesian information criterion.
         phases: Of the search, in their order.
         iterate: Whether the phases are repeated until nothing improves.
+        intercept: ``"regime"`` for one in each set of targets, as the package has it: means say
+            nothing then; ``"shared"`` for one in all rows in which a column was not set.
     """
+    if intercept not in INTERCEPTS:
+        raise UnknownOption("intercept of 'gies'", intercept, INTERCEPTS)
     if isinstance(phases, str) or not phases or not set(phases) <= set(PHASES):
         raise UnknownOption("phases of 'gies'", phases, (f"a list of {', '.join(PHASES)}",))
     settings = {
         "penalty": _number("penalty of 'gies'", penalty),
         "phases": list(phases),
         "iterate": _switch("iterate of 'gies'", iterate),
+        "intercept": intercept,
     }
 
     def search(table: Dataset) -> tuple[Bools, str]:
         cost = penalty * float(np.log(len(table)))
         scores = import_module("gies.scores.gauss_int_l0_pen")
         measure = scores.GaussIntL0Pen(*environments(table), lmbda=cost)
+        if intercept == "shared":
+            free = [table.values[~set_] for set_ in table.targeted.T]
+            measure.part_sample_cov = np.stack([np.cov(x, rowvar=False, bias=True) for x in free])
         measure.part_sample_cov += RIDGE * np.eye(len(table.names))
         graph, _ = import_module("gies").fit(measure, phases=list(phases), iterate=iterate)
         return np.array(graph) != 0, ""
