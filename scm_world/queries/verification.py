@@ -70,9 +70,9 @@ class Undeclared(Report):
     """An effect without an edge.
 
     Attributes:
-        cause: The variable that was changed.
+        cause: The variable that was changed; several, joined by ``" & "``, if each is needed.
         effect: The variable that should not have responded.
-        lag: 0 or 1.
+        lag: After how many control steps; from 2 on, something remembers what no state holds.
         size: Largest effect observed, in the unit of the child.
         probe: Number of the probe state in which it was observed.
         kind: How this probe state came about.
@@ -119,8 +119,12 @@ class Verification(Report):
             undeclared.
         seen_held_out: How many declared edges were seen in the held-out states; None of a generated
             graph, of which not all are looked for.
-        provenance: How many declared edges were seen and how many there are, by what decides the
-            effect: ``"engine"``, ``"readout"`` (computed from states) or ``"definition"``.
+        provenance: How many declared edges were seen, how many there are, and how many effects
+            without an edge were seen, by what decides the effect: ``"engine"``, ``"readout"``
+            (computed from states) or ``"definition"``.
+        unstable: What differed, and by how much, though nothing had been changed: from one
+            evaluation or run to the next, or after something was put back.
+        shared_noise: Pairs of variables that are given one and the same noise.
         planned: How many probe states there may have been, without those.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
         rollouts: Control steps simulated in an experiment of their own.
@@ -146,7 +150,9 @@ class Verification(Report):
     probes: int
     held_out: int = 0
     seen_held_out: int | None = None
-    provenance: dict[str, tuple[int, int]] = {}
+    provenance: dict[str, tuple[int, int, int]] = {}
+    unstable: dict[str, float] = {}
+    shared_noise: tuple[tuple[str, str], ...] = ()
     planned: int
     interrupted: bool
     rollouts: int
@@ -191,29 +197,28 @@ class Verification(Report):
         Of a generated graph, edges may be left that were never seen.
         """
         unseen = self.never_fired and not self.generated
-        wrong = self.undeclared or unseen or self.colors or self.interrupted
-        return self.floor == 0.0 and not wrong
+        wrong = (self.undeclared, unseen, self.colors, self.unstable, self.shared_noise)
+        return self.floor == 0.0 and not self.interrupted and not any(wrong)
 
     def rows(self) -> tuple[Row, ...]:
         """List the numbers, what they mean, and whether they are good."""
         states = f"{self.probes} of at most {self.planned}"
         states += f", {self.held_out} held out" if self.held_out else ""
         unseen = not self.never_fired or (None if self.generated else False)
-        found = (
-            f"{len(self.fired)} of {len(self.declared)} ({100 * self.share:.2f} %)",
-            unseen,
-        )
-        more: list[Row] = [
-            (f"of these, by {by}", f"{seen} of {all_}", None)
-            for by, (seen, all_) in self.provenance.items()
-            if all_
+        counts: list[Row] = [
+            (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared", not others)
+            for by, (seen, all_, others) in self.provenance.items()
+            if all_ or others
         ]
+        least = min((edge.states for edge in self.fired), default=0)
+        more: list[Row] = [("each seen one in at least", f"{least} states", None)]
         if self.seen_held_out is not None:
             text = (
                 f"{self.seen_held_out} of {len(self.declared)} in {self.held_out} held-out states"
             )
             more.append(("without the task's scenarios", text, None))
         return (
+            *counts,
             ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
             ("preset, seed", f"{self.preset}, {self.seed}", None),
             ("probe states", states + ": interrupted" * self.interrupted, None),
@@ -221,10 +226,15 @@ class Verification(Report):
             ("floor (do and undo)", f"{self.floor:g}", self.floor == 0.0),
             ("settable variables", str(self.settable), None),
             ("never feasible", listed(self.untried), None),
-            ("declared edges seen", *found),
             *more,
             ("never seen", listed(map(arrow, self.never_fired)), unseen),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
+            ("differs by itself", listed(self.unstable), not self.unstable),
+            (
+                "noise in common",
+                listed(map(" and ".join, self.shared_noise)),
+                not self.shared_noise,
+            ),
             ("colors that move something", listed(map(arrow, self.colors)), not self.colors),
             ("seconds", f"{self.seconds:.1f}", None),
             ("passed", "yes" if self.passed else "no", self.passed),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, final
 
 from scm_world._arguments import whole_number
@@ -14,7 +15,9 @@ from scm_world.queries.agreement import SEEDS, Agreement, Sign, compare_signs
 from scm_world.queries.experiments.effects import EdgeKey, Effects, Series
 from scm_world.queries.experiments.models import PairedEquations
 from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import Probe
 from scm_world.queries.experiments.probes import probes as probe_states
+from scm_world.queries.experiments.together import Together
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.queries.verification import (
@@ -170,22 +173,48 @@ def verify_engines(
 
 
 def _provenance(
-    model: SCM, declared: Iterable[EdgeKey], found: set[EdgeKey]
-) -> dict[str, tuple[int, int]]:
-    """Count the edges that were seen and those that are declared, by what decides the effect.
+    model: SCM, declared: Iterable[EdgeKey], found: set[EdgeKey], undeclared: Iterable[EdgeKey]
+) -> dict[str, tuple[int, int, int]]:
+    """Count declared edges that were seen, all of them, and undeclared ones, by what decides.
 
     The engine decides states and what it reports. What is computed from them is a readout, and
     everything else follows by definition: its edges hold because the mechanism is what it is.
     """
-    counted = {"engine": (0, 0), "readout": (0, 0), "definition": (0, 0)}
-    for key in declared:
+    counted = {"engine": [0, 0, 0], "readout": [0, 0, 0], "definition": [0, 0, 0]}
+
+    def of(key: EdgeKey) -> list[int]:
         effect: Any = model.declared(key[1])
-        by = "definition"
-        if isinstance(effect, Measured):
-            by = "engine" if effect.mechanism is None else "readout"
-        seen, all_ = counted[by]
-        counted[by] = seen + (key in found), all_ + 1
-    return counted
+        if not isinstance(effect, Measured):
+            return counted["definition"]
+        return counted["engine" if effect.mechanism is None else "readout"]
+
+    for key in declared:
+        of(key)[0] += key in found
+        of(key)[1] += 1
+    for key in undeclared:
+        of(key)[2] += 1
+    return {by: (seen, all_, others) for by, (seen, all_, others) in counted.items()}
+
+
+@final
+class _Experiments:
+    """All experiments with a world: one variable changed, and everything that should not matter.
+
+    Args:
+        world: To experiment with.
+        seed: Of the values.
+        causes: Names of the variables that are changed alone; all if None.
+    """
+
+    def __init__(self, world: Simulation, seed: int, causes: set[str] | None = None) -> None:
+        self._paired = Paired(world, seed, causes=causes)
+        self.effects, self.targets = self._paired.effects, self._paired.targets
+        self._together = Together(world, seed, self.effects)
+
+    def run(self, number: int, probe: Probe) -> None:
+        """Do all experiments of one probe state."""
+        self._paired.run(number, probe)
+        self._together.run(number, probe)
 
 
 @final
@@ -229,7 +258,7 @@ def _verified(
     declared = tuple(edge.key for edge in model.edges)
     measured = {v.name for v in model.variables if isinstance(v, Measured)}
     watch = _Watch(declared, least, QUIET if generated else None)
-    paired = Paired(world, seed) if world else PairedEquations(model, seed)
+    paired: Any = _Experiments(world, seed) if world else PairedEquations(model, seed)
     series = Series(paired, probes, progress)
     series.run(probe_states(world, probes, seed) if world else range(probes), watch)
     effects, done = series.effects, series.done
@@ -238,9 +267,9 @@ def _verified(
     open_ = found.symmetric_difference(declared)
     further: Series | None = None
     again: set[EdgeKey] | None = None
-    if world and held_out and not interrupted and (open_ or not generated):
+    if world and held_out and not interrupted:
         causes = {cause for cause, _, _ in open_} if generated else None
-        further = Series(Paired(world, seed + OTHER, causes=causes), held_out)
+        further = Series(_Experiments(world, seed + OTHER, causes), held_out)
         with contextlib.suppress(KeyboardInterrupt):
             states = probe_states(world, held_out, seed + OTHER, scenarios=False)
             further.run(states, lambda new, more: watch(new, done + more) and False)
@@ -249,12 +278,16 @@ def _verified(
         effects.take(further.effects, done)
         found = effects.edges(set(declared))
     undeclared = []
-    for key in sorted(found - set(declared)):
-        setting = effects.settings[key]
+    seen = [(key, effects.largest[key], effects.settings[key]) for key in found - set(declared)]
+    seen += [
+        (key, size, replace(where, kind=f"{where.kind}, without contact"))
+        for key, (size, where) in effects.apart.items()
+    ]
+    for key, size, setting in sorted(seen, key=lambda one: one[0]):
         undeclared.append(
             Undeclared(
                 **named(key),
-                size=effects.largest[key],
+                size=size,
                 probe=setting.probe,
                 kind=setting.kind,
                 change=() if setting.change is None else tuple(setting.change.tolist()),
@@ -270,7 +303,9 @@ def _verified(
         probes=done,
         held_out=0 if further is None else further.done,
         seen_held_out=None if again is None or generated else len(again & set(declared)),
-        provenance=_provenance(model, declared, found),
+        provenance=_provenance(model, declared, found, [edge.key for edge in undeclared]),
+        unstable=dict(sorted(effects.unstable.items())),
+        shared_noise=tuple(sorted(effects.shared_noise)),
         planned=probes,
         interrupted=interrupted,
         rollouts=effects.rollouts,

@@ -69,7 +69,7 @@ def test_the_graph_shows_without_scenarios(pushing: Verification) -> None:
     )
     assert engine[1] + readout[1] + definition[1] == len(pushing.declared)
     assert engine[1] > 200
-    assert "of these, by engine" in str(pushing)
+    assert "edges by engine" in str(pushing)
 
 
 def test_a_report_survives_json(pushing: Verification) -> None:

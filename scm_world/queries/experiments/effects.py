@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, final
 
@@ -67,6 +67,9 @@ class Effects:
         undone: Targets that were changed and put back.
         rollouts: Control steps simulated in an experiment of their own.
         refused: Targets for which no feasible value was found, with how often.
+        unstable: What differed though nothing had been changed, with by how much.
+        apart: The largest effect, and where, of each edge by contact while nothing touched.
+        shared_noise: Pairs of variables that are given one and the same noise.
         setting: What is being done now.
         responses: By pair and probe, if they are wanted; else None.
     """
@@ -79,6 +82,9 @@ class Effects:
     undone: set[str] = field(default_factory=set)
     rollouts: int = 0
     refused: dict[str, int] = field(default_factory=dict)
+    unstable: dict[str, float] = field(default_factory=dict)
+    apart: dict[EdgeKey, tuple[float, ProbeSetting]] = field(default_factory=dict)
+    shared_noise: set[tuple[str, str]] = field(default_factory=set)
     setting: ProbeSetting | None = None
     responses: dict[tuple[EdgeKey, int], Response] | None = None
     _answered: set[EdgeKey] = field(default_factory=set)
@@ -94,6 +100,13 @@ class Effects:
             self._answered.add(key)
         if self.responses is not None and size > 0.0:
             self._respond(self.responses, key, np.ravel(after), np.ravel(before))
+
+    def see_apart(self, sizes: Mapping[EdgeKey, float]) -> None:
+        """Keep effects of what needs contact, seen while nothing touched."""
+        for key, size in sizes.items():
+            known = self.apart[key][0] if key in self.apart else RESOLUTION
+            if size > known and self.setting is not None:
+                self.apart[key] = size, self.setting
 
     def see_nothing(self, cause: str, effect: str, lag: int) -> None:
         """Count a pair that was observed without a difference."""
@@ -132,6 +145,12 @@ class Effects:
             self.states[key] = self.states.get(key, 0) + other.states.get(key, 0)
         self.floor = max(self.floor, other.floor)
         self.undone |= other.undone
+        self.shared_noise |= other.shared_noise
+        for name, size in other.unstable.items():
+            self.unstable[name] = max(size, self.unstable.get(name, 0.0))
+        for key, (size, found) in other.apart.items():
+            if key not in self.apart or size > self.apart[key][0]:
+                self.apart[key] = size, replace(found, probe=done + found.probe)
         self.rollouts += other.rollouts
 
     @property
@@ -161,6 +180,9 @@ class Effects:
             states=dict(self.states),
             undone=set(self.undone),
             refused=dict(self.refused),
+            unstable=dict(self.unstable),
+            apart=dict(self.apart),
+            shared_noise=set(self.shared_noise),
             responses=None if self.responses is None else dict(self.responses),
             _answered=set(),
         )

@@ -10,6 +10,7 @@ from scm_world._types import Value, Values
 from scm_world.graph import SCM, NoiseKey
 from scm_world.queries.equations import Layout
 from scm_world.queries.experiments.effects import Effects, gap
+from scm_world.queries.experiments.noise import shared_noise
 from scm_world.variables import Box, Categories, Integers, Noise, Variable
 
 
@@ -45,12 +46,20 @@ class PairedEquations:
         again = model.solve(self._actions, previous=first, key=at)
         effects.rollouts += 2
         effects.floor = max(effects.floor, *(gap(unit[n], again[n]) for n in unit))
+        if number == 0:
+            effects.shared_noise |= shared_noise(model, unit, first)
         for cause in model:
             other = _another(model[cause], unit[cause], unit, noise, number)
             _compare(model, cause, {**unit, cause: other}, first, unit, at, effects, lag=0)
             memory = {**first, cause: _another(model[cause], first[cause], first, noise, number)}
             _compare(model, cause, unit, memory, unit, at, effects, lag=1)
             effects.rollouts += 1
+        for name in reversed(tuple(model)):  # alone, last ones first, and after all the others
+            value = model.solve(unit, previous=first, key=at, only=(name,))[name]
+            if gap(value, unit[name]) > 0.0:
+                effects.unstable[name] = max(
+                    effects.unstable.get(name, 0.0), gap(value, unit[name])
+                )
         effects.end_of_probe()
 
 

@@ -18,8 +18,10 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
+from scm_world.backends.base import InMemory
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import (
+    RESOLUTION,
     EdgeKey,
     Effects,
     ProbeSetting,
@@ -154,6 +156,10 @@ class Paired:
             for lag in (0, 1)
         )
         self._pool: dict[str, list[Value]] = {name: [] for name in self._readouts}
+        in_memory = isinstance(world.backend, InMemory)  # nothing ever touches there
+        self._by_contact = frozenset(
+            edge.key for edge in model.edges if edge.when == "contact" and not in_memory
+        )
 
     def run(self, number: int, probe: Probe) -> None:
         """Do all experiments of one probe state."""
@@ -166,8 +172,12 @@ class Paired:
         self._after = _Kept(self._world)
         self._later = self._after.values
         self._reported = self._engine_values()
-        worn = max((gap(value, at_first[n]) for n, value in self._reported.items()), default=0.0)
-        self.effects.floor = max(self.effects.floor, worn)  # nothing but time has passed
+        for name, value in self._reported.items():  # nothing but time has passed
+            self._see_floor(name, gap(value, at_first[name]))
+        self._apart = False
+        if self._by_contact:
+            self._world.restore(probe.snapshot)
+            self._apart = self._touches_nothing(probe.action)
         for target in self.targets:
             self._experiment(target)
         for action in self.actions:
@@ -338,7 +348,9 @@ class Paired:
 
     def _see_later(self, cause: str, action: Floats | None = None) -> None:
         """Step with everything as it was but the cause, and compare with the base run."""
-        memory = self._advanced(self._probe.action if action is None else action)
+        action = self._probe.action if action is None else action
+        here = self._world.snapshot() if self._apart else None
+        memory = self._advanced(action)
         moved = frozenset(self._after.differing(self._world))
         now = self._world.current()[0]
         for name in self._states:
@@ -348,6 +360,25 @@ class Paired:
                 self.effects.see_nothing(cause, name, 1)
         self._see_memory(cause, memory)
         self._see_engine(cause)
+        far = {(cause, name, 1) for name in moved} & self._by_contact if here else set()
+        sizes = {key: gap(now[key[1]], self._later[key[1]]) for key in far}
+        if here and any(size > RESOLUTION for size in sizes.values()):
+            there = self._world.snapshot()
+            self._world.restore(here)
+            if self._touches_nothing(action):
+                self.effects.see_apart(sizes)
+            self._world.restore(there)
+
+    def _touches_nothing(self, action: Floats) -> bool:
+        """Take the physics steps of a control step one by one; tell whether bodies stay apart."""
+        world = self._world
+        mode, substeps = world.pace
+        told = world.told(world.decided(world.compiled.clipped(action)), world.index)
+        for _ in range(substeps):
+            world.backend.step(mode, told, 1)
+            if world.backend.contacts():
+                return False
+        return True
 
     def _engine_values(self) -> dict[str, Value]:
         """Read the parameters that the engine has now, by variable."""
@@ -384,8 +415,14 @@ class Paired:
         self.effects.undone.add(target)
         self._advanced(self._probe.action)
         moved, now = self._after.differing(self._world), self._world.current()[0]
-        worst = max((gap(now[name], self._later[name]) for name in moved), default=0.0)
-        self.effects.floor = max(self.effects.floor, worst)
+        for name in moved:
+            self._see_floor(name, gap(now[name], self._later[name]))
+
+    def _see_floor(self, name: str, size: float) -> None:
+        """Note what differs though nothing was changed, or what was has been put back."""
+        if size > 0.0:
+            self.effects.floor = max(self.effects.floor, size)
+            self.effects.unstable[name] = max(self.effects.unstable.get(name, 0.0), size)
 
     def _vary_action(self, name: str) -> None:
         """Find the effects of another value of one action, within its range."""

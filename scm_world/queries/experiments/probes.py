@@ -14,10 +14,19 @@ from typing import Any, TypeVar, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value
+from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.tasks.base import Dice, Scenario, action_range
-from scm_world.variables import Box, Exogenous, Measured, Noise, Rotations, Variable
+from scm_world.variables import (
+    Box,
+    Categories,
+    Exogenous,
+    Integers,
+    Measured,
+    Noise,
+    Rotations,
+    Variable,
+)
 from scm_world.world import Simulation, WorldSnapshot
 
 Pair = tuple[str, str]
@@ -244,19 +253,53 @@ def set_others(world: Simulation, dice: Dice) -> None:
 
 def _jittered(variable: Exogenous, world: Simulation, dice: Dice) -> Value | None:
     """Give another value of a parameter, or None where it keeps the one that it has."""
-    n = int(np.prod(variable.shape))
-    unit = dice.of(f"{variable.name}|other", n + 2)
-    space = variable.a if unit[0] < 0.5 else variable.b
-    if unit[1] >= SHARE:
+    if dice.of(f"{variable.name}|other or not", 1)[0] >= SHARE:
         return None
-    present = world[variable.name]
-    if isinstance(space, Box):
-        low, high = space.bounds(variable.shape, world.current()[0])
-        if np.isfinite(low).all() and np.isfinite(high).all():
-            return np.asarray(low + unit[2:].reshape(variable.shape) * (high - low))
-    moved = present * (1.0 + JITTER * (2.0 * unit[2:].reshape(variable.shape) - 1.0))
+    now = world.current()[0]
+    return drawn(variable, world[variable.name], now, dice, "other", JITTER)
+
+
+def drawn(
+    variable: Variable, present: Value, now: Values, dice: Dice, stream: str, share: float
+) -> Value | None:
+    """Draw another value of a variable: from its space A, its space B, or within its bounds.
+
+    A parameter without ends is moved by a share of itself; a state as far as it can be, or as is
+    within reach. None if there is no other value.
+
+    Args:
+        variable: It can be set.
+        present: The value that it has.
+        now: Values of what its spaces and bounds follow from.
+        dice: Random numbers.
+        stream: Which of them.
+        share: How far, as a fraction, what has no ends is moved.
+    """
+    n = int(np.prod(variable.shape))
+    unit = dice.of(f"{variable.name}|{stream}", n + 2)
+    numbers = unit[2:].reshape(variable.shape)
     bounds = variable.bounds
-    return np.asarray(moved if bounds is None else bounds.nearest(moved, world.current()[0]))
+    match bounds:
+        case Integers():
+            width = bounds.high - bounds.low + 1
+            return np.asarray(bounds.low + np.floor(numbers * width).astype(np.int64))
+        case Categories(members=members):
+            others = [member for member in members if not np.any(present == member)]
+            return variable.array(others[int(unit[0] * len(others))]) if others else None
+    if variable.dtype != "real":
+        return None
+    if isinstance(variable, Measured):
+        return _moved(variable, present, unit[1:])
+    named = (variable.space("A"), variable.space("B"), bounds)
+    ends = [space.bounds(variable.shape, now) for space in named if isinstance(space, Box)]
+    ends = [pair for pair in ends if np.isfinite(pair).all()]
+    if ends:
+        low, high = ends[int(unit[0] * len(ends))]
+        return np.asarray(low + numbers * (high - low))
+    if isinstance(bounds, Rotations):
+        return bounds.nearest(present + 2.0 * (2.0 * numbers - 1.0))
+    moved = present * (1.0 + share * (2.0 * numbers - 1.0)) + JITTER * (present == 0.0) * numbers
+    return np.asarray(moved if bounds is None else bounds.nearest(moved, now))
 
 
 def _moved(variable: Variable, present: Value, drawn: Floats) -> Value:

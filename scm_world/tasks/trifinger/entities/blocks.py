@@ -184,6 +184,7 @@ class ToolBlock(Entity):
         position, orientation = self._v("cartesian_position"), self._v("orientation")
         linear, angular = self._v("linear_velocity"), self._v("angular_velocity")
         always = "gravity", PRESET
+        spinning = angular, self._v("size"), PRESET  # the size decides the inertia: a block tumbles
         yield StateDeclaration(
             position,
             "m",
@@ -204,7 +205,7 @@ class ToolBlock(Entity):
             numbers.QUATERNION_BOUNDS,
             self._orientation,
             "Orientation as a unit quaternion (x, y, z, w) with w >= 0.",
-            always=(orientation, angular, PRESET),
+            always=(orientation, *spinning),
             **self._respawn(numbers.IDENTITY),
         )
         yield StateDeclaration(
@@ -224,7 +225,7 @@ class ToolBlock(Entity):
             numbers.ANGULAR_VELOCITY_BOUNDS,
             (0.0, 0.0, 0.0),
             "Angular velocity in the world frame.",
-            always=(angular, PRESET),
+            always=(orientation, *spinning),
             **self._respawn((0.0, 0.0, 0.0)),
         )
 
