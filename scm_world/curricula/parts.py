@@ -23,7 +23,9 @@ from scm_world.geometry.rotations import (
 from scm_world.graph import flatten
 from scm_world.variables import (
     Box,
+    Continuous,
     Cylinder,
+    Discrete,
     Distribution,
     Draw,
     Function,
@@ -154,14 +156,14 @@ _DRAWS: WeakKeyDictionary[CompiledTask, dict[tuple[str, bool], Acts]] = WeakKeyD
 
 def _check(variable: Variable, region: SpaceName | Distribution) -> None:
     """Refuse a region in which a variable cannot lie."""
-    if variable.dtype != "real" and isinstance(region, Box | Cylinder | Normal):
+    if variable.dtype != "real" and isinstance(region, Box | Cylinder | Normal | Continuous):
         raise InterventionError(
             f"{variable.name!r} is a whole number, and {region!r} has others; draw it from "
             "Integers(low, high), Categories([…]) or a declared space",
             variable=variable.name,
             value=region,
         )
-    if isinstance(region, Normal | Cylinder):
+    if isinstance(region, Normal | Cylinder | Continuous | Discrete):
         check_draw(variable, Draw(region))
     else:
         check_region(variable, region)

@@ -10,7 +10,9 @@ import numpy as np
 from scm_world.errors import InterventionError, UnknownVariable
 from scm_world.graph.evaluate import AppliedIntervention, source_of
 from scm_world.variables import (
+    Derived,
     Draw,
+    Function,
     Hard,
     Intervention,
     Mechanism,
@@ -35,21 +37,29 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
             _known(declared, source_of(AppliedIntervention(value, variable)).parents())
             return value
         case Mechanism():
-            _known(declared, (parent.name for parent in value.parents))
+            act = _complete(variable, value)
+            _known(declared, (parent.name for parent in act.parents))
             own = (variable.name, *variable.parts)
-            if any(parent.name in own and not parent.lag for parent in value.parents):
+            if any(parent.name in own and not parent.lag for parent in act.parents):
                 raise InterventionError(
                     f"do({variable.name}): a variable cannot follow itself within an instant; "
                     "use Shift or Scale",
                     variable=variable.name,
                     value=value,
                 )
-            return value
+            return act
         case Natural():
             return value
         case Null():
             raise InterventionError(
                 f"do({variable.name}): a variable cannot be taken away; a body of a world can be",
+                variable=variable.name,
+                value=value,
+            )
+        case Shift() | Scale() if variable.dtype == "categorical":
+            raise InterventionError(
+                f"do({variable.name}): categories have no order, so there is no {value!r}; set a "
+                "category, Draw one, or give a Mechanism",
                 variable=variable.name,
                 value=value,
             )
@@ -61,6 +71,28 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
     if variable.bounds is not None and not variable.bounds.parents():
         check_bounds(variable, number, {})
     return Hard(number.tolist())
+
+
+def _complete(variable: Variable, value: Mechanism) -> Mechanism:
+    """Put what a mechanism leaves out in its place: the variable's own function and noise.
+
+    Raises:
+        InterventionError: The variable has none, or the function takes no noise.
+    """
+    own = variable if isinstance(variable, Derived) else None
+    if value.function is None and (own is None or own.noise is None):
+        said = "it has no noise that could be another one"
+    elif value.function is None and own is not None:
+        return value.model_copy(update={"function": own.mechanism, "parents": own.parents})
+    elif value.noise is not None and not value.equation.takes_noise:
+        said = "its function does not take noise; give it an argument `noise`"
+    elif isinstance(value.function, Function) and value.equation.takes_noise:
+        if value.noise is not None or (own is not None and own.noise is not None):
+            return value
+        said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
+    else:
+        return value
+    raise InterventionError(f"do({variable.name}): {said}", variable=variable.name, value=value)
 
 
 def _known(declared: Mapping[str, Variable], names: Any) -> None:

@@ -12,6 +12,7 @@ from scm_world._types import Value, Values
 from scm_world.errors import ModelError, ScmWorldError, WrongShape, WrongType, in_one_line
 from scm_world.variables import (
     SOFT,
+    Categories,
     Derived,
     Distribution,
     Draw,
@@ -42,6 +43,7 @@ class NoiseKey:
             what was drawn at the start of an episode stays, however late one intervenes.
         attempt: How many draws were rejected before, because they were infeasible.
         kept: Variables that are not drawn again at another attempt.
+        given: Noise that is known: of some variables, instead of draws.
     """
 
     noise: Noise
@@ -51,11 +53,14 @@ class NoiseKey:
     origin: int | None = None
     attempt: int = 0
     kept: frozenset[str] = frozenset()
+    given: Values | None = None
 
     def natural(
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
     ) -> Value:
         """Draw what a variable has by itself, without intervention."""
+        if self.given is not None and name in self.given:
+            return self.given[name]
         key = replace(self, attempt=0) if self.attempt else self
         if self.origin is not None:
             key = replace(key, step=self.origin, origin=None)
@@ -111,6 +116,41 @@ def source_of(act: AppliedIntervention) -> Distribution:
     return space
 
 
+def noise_of(
+    variable: Variable, mechanism: Derived | Mechanism, key: NoiseKey | None, values: Values
+) -> dict[str, Value]:
+    """Give the noise that the function of a variable takes, as its argument; none if it has none.
+
+    Args:
+        variable: The variable.
+        mechanism: Its own declaration, or what an intervention has put in the place.
+        key: Where noise is drawn; the noise is zero if None.
+        values: Of the variables that a distribution follows.
+    """
+    own = variable if isinstance(variable, Derived) else None
+    source = mechanism.noise
+    if isinstance(mechanism, Mechanism):
+        if not mechanism.equation.takes_noise:
+            return {}
+        source = mechanism.noise or (own.noise if own is not None else None)
+    if source is None:
+        return {}
+    shape = variable.shape if own is None or own.noise_shape is None else own.noise_shape
+    if key is None:
+        return {"noise": np.zeros(shape)}
+    return {"noise": key.natural(source, variable.name, shape, values)}
+
+
+def _check_categories(variable: Variable, value: Value) -> None:
+    """Refuse what a function gives that is none of the categories of its variable."""
+    bounds = variable.bounds
+    if isinstance(bounds, Categories) and not bounds.contains(value):
+        wrong = np.setdiff1d(value, bounds.members).tolist()[:3]
+        allowed = bounds.describe(variable.shape, {})
+        said = f"the function of {variable.name!r} gives {wrong}, which are none of {allowed}"
+        raise ModelError([said])
+
+
 @final
 class Evaluator:
     """The mechanisms of a model, with their functions looked up once.
@@ -139,6 +179,8 @@ class Evaluator:
         elif key is None:
             raise ModelError([f"{requested.name!r} is drawn: solve needs a noise key to draw with"])
         else:
+            if getattr(requested, "per", "step") == "episode" and key.origin is None:
+                key = replace(key, step=0)
             source, stream = source_of(act), getattr(act.intervention, "stream", None)
             value = key.draw(source, requested.name, requested.shape, values, stream)
         return self._given(requested, name, value)
@@ -162,7 +204,7 @@ class Evaluator:
         if act is None:
             return self._natural(self._declared[name], values, previous, key)
         if isinstance(act.intervention, Mechanism):
-            return self._followed(name, act, act.intervention, values, previous)
+            return self._followed(name, act, act.intervention, values, previous, key)
         if not isinstance(act.intervention, SOFT):
             return self.forced(name, act, values, key)
         natural = self._natural(self._declared[name], values, previous, key)
@@ -182,10 +224,12 @@ class Evaluator:
         given: Mechanism,
         values: Values,
         previous: Values,
+        key: NoiseKey | None,
     ) -> Value:
         requested = act.requested
         arguments = map(np.array, self._arguments(given.parents, values, previous))  # copies
-        found = given.function.bind()(*arguments)
+        noise = noise_of(requested, given, key, values)
+        found = given.equation.bind()(*arguments, **noise)
         value = np.asarray(found)
         if value.dtype.kind not in ("iuf" if requested.dtype == "real" else "biuf"):
             raise WrongType(requested.name, found, f"numbers of shape {requested.shape}")
@@ -196,6 +240,7 @@ class Evaluator:
                 raise WrongShape(requested.name, given, requested.shape, value.shape) from None
         if requested.dtype != "real":
             value = np.rint(value).astype(np.int64)
+        _check_categories(requested, value)
         return self._given(requested, name, value)
 
     def _natural(
@@ -207,6 +252,8 @@ class Evaluator:
                     return values[variable.name]
                 if key is None or variable.distribution is None:
                     return variable.array(variable.default)
+                if variable.per == "episode" and key.origin is None and key.step:
+                    key = replace(key, step=0)
                 return key.natural(variable.distribution, variable.name, variable.shape, values)
             case Fixed():
                 return variable.array(variable.value)
@@ -225,11 +272,8 @@ class Evaluator:
     def _derive(
         self, variable: Derived, values: Values, previous: Values, key: NoiseKey | None
     ) -> Value:
-        arguments, given = self._arguments(variable.all_parents, values, previous), {}
-        if variable.noise is not None:
-            given["noise"] = np.zeros(variable.shape)
-            if key is not None:
-                given["noise"] = key.natural(variable.noise, variable.name, variable.shape, values)
+        arguments = self._arguments(variable.all_parents, values, previous)
+        given = {} if variable.noise is None else noise_of(variable, variable, key, values)
         function = self._bound(variable)
         try:
             value = np.asarray(function(*arguments, **given))
@@ -242,6 +286,7 @@ class Evaluator:
         if value.dtype.kind not in "biuf" or shape != variable.shape:
             wanted = f"numbers of shape {variable.shape}" if variable.shape else "a number"
             raise ModelError([f"the function of {variable.name!r} gives {value!r}, not {wanted}"])
+        _check_categories(variable, value)
         return value
 
     def _arguments(

@@ -174,8 +174,16 @@ class SCM:
         default = tuple([0.0] * int(np.prod(variable.shape))) if variable.shape else 0.0
         if isinstance(act.intervention, Mechanism):
             given = act.intervention
+            noise = given.noise
+            if isinstance(variable, Derived) and given.equation.takes_noise:
+                noise = noise or variable.noise
             return Derived(
-                name=name, parents=given.parents, mechanism=given.function, **common, **spaces
+                name=name,
+                parents=given.parents,
+                mechanism=given.equation,
+                noise=noise,
+                **common,
+                **spaces,
             )
         source = source_of(act)
         return Exogenous(name=name, default=default, distribution=source, **common, **spaces)
@@ -391,6 +399,8 @@ class SCM:
     ) -> dict[str, Value]:
         """Compute every variable from the exogenous ones, shape ``(..., *shape)`` each.
 
+        Every value has the batch axes that lead in what is known, or in what the key draws.
+
         Args:
             known: Values of exogenous and measured variables and of actions; batch axes may lead.
             previous: Values of one control step ago, for parents of lag 1. Where it is not
@@ -401,13 +411,48 @@ class SCM:
             only: Compute these, in the order of the model, and take the rest from ``known``.
 
         Raises:
-            ModelError: A measured variable or an action has no value.
+            ModelError: A measured variable or an action has no value, or a value is known of
+                what is computed, and ``only`` does not leave that out.
         """
         values: dict[str, Value] = dict(known or {})
         evaluate = self._evaluator.evaluate
+        if only is None:
+            self._refuse_computed(values)
+        lead = self._lead(values, key, whole=only is None)
         for name in self._order if only is None else only:
-            values[name] = evaluate(name, self._acts.get(name), values, previous or {}, key)
+            found = evaluate(name, self._acts.get(name), values, previous or {}, key)
+            values[name] = self._spread(name, found, lead) if lead else found
         return values
+
+    def _refuse_computed(self, known: Values) -> None:
+        """Refuse values that would be ignored."""
+        computed = [
+            name
+            for name in known
+            if name in self
+            and name not in self._acts
+            and getattr(self._declared[name], "mechanism", None) is not None
+        ]
+        if computed:
+            raise ModelError(
+                [
+                    f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
+                    "would be ignored; ask counterfactual(observed, do=…), or set it with do"
+                ]
+            )
+
+    def _lead(self, known: Values, key: NoiseKey | None, *, whole: bool) -> tuple[int, ...]:
+        """Give the batch axes of what is computed; without a key, those of what is known."""
+        if key is not None and key.count is not None:
+            return (key.count,)
+        if not whole or not known:
+            return ()
+        leads = (
+            np.shape(value)[: np.ndim(value) - len(self._declared[name].shape)]
+            for name, value in known.items()
+            if name in self._declared
+        )
+        return np.broadcast_shapes(*leads)
 
     def begin(
         self,
@@ -420,9 +465,11 @@ class SCM:
 
         What has lagged causes or effects has its ``start`` or default there, unless an intervention
         replaces its mechanism. The rest follows from that. Nothing has been drawn yet but what
-        an intervention draws. Arguments and result are those of ``solve``.
+        an intervention draws, and what is drawn once per episode. Arguments and result are those of
+        ``solve``.
         """
         values: dict[str, Value] = dict(known or {})
+        lead = self._lead(values, key, whole=only is None)
         if key is not None:
             key = replace(key, step=BEFORE)
         if self._temporal is None:
@@ -434,13 +481,15 @@ class SCM:
                 for end in (name, parent.name)
             )
         for name in self._order if only is None else only:
-            act = self._acts.get(name)
+            act, variable = self._acts.get(name), self._declared[name]
             if act is not None and not isinstance(act.intervention, SOFT):
-                values[name] = self._evaluator.evaluate(name, act, values, {}, key)
-            elif name in self._temporal and isinstance(self._declared[name], Derived | Measured):
-                values[name] = values.get(name, self._evaluator.first(name))
+                found = self._evaluator.evaluate(name, act, values, {}, key)
+            elif name in self._temporal and isinstance(variable, Derived | Measured):
+                found = values.get(name, self._evaluator.first(name))
             else:
-                values[name] = self._evaluator.evaluate(name, act, values, {}, None)
+                drawn = key if getattr(variable, "per", "step") == "episode" else None
+                found = self._evaluator.evaluate(name, act, values, {}, drawn)
+            values[name] = self._spread(name, found, lead) if lead else found
         return values
 
     def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
@@ -472,15 +521,15 @@ class SCM:
         if steps is None:
             if self.is_temporal:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])
-            solved = self.solve(key=NoiseKey(noise, first, 0, n))
-            return {name: self._spread(name, value, n) for name, value in solved.items()}
+            return self.solve(key=NoiseKey(noise, first, 0, n))
         slices: list[dict[str, Value]] = []
         start = self.begin(key=NoiseKey(noise, first, 0, n)) if steps else {}
         for step in range(steps):
             before = slices[-1] if slices else start
-            solved = self.solve(previous=before, key=NoiseKey(noise, first, step, n))
-            slices.append({name: self._spread(name, v, n) for name, v in solved.items()})
+            slices.append(self.solve(previous=before, key=NoiseKey(noise, first, step, n)))
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
 
-    def _spread(self, name: str, value: Value, n: int) -> Value:
-        return np.broadcast_to(value, (n, *self._declared[name].shape))
+    def _spread(self, name: str, value: Value, lead: tuple[int, ...]) -> Value:
+        """Give a value its batch axes, where it has none."""
+        shape = self._declared[name].shape
+        return value if np.ndim(value) > len(shape) else np.broadcast_to(value, (*lead, *shape))

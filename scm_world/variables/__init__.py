@@ -1,7 +1,21 @@
 """Typed variables, their spaces, their noise, and what can be done to them."""
 
 from scm_world.variables.bundles import bundle, divided, part_of, whole_of
-from scm_world.variables.distributions import Cylinder, Distribution, Normal
+from scm_world.variables.distributions import (
+    Bernoulli,
+    Categorical,
+    Continuous,
+    Cylinder,
+    Discrete,
+    Distribution,
+    Empirical,
+    Exponential,
+    Gamma,
+    Gumbel,
+    Laplace,
+    Normal,
+    StudentT,
+)
 from scm_world.variables.interventions import (
     SOFT,
     Draw,
@@ -24,7 +38,7 @@ from scm_world.variables.kinds import (
     Variable,
     names,
 )
-from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear
+from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear, Table
 from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import (
     Affine,
@@ -46,21 +60,30 @@ __all__ = [
     "Affine",
     "AnyVariable",
     "B",
+    "Bernoulli",
     "Box",
+    "Categorical",
     "Categories",
     "Concatenation",
+    "Continuous",
     "Cylinder",
     "Derived",
+    "Discrete",
     "Distribution",
     "Draw",
     "Either",
+    "Empirical",
     "Equation",
     "Exogenous",
+    "Exponential",
     "Fixed",
     "Function",
+    "Gamma",
+    "Gumbel",
     "Hard",
     "Integers",
     "Intervention",
+    "Laplace",
     "Linear",
     "Measured",
     "Mechanism",
@@ -73,8 +96,10 @@ __all__ = [
     "Scale",
     "Shift",
     "Space",
+    "StudentT",
     "Subset",
     "Switch",
+    "Table",
     "Variable",
     "bundle",
     "divided",

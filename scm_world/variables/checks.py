@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from scm_world.errors import (
 from scm_world.variables.interventions import Draw
 from scm_world.variables.kinds import SPACES, SpaceName, Variable
 from scm_world.variables.noise import Noise
-from scm_world.variables.spaces import Space
+from scm_world.variables.spaces import Categories, Space
 from scm_world.variables.subsets import Subset
 
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
@@ -28,6 +29,8 @@ _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 
 def _expected(variable: Variable) -> str:
     noun = {"real": "numbers", "integer": "whole numbers", "categorical": "whole numbers"}
+    if isinstance(variable.bounds, Categories) and variable.bounds.labels:
+        noun["categorical"] = " or ".join(map(repr, variable.bounds.labels))
     where = f" of shape {variable.shape}" if variable.shape else ""
     drawn = [f'Draw("{name}")' for name in SPACES if variable.space(name) is not None]
     return f"{noun[variable.dtype]}{where}" + (f", or {', '.join(drawn)}" if drawn else "")
@@ -44,6 +47,9 @@ def coerce(variable: Variable, value: Any) -> Value:
         WrongShape: It has another shape.
         NotFinite: It has a NaN or an infinity.
     """
+    if isinstance(variable.bounds, Categories) and variable.bounds.labels:
+        with suppress(KeyError, ValueError, TypeError):  # refused below
+            value = variable.bounds.numbers(value)
     if np.ma.isMaskedArray(value):  # there is something under the mask
         raise WrongType(variable.name, value, _expected(variable))
     try:

@@ -1,11 +1,12 @@
-"""Distributions: spaces, which stand for the uniform one, and the normal one."""
+"""Distributions: spaces, which stand for the uniform one, and those of statistics."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, final
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from scm_world._types import Floats, Value, Values
 from scm_world.variables.spaces import (
@@ -103,8 +104,170 @@ class Cylinder(Frozen):
         return f"uniform by volume over {self.box.describe(shape, values)}"
 
 
+@final
+class Continuous(Frozen):
+    """A continuous distribution of scipy, by its name there, component by component.
+
+    ``Laplace``, ``Exponential``, ``Gamma``, ``StudentT`` and ``Gumbel`` make the usual ones.
+
+    Attributes:
+        family: Name of the distribution in ``scipy.stats``.
+        parameters: Its arguments, ``loc`` and ``scale`` among them.
+
+    Example:
+        >>> Continuous("beta", a=2.0, b=5.0).describe((), {})
+        'beta(a=2, b=5)'
+    """
+
+    kind: Literal["continuous"] = "continuous"
+    family: str
+    parameters: dict[str, float] = Field(default_factory=dict)
+
+    def __init__(self, family: str, **parameters: Any) -> None:
+        given = parameters.pop("parameters", parameters)
+        super().__init__(family=family, parameters=given)
+
+    @cached_property
+    def frozen(self) -> Any:
+        """The distribution of scipy, with its parameters."""
+        from scipy import stats
+
+        family = getattr(stats, self.family, None)
+        if not isinstance(family, stats.rv_continuous):
+            raise ValueError(f"{self.family!r} is no continuous distribution of scipy.stats")
+        try:
+            frozen = family(**self.parameters)
+        except TypeError as error:
+            raise ValueError(f"scipy.stats.{self.family}: {error}") from None
+        if not np.isfinite(frozen.median()):
+            raise ValueError(f"{self.describe((), {})} is no distribution")
+        return frozen
+
+    @model_validator(mode="after")
+    def _exists(self) -> Self:
+        self.frozen.support()
+        return self
+
+    def parents(self) -> frozenset[str]:
+        """Name the variables that it depends on: there are none."""
+        return frozenset()
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes: one for each component."""
+        return int(np.prod(shape))
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn uniform numbers into quantiles."""
+        inside = uniforms.reshape(*uniforms.shape[:-1], *shape) + 2.0**-54  # never 0
+        return np.asarray(self.frozen.ppf(inside))
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the distribution down."""
+        return f"{self.family}({', '.join(f'{k}={v:g}' for k, v in self.parameters.items())})"
+
+
+def Laplace(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802 # a distribution
+    """Give the Laplace distribution; its standard deviation is √2 times the scale."""
+    return Continuous("laplace", loc=loc, scale=scale)
+
+
+def Exponential(scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
+    """Give the exponential distribution, whose mean is the scale (plus ``loc``)."""
+    return Continuous("expon", loc=loc, scale=scale)
+
+
+def Gamma(shape: float, scale: float = 1.0, loc: float = 0.0) -> Continuous:  # noqa: N802
+    """Give the gamma distribution, whose mean is shape times scale (plus ``loc``)."""
+    return Continuous("gamma", a=shape, loc=loc, scale=scale)
+
+
+def StudentT(df: float, loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
+    """Give Student's t distribution with ``df`` degrees of freedom."""
+    return Continuous("t", df=df, loc=loc, scale=scale)
+
+
+def Gumbel(loc: float = 0.0, scale: float = 1.0) -> Continuous:  # noqa: N802
+    """Give the Gumbel distribution of maxima."""
+    return Continuous("gumbel_r", loc=loc, scale=scale)
+
+
+@final
+class Discrete(Frozen):
+    """A few numbers, each with a probability, component by component.
+
+    ``Bernoulli``, ``Categorical`` and ``Empirical`` make the usual ones.
+
+    Attributes:
+        values: The numbers.
+        probabilities: Of each; all alike if None.
+
+    Example:
+        >>> Discrete((0, 10), (0.25, 0.75)).transform(np.array([[0.2], [0.3]]), (), {})
+        array([ 0, 10])
+    """
+
+    kind: Literal["discrete"] = "discrete"
+    values: tuple[int, ...] | tuple[float, ...] = Field(min_length=1)
+    probabilities: tuple[float, ...] | None = None
+
+    def __init__(self, values: Any, probabilities: Any = None, **fields: Any) -> None:
+        listed = np.ravel(values).tolist()
+        chances = None if probabilities is None else tuple(np.ravel(probabilities).tolist())
+        super().__init__(values=tuple(listed), probabilities=chances, **fields)
+
+    @model_validator(mode="after")
+    def _sums_to_one(self) -> Self:
+        chances = self.chances
+        if chances.shape != (len(self.values),) or not np.all(chances >= 0.0):
+            raise ValueError(f"{len(self.values)} values need as many probabilities, none negative")
+        if abs(chances.sum() - 1.0) > 1e-9:
+            raise ValueError(f"probabilities sum to {chances.sum():g}, not to 1")
+        return self
+
+    @property
+    def chances(self) -> Floats:
+        """The probability of each value, shape (n,)."""
+        n = len(self.values)
+        return np.full(n, 1.0 / n) if self.probabilities is None else np.array(self.probabilities)
+
+    def parents(self) -> frozenset[str]:
+        """Name the variables that it depends on: there are none."""
+        return frozenset()
+
+    def n_uniforms(self, shape: tuple[int, ...]) -> int:
+        """Count the uniform numbers that one draw takes: one for each component."""
+        return int(np.prod(shape))
+
+    def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
+        """Turn uniform numbers into values."""
+        unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
+        ends = np.cumsum(self.chances)[:-1]
+        return np.asarray(self.values)[np.searchsorted(ends, unit, side="right")]
+
+    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+        """Write the distribution down."""
+        pairs = zip(self.values[:5], self.chances.tolist(), strict=False)
+        more = ", …" if len(self.values) > 5 else ""
+        return "{" + ", ".join(f"{value:g}: {p:g}" for value, p in pairs) + more + "}"
+
+
+def Bernoulli(p: float) -> Discrete:  # noqa: N802
+    """Give 1 with probability ``p``, else 0."""
+    return Discrete((0, 1), (1.0 - p, p))
+
+
+def Categorical(probabilities: Any, values: Any = None) -> Discrete:  # noqa: N802
+    """Give whole numbers with probabilities: 0, 1, … unless others are given."""
+    return Discrete(range(np.size(probabilities)) if values is None else values, probabilities)
+
+
+def Empirical(sample: Any) -> Discrete:  # noqa: N802
+    """Give the numbers of a sample, each as often as it is there."""
+    return Discrete(np.ravel(np.asarray(sample, dtype=float)))
+
+
 Distribution = Annotated[
-    Box | Integers | Categories | Either | Rotations | Normal | Cylinder,
+    Box | Integers | Categories | Either | Rotations | Normal | Cylinder | Continuous | Discrete,
     Field(discriminator="kind"),
 ]
 """Anything one can draw from; a space stands for the uniform distribution over it."""

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.kinds import SPACES, AsMechanism, AsParents, Parent, SpaceName
-from scm_world.variables.mechanisms import Function, Linear
+from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table
 from scm_world.variables.spaces import Frozen
 
 Number = float | tuple[float, ...]
@@ -32,9 +32,10 @@ def _number(what: str, value: Any) -> Any:
     return tuple(given.ravel().tolist()) if given.ndim else value
 
 
-def _without_bundle(data: dict[str, Any]) -> dict[str, Any]:
-    """Leave out of written data what is only there in parts of a bundle."""
-    return {name: value for name, value in data.items() if name != "of" or value is not None}
+def _without_bundle(data: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Leave out of written data what is mostly None, such as the bundle that a part is of."""
+    rare = names or ("of",)
+    return {name: value for name, value in data.items() if name not in rare or value is not None}
 
 
 @final
@@ -120,9 +121,14 @@ class Mechanism(Frozen):
     default), a state is set to what the function gives at that instant, and an action follows
     anything at every step: then the function is the policy.
 
+    Noise stays what it is: a function that takes ``noise`` is given the same numbers as the one
+    that it replaces. With ``noise`` alone, function and parents stay, and the noise is another one.
+
     Attributes:
-        function: Called with the values of the parents, in their order.
+        function: Called with the values of the parents, in their order, and with ``noise=`` if it
+            takes that; None for the variable's own.
         parents: The causes; the graph then has these edges in place of the others.
+        noise: Distribution of the noise; that of the variable if None.
         of: A bundle that the function gives as a whole; the variable gets its part of it.
 
     Example:
@@ -132,18 +138,29 @@ class Mechanism(Frozen):
     """
 
     kind: Literal["mechanism"] = "mechanism"
-    function: AsMechanism
-    parents: AsParents
+    function: AsMechanism | None = None
+    parents: AsParents = ()
+    noise: Distribution | None = None
     of: str | None = None
 
     @model_serializer(mode="wrap")
     def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _without_bundle(handler(self))
+        return _without_bundle(handler(self), "of", "noise")
 
-    def __init__(self, function: Any, parents: Any = (), **fields: Any) -> None:
+    @property
+    def equation(self) -> Function | Linear | Concatenation | Table:
+        """The function; ``do`` has put that of the variable in the place of None."""
+        if self.function is None:
+            raise ModelError(["a mechanism without a function is complete only in a model"])
+        return self.function
+
+    def __init__(self, function: Any = None, parents: Any = (), **fields: Any) -> None:
         named = (parents,) if isinstance(parents, str | Parent) else tuple(parents)
-        if not (callable(function) or isinstance(function, Function | Linear | dict)):
-            allowed = ("a function of the parents", "Function", "Linear")
+        known = (Function, Linear, Concatenation, Table, dict)
+        if function is None and fields.get("noise") is not None and not named:
+            pass
+        elif not (callable(function) or isinstance(function, known)):
+            allowed = ("a function of the parents", "Function", "Linear", "Table")
             raise UnknownOption("Mechanism(function)", function, allowed)
         super().__init__(function=function, parents=named, **fields)
 

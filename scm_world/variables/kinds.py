@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, WrapValidator, model_validator
 
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
-from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear
+from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear, Table
 from scm_world.variables.spaces import (
     Box,
     Categories,
@@ -37,7 +37,9 @@ def _as_number(value: Any) -> Any:
 
 def _as_mechanism(value: Any) -> Any:
     return (
-        Function(value) if callable(value) and not isinstance(value, Function | Linear) else value
+        Function(value)
+        if callable(value) and not isinstance(value, Function | Linear | Table)
+        else value
     )
 
 
@@ -258,11 +260,14 @@ class Exogenous(Variable):
     Attributes:
         default: The value without a draw.
         distribution: Where ``sample`` draws from; None for the default.
+        per: When it is drawn in a model with lagged edges: once for an ``"episode"``, as a
+            parameter is, or anew in every ``"step"``.
     """
 
     kind: Literal["exogenous"] = "exogenous"
     default: AsNumber = 0.0
     distribution: Distribution | None = None
+    per: Literal["episode", "step"] = "episode"
 
     @property
     def all_parents(self) -> tuple[Parent, ...]:
@@ -287,6 +292,9 @@ class Derived(Variable):
         parents: Its causes, in the order in which the mechanism takes them.
         mechanism: The function.
         noise: Distribution of its own noise, or None. The mechanism takes it as ``noise=``.
+        noise_shape: Shape of the noise; that of the variable if None.
+        inverse_noise: The function from a value of this variable, and those of the parents, to its
+            noise. ``SCM.counterfactual`` needs it where it cannot invert the mechanism itself.
         start: The value that lagged children see before the first step.
         inverse: For other coordinates of one quantity (cylindrical for Cartesian): the function
             from a value of this variable to the one of its only parent. An intervention on this
@@ -297,8 +305,10 @@ class Derived(Variable):
     parents: AsParents
     mechanism: AsMechanism
     noise: Distribution | None = None
+    noise_shape: tuple[int, ...] | None = None
     start: AsNumber = 0.0
     inverse: AsMechanism | None = None
+    inverse_noise: AsMechanism | None = None
 
     @property
     def all_parents(self) -> tuple[Parent, ...]:
@@ -310,13 +320,29 @@ class Derived(Variable):
         """The parents of a bundle; nothing for other variables."""
         return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _tables_have_uniform_noise(cls, data: Any) -> Any:
+        if isinstance(data, dict) and isinstance(data.get("mechanism"), Table):
+            return {"noise": Box(0.0, 1.0), **data}
+        return data
+
     @model_validator(mode="after")
     def _fits(self) -> Derived:
         if self.inverse is not None and len(self.parents) != 1:
             raise ValueError(f"{self.name}: coordinates have exactly one parent")
-        weights = self.mechanism.weights if isinstance(self.mechanism, Linear) else self.parents
-        if len(weights) != len(self.parents):
-            raise ValueError(f"{self.name}: {len(weights)} weights for {len(self.parents)} parents")
+        expected: Any = self.parents
+        match self.mechanism:
+            case Linear(weights=weights):
+                expected = weights
+            case Table(shape=shape):
+                expected = shape[:-1]
+        if len(expected) != len(self.parents):
+            raise ValueError(
+                f"{self.name}: {len(expected)} weights for {len(self.parents)} parents"
+            )
+        if self.noise is None and (self.noise_shape is not None or self.inverse_noise is not None):
+            raise ValueError(f"{self.name}: noise_shape and inverse_noise need a noise")
         return self
 
 

@@ -8,10 +8,11 @@ noise, with ``noise=``. Values carry leading batch axes; write ``size[..., 2] / 
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Callable, Iterable
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self, final
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -174,6 +175,14 @@ class Function(Frozen):
         """Give a callable with the constants filled in; always the same one."""
         return self._bound
 
+    @property
+    def takes_noise(self) -> bool:
+        """Whether the function has an argument ``noise``."""
+        try:
+            return "noise" in inspect.signature(self.resolve()).parameters
+        except (TypeError, ValueError):  # a function in C says nothing
+            return False
+
     @cached_property
     def _bound(self) -> Callable[..., Any]:
         function = self.resolve()
@@ -253,6 +262,7 @@ class Linear(Frozen):
     kind: Literal["linear"] = "linear"
     weights: tuple[float, ...]
     intercept: float = 0.0
+    takes_noise: ClassVar[bool] = True
 
     def bind(self) -> Callable[..., Any]:
         """Give the function of the parents."""
@@ -288,6 +298,7 @@ class Concatenation(Frozen):
 
     kind: Literal["concatenation"] = "concatenation"
     shapes: tuple[tuple[int, ...], ...]
+    takes_noise: ClassVar[bool] = False
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -330,4 +341,81 @@ class Joined:
         return np.concatenate([np.broadcast_to(f, (*whole, f.shape[-1])) for f in flat], axis=-1)
 
 
-Equation = Annotated[Function | Linear | Concatenation, Field(discriminator="kind")]
+@final
+class Table(Frozen):
+    """A table of conditional probabilities: a category, given those of the parents.
+
+    The noise is uniform on [0, 1]; a variable with a table has it if it declares no other.
+
+    Attributes:
+        probabilities: One after another, the values of the last parent changing fastest.
+        shape: How many values each parent has, and last how many the variable has.
+        given: The values of each parent in the order of the table; 0, 1, … where it is empty.
+        values: Those of the variable in this order; 0, 1, … where it is empty.
+
+    Example:
+        >>> grass = Table([[0.9, 0.1], [0.2, 0.8]])  # wet (1) or dry (0), given rain
+        >>> grass.bind()(np.array([0, 1]), noise=np.array([0.5, 0.5]))
+        array([0, 1])
+    """
+
+    kind: Literal["table"] = "table"
+    probabilities: tuple[float, ...]
+    shape: tuple[int, ...] = ()
+    given: tuple[tuple[int, ...], ...] = ()
+    values: tuple[int, ...] = ()
+    takes_noise: ClassVar[bool] = True
+
+    def __init__(self, probabilities: Any, **fields: Any) -> None:
+        table = np.asarray(probabilities, dtype=float)
+        fields.setdefault("shape", table.shape)
+        super().__init__(probabilities=tuple(table.ravel().tolist()), **fields)
+
+    @model_validator(mode="after")
+    def _holds_probabilities(self) -> Self:
+        sizes = [len(values) for values in self.given]
+        if len(self.probabilities) != int(np.prod(self.shape)) or not self.shape:
+            raise ValueError(f"{len(self.probabilities)} probabilities for a table {self.shape}")
+        if (sizes and sizes != [*self.shape[:-1]]) or len(self.values) not in (0, self.shape[-1]):
+            raise ValueError(f"values of parents, or of the variable, do not fit {self.shape}")
+        sums = self.table.sum(axis=-1)
+        if (self.table < 0.0).any() or not np.allclose(sums, 1.0, rtol=0.0, atol=1e-9):
+            raise ValueError("each row of probabilities is not negative and sums to 1")
+        return self
+
+    @property
+    def table(self) -> Any:
+        """The probabilities, as an array of the shape."""
+        return np.reshape(self.probabilities, self.shape)
+
+    def row(self, *parents: Value) -> Any:
+        """Give the probabilities given the parents, shape (..., number of values).
+
+        Raises:
+            ModelError: A parent has another value.
+        """
+        places = []
+        for axis, parent in enumerate(parents):
+            known = np.asarray(self.given[axis] if self.given else range(self.shape[axis]))
+            found = np.asarray(parent)[..., None] == known
+            if not found.any(axis=-1).all():
+                raise ModelError([f"parent {axis} of a table is {parent}, not in {known.tolist()}"])
+            places.append(found.argmax(axis=-1))
+        return self.table[tuple(places)]
+
+    def bind(self) -> Callable[..., Any]:
+        """Give the function of the parents and of uniform noise."""
+        values = np.asarray(self.values or range(self.shape[-1]))
+
+        def category(*parents: Value, noise: Value | float = 0.0) -> Any:
+            ends = np.cumsum(self.row(*parents), axis=-1)[..., :-1]
+            return values[(ends <= np.asarray(noise)[..., None]).sum(axis=-1)]
+
+        return category
+
+    def is_portable(self) -> bool:
+        """Tell that numbers can always be written down."""
+        return True
+
+
+Equation = Annotated[Function | Linear | Concatenation | Table, Field(discriminator="kind")]

@@ -13,7 +13,15 @@ from operator import gt
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
@@ -318,18 +326,47 @@ class Integers(_Space):
 
 @final
 class Categories(_Space):
-    """A few whole numbers, without an order.
+    """A few whole numbers, without an order, which may have labels.
+
+    Attributes:
+        members: The numbers.
+        labels: Of each; ``do`` takes them in the place of numbers. There may be none.
 
     Example:
         >>> Categories((1, 20)).contains(np.array(20))
         True
+        >>> Categories(labels=("dry", "wet")).members
+        (0, 1)
     """
 
     kind: Literal["categories"] = "categories"
     members: tuple[int, ...] = Field(min_length=1)
+    labels: tuple[str, ...] = ()
 
-    def __init__(self, members: Any, **fields: Any) -> None:
-        super().__init__(members=tuple(members), **fields)
+    def __init__(self, members: Any = None, labels: Any = (), **fields: Any) -> None:
+        found = range(len(labels)) if members is None else members
+        super().__init__(members=tuple(found), labels=tuple(labels), **fields)
+
+    @model_validator(mode="after")
+    def _labels_fit(self) -> Self:
+        if self.labels and len({*self.labels}) != len(self.members):
+            raise ValueError(f"{len(self.members)} categories need as many different labels")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_no_labels(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data: dict[str, Any] = handler(self)
+        return data if self.labels else {k: v for k, v in data.items() if k != "labels"}
+
+    def numbers(self, labels: Any) -> Value:
+        """Give the numbers of labels, of any shape.
+
+        Raises:
+            KeyError: There is no such label.
+        """
+        known = dict(zip(self.labels, self.members, strict=True))
+        found = np.array([known[label] for label in np.ravel(labels).tolist()], dtype=np.int64)
+        return found.reshape(np.shape(labels))
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Tell whether every component is a member."""
@@ -351,8 +388,11 @@ class Categories(_Space):
         return np.asarray(self.members, dtype=np.int64)[index]
 
     def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write the members down."""
-        return "{" + ", ".join(map(str, self.members)) + "}"
+        """Write the members down, with their labels."""
+        if not self.labels:
+            return "{" + ", ".join(map(str, self.members)) + "}"
+        pairs = zip(self.members, self.labels, strict=True)
+        return "{" + ", ".join(f"{member}: {label}" for member, label in pairs) + "}"
 
 
 _Part = Annotated[Box | Integers | Categories, Field(discriminator="kind")]

@@ -12,6 +12,7 @@ import numpy as np
 from scm_world._types import Value, Values
 from scm_world.errors import InterventionError, NotFinite, OutOfBounds, WrongShape
 from scm_world.graph import NoiseKey
+from scm_world.graph.evaluate import noise_of
 from scm_world.variables import (
     SOFT,
     Draw,
@@ -298,7 +299,7 @@ class Solver:
             value = requested.array(act.value)
         elif isinstance(act, Mechanism):
             values = {**self.static, **self._task.states(self.base.state)}
-            value = _followed(requested, act, values)
+            value = _followed(requested, act, values, self._key)
         elif isinstance(act, Natural | Null):
             value = self._coordinates(name)
         elif isinstance(act, Draw):
@@ -448,7 +449,7 @@ def _moving(
     return found
 
 
-def _followed(requested: Variable, act: Mechanism, values: Values) -> Value:
+def _followed(requested: Variable, act: Mechanism, values: Values, key: NoiseKey) -> Value:
     """Compute the value that a state is set to.
 
     Raises:
@@ -463,5 +464,6 @@ def _followed(requested: Variable, act: Mechanism, values: Values) -> Value:
             variable=requested.name,
             value=act,
         )
-    found: Any = act.function.bind()(*(np.array(values[p.name]) for p in act.parents))
+    given = (np.array(values[p.name]) for p in act.parents)
+    found: Any = act.equation.bind()(*given, **noise_of(requested, act, key, values))
     return coerce(requested, found)
