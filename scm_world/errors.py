@@ -17,6 +17,7 @@ allowed and what to do::
     │   ├── ClosesCycle          a mechanism that makes variables cause one another at lag 0
     │   ├── Infeasible           two bodies in one place, or a body outside the arena
     │   └── SeveralProblems      more than one of the above
+    ├── ImpossibleObservation    values that a causal model cannot give (a ModelError)
     ├── CyclicModel              a causal model with contemporaneous cycles (a ModelError)
     ├── ActionError              an action the robot cannot take
     ├── NotReset                 a world that was never reset
@@ -54,6 +55,7 @@ __all__ = [
     "EngineFailure",
     "EvaluationError",
     "Forbidden",
+    "ImpossibleObservation",
     "Infeasible",
     "InterventionError",
     "MissingEngine",
@@ -155,6 +157,18 @@ class ModelError(ScmWorldError, ValueError):
         self.problems = tuple(problems)
         lines = "\n".join(f"  - {problem}" for problem in self.problems)
         super().__init__(f"the model has {len(self.problems)} problem(s):\n{lines}")
+
+
+class ImpossibleObservation(ModelError):
+    """An observation that the model cannot give.
+
+    Attributes:
+        variable: The variable that was observed.
+    """
+
+    def __init__(self, variable: str, reason: str) -> None:
+        self.variable = variable
+        super().__init__([f"{variable!r}: {reason}"])
 
 
 class CyclicModel(ModelError):

@@ -59,8 +59,6 @@ class NoiseKey:
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
     ) -> Value:
         """Draw what a variable has by itself, without intervention."""
-        if self.given is not None and name in self.given:
-            return self.given[name]
         key = replace(self, attempt=0) if self.attempt else self
         if self.origin is not None:
             key = replace(key, step=self.origin, origin=None)
@@ -75,6 +73,8 @@ class NoiseKey:
         stream: str | None = None,
     ) -> Value:
         """Draw a value of a variable, shape ``(count, *shape)`` or ``shape``."""
+        if stream is None and self.given is not None and name in self.given:
+            return self.given[name]
         own = name if stream is None else f"{stream}/{name}"
         drawn = self.noise.draw(
             source,
@@ -182,6 +182,8 @@ class Evaluator:
             if getattr(requested, "per", "step") == "episode" and key.origin is None:
                 key = replace(key, step=0)
             source, stream = source_of(act), getattr(act.intervention, "stream", None)
+            if stream is None and key.origin is None and key.given is None:
+                stream = "do"  # of a model; a world counts its draws
             value = key.draw(source, requested.name, requested.shape, values, stream)
         return self._given(requested, name, value)
 

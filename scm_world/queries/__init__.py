@@ -1,6 +1,7 @@
 """Questions to a world: what follows, what would have followed, and whether the graph is right."""
 
 from scm_world.policies.scripted import Random
+from scm_world.queries.abduction import Counterfactuals
 from scm_world.queries.agreement import Agreement
 from scm_world.queries.consequences import Consequence, Consequences, consequences
 from scm_world.queries.differences import ButFor, Divergence, EpisodeDifference, but_for, compare
@@ -37,6 +38,7 @@ __all__ = [
     "Consequence",
     "Consequences",
     "Contact",
+    "Counterfactuals",
     "Divergence",
     "Effect",
     "Episode",

@@ -93,8 +93,10 @@ class Effect:
     def __str__(self) -> str:
         how = "paired" if self.paired else "unpaired"
         ratio = _show(self.variance_ratio)
+        varies = not bool(np.isnan(self.low).all())
+        ends = f" [{_show(self.low)}, {_show(self.high)}]" if varies else ""
         return (
-            f"{self.outcome}: {_show(self.mean)} [{_show(self.low)}, {_show(self.high)}], "
+            f"{self.outcome}: {_show(self.mean)}{ends} under {self.do} versus {self.versus}, "
             f"n = {self.n} {how}, variance unpaired : paired {ratio}"
             + (f"; {self.caution}" if self.caution else "")
         )

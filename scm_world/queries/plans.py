@@ -6,13 +6,23 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, final
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from scm_world.errors import DAMAGED, InterventionError, ModelError
 from scm_world.graph import flatten
 from scm_world.queries.equations import System
 from scm_world.queries.timed import ACTS, TIMED, At, Clamp, On, Timed, as_act
-from scm_world.variables import Function, Hard, Intervention, Mechanism, Natural
+from scm_world.variables import (
+    Draw,
+    Function,
+    Hard,
+    Intervention,
+    Mechanism,
+    Natural,
+    Scale,
+    Shift,
+)
 from scm_world.variables.mechanisms import check_portable, check_trusted
 
 FORMAT = "scm_world/plan/1"
@@ -71,6 +81,12 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def __repr__(self) -> str:
         return f"Plan({self._parts})"
+
+    def __str__(self) -> str:
+        if not self._parts:
+            return "nothing done"
+        acts = (f"{name} = {_short(part)}" for name, parts in self._parts.items() for part in parts)
+        return f"do({', '.join(acts)})"
 
     def do(self, request: Mapping[str, Any]) -> Plan:
         """Give the plan that does this too; where both set a variable, this one counts."""
@@ -156,6 +172,24 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         for _, act in self.acts():
             if isinstance(act, Mechanism) and isinstance(act.function, Function):
                 yield act.function
+
+
+def _short(part: Any) -> str:
+    """Write an intervention down in few words."""
+    match part:
+        case Hard(value=value):
+            return np.array2string(np.asarray(value), precision=4, separator=", ", threshold=9)
+        case At(step=step, act=act):
+            return f"{_short(act)} at {step}"
+        case Clamp(act=act, start=start, stop=stop):
+            return f"{_short(act)} from {start} to {'the end' if stop is None else stop}"
+        case Shift(by=by) | Scale(by=by):
+            return f"{type(part).__name__}({by})"
+        case Draw(source=source):
+            return f"Draw({source!r})"
+        case Mechanism(parents=parents):
+            return f"a function of {', '.join(p.name for p in parents) or 'nothing'}"
+    return f"{type(part).__name__}()"
 
 
 def _parts(value: Any) -> tuple[Any, ...]:

@@ -12,10 +12,11 @@ from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries import samples
+from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.estimates import Effect, effect_of
-from scm_world.queries.outcomes import usual_outcomes
+from scm_world.queries.outcomes import Outcome, usual_outcomes
 from scm_world.queries.plans import Plan
 from scm_world.queries.progress import Progress, part
 from scm_world.queries.rollouts import Unit, as_names, length
@@ -74,36 +75,6 @@ class Questions(ABC):
                 names=as_names(record),
             )
             return Episode(twins, unit, unit.run(world))
-
-    def counterfactual(
-        self,
-        do: Mapping[str, Any] | None = None,
-        *,
-        at: int = 0,
-        actions: Any = "replay",
-        policy: Any = None,
-        seed: int = 0,
-        episode: int = 0,
-        steps: int | None = None,
-        record: Iterable[str] = (),
-    ) -> Episode:
-        """Run an episode and return its counterfactual: an intervention, with the same noise.
-
-        Args:
-            do: The intervention; without a time it takes place at the instant ``at``.
-            at: Number of the control step.
-            actions: ``"replay"`` for the same actions, or a policy that acts from there on.
-            policy: Of the episode; see ``rollout``, also for what follows.
-            seed: Of the noise.
-            episode: Number of the episode within that noise.
-            steps: How many control steps.
-            record: Variables to write down on the way.
-
-        Returns:
-            The episode as it would have been; compare it with ``rollout`` of the same seed.
-        """
-        factual = self.rollout(policy, seed=seed, episode=episode, steps=steps, record=record)
-        return factual.counterfactual(do, at=at, actions=actions, record=record)
 
     def see(
         self,
@@ -188,6 +159,66 @@ class Questions(ABC):
             )
         )
         return effect_of(self._asked()[1], outcome, treated, control, paired=paired)
+
+    def direct_effect(
+        self,
+        outcome: Any,
+        *,
+        do: Mapping[str, Any],
+        versus: Mapping[str, Any] | None = None,
+        mediators: Iterable[str] | Mapping[str, Any],
+        n: int = 100,
+        progress: Progress | None = None,
+        **setting: Any,
+    ) -> Effect:
+        """Estimate the part of an effect that does not go through mediators.
+
+        The *controlled* direct effect holds them at given values in both arms. The *natural* one
+        lets each unit keep, under ``do``, the values that its mediators have under ``versus``.
+
+        Args:
+            outcome: As in ``effect``.
+            do: What is done.
+            versus: The intervention it is compared with; none if None.
+            mediators: Values by name for the controlled effect; names for the natural one.
+            n: How many units.
+            progress: Called after each episode.
+            setting: See ``sample``.
+
+        Returns:
+            The effect, paired.
+
+        Raises:
+            UnknownOption: The natural effect is asked of what has several instants, where a
+                mediator is a whole path: hold it with ``mediators={name: value}``.
+
+        Source:
+            Pearl, *Direct and indirect effects*, UAI 2001, definitions 1 and 3.
+        """
+        if isinstance(mediators, Mapping):
+            arms = ({**given, **mediators} for given in (do, versus or {}))
+            both: dict[str, Any] = {**setting, "n": n, "progress": progress}
+            return self.effect(outcome, do=next(arms), versus=next(arms), **both)
+        names, (twins, system) = as_names(mediators), self._asked()
+        if not isinstance(system, Equations) or system.model.is_temporal:
+            allowed = ("values of mediators by name, such as {'m': 1.0}: the controlled effect",)
+            raise UnknownOption("mediators of several instants", names, allowed)
+        count = whole_number("n", n, least=2)
+        outcomes = (outcome, *(Outcome(name) for name in names))
+        told = part(progress, 0, 2 * count)
+        control = self.sample(count, versus, outcomes=outcomes, progress=told, **setting)
+        kept = [values for _, values in zip(range(len(names) + 1), control.values(), strict=True)]
+        treated = samples.sample(
+            twins,
+            system,
+            self._with(do),
+            count,
+            outcomes=(outcome,),
+            setting=Setting.of(system, setting),
+            each=[dict(zip(names, row, strict=True)) for row in zip(*kept[1:], strict=True)],
+            progress=part(progress, count, 2 * count),
+        )
+        return effect_of(system, outcome, treated, control)
 
     def effect_over(
         self,
@@ -319,6 +350,62 @@ class SCM(Questions, graph.SCM):
     def graph(self) -> Self:
         """The causal model: this one. A ``World`` has one beside its backend."""
         return self
+
+    def counterfactual(
+        self,
+        observed: Any,
+        do: Mapping[str, Any] | None = None,
+        *,
+        n: int | None = None,
+        seed: int = 0,
+        tolerance: float = 1e-6,
+    ) -> Counterfactuals:
+        """Say what units that were observed would have been under an intervention.
+
+        Abduction finds the noise of each unit from its observed values; then the model is solved
+        again under the intervention, with the same noise. The noise of what was observed follows
+        exactly if it is added, if the mechanism is monotone in it, or if there is an
+        ``inverse_noise``; where several values of the noise are possible, and where a variable was
+        not observed, it is drawn given the observations. The replay of a simulated episode, whose
+        noise is known, is ``rollout(…).counterfactual(do)``.
+
+        Args:
+            observed: Values by name, of some or all variables: a row (values of the shape of the
+                variable), or a table (with a leading axis, or a data frame); NaN where there is
+                none. With lagged edges, a column has the control steps before the shape.
+            do: The intervention; the observations were made without it.
+            n: How many draws of what is not known of each unit; 1 where everything follows
+                exactly, and 1000 elsewhere, if None.
+            seed: Of the draws.
+            tolerance: How far a value may lie from what follows of its causes, relative to one plus
+                its size.
+
+        Returns:
+            Values by name, with what they were, weights and effective number of draws.
+
+        Raises:
+            ImpossibleObservation: The model cannot give it; the error names the variable.
+            ModelError: A mechanism cannot be inverted; the error says what to declare.
+            InterventionError: The intervention was refused.
+
+        Example:
+            >>> from scm_world.variables import Derived, Exogenous, Linear, Normal
+            >>> model = SCM([
+            ...     Exogenous(name="x", distribution=Normal()),
+            ...     Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,)),
+            ...             noise=Normal()),
+            ... ])
+            >>> found = model.counterfactual({"x": 1.0, "y": 2.5}, do={"x": 3.0})
+            >>> print(found["y"], found.exact)
+            6.5 True
+        """
+        if do is None:
+            allowed = (
+                "what is done, as in counterfactual(observed, do={…})",
+                "a replay of a simulated unit, rollout(seed=…).counterfactual({…})",
+            )
+            raise UnknownOption("do", do, allowed)
+        return counterfactuals(self, observed, do, n=n, seed=seed, tolerance=tolerance)
 
     def given(self, do: Mapping[str, Any]) -> Self:
         """Give the model in which this is done too: the same as ``do``."""

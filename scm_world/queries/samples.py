@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -190,6 +190,7 @@ def sample(
     outcomes: Iterable[Any],
     setting: Setting,
     first: int = 0,
+    each: Sequence[Mapping[str, Any]] = (),
     progress: Progress | None = None,
 ) -> Samples:
     """Run episodes under an intervention, and read outcomes off them.
@@ -202,6 +203,7 @@ def sample(
         outcomes: What to read off: names of variables, ``Outcome`` or functions of the episode.
         setting: The circumstances.
         first: Number of the first episode.
+        each: What is done in each of them besides.
         progress: Called after each episode.
     """
     count = whole_number("n", n, least=1)
@@ -224,10 +226,13 @@ def sample(
     numbers, plan = range(first, first + count), setting.plan(world, do)
     unit = setting.unit(world, plan, first, names)
     units = [replace(unit, number=number) for number in numbers]
+    if each:
+        several = [((0, plan.do(more)),) for more in each]
+        units = [replace(one, layers=own) for one, own in zip(units, several, strict=True)]
     if isinstance(twins, EquationTwins) and all(isinstance(one, Outcome) for one in wanted):
         vectors = paths(twins, units)
-        each = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)
-        found = [as_numbers(values) for values in each]
+        read_off = (one.of_many(twins.layout.read(one.name, vectors)) for one in wanted)
+        found = [as_numbers(values) for values in read_off]
         if progress is not None:
             progress(count, count)
     else:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Self, final
 
 from scm_world._types import Floats
 from scm_world.backends import Backend
+from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import System
 from scm_world.queries.plans import Key, Plan, Schedule
 from scm_world.queries.questions import Questions
@@ -175,6 +176,36 @@ class World(Simulation, Questions):
             if due:
                 other.do(due)
         return other
+
+    def counterfactual(
+        self,
+        do: Mapping[str, Any] | None = None,
+        *,
+        at: int = 0,
+        actions: Any = "replay",
+        policy: Any = None,
+        seed: int = 0,
+        episode: int = 0,
+        steps: int | None = None,
+        record: Iterable[str] = (),
+    ) -> Episode:
+        """Run an episode and return its counterfactual: an intervention, with the same noise.
+
+        Args:
+            do: The intervention; without a time it takes place at the instant ``at``.
+            at: Number of the control step.
+            actions: ``"replay"`` for the same actions, or a policy that acts from there on.
+            policy: Of the episode; see ``rollout``, also for what follows.
+            seed: Of the noise.
+            episode: Number of the episode within that noise.
+            steps: How many control steps.
+            record: Variables to write down on the way.
+
+        Returns:
+            The episode as it would have been; compare it with ``rollout`` of the same seed.
+        """
+        factual = self.rollout(policy, seed=seed, episode=episode, steps=steps, record=record)
+        return factual.counterfactual(do, at=at, actions=actions, record=record)
 
     def __enter__(self) -> Self:
         return self

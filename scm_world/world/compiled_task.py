@@ -347,6 +347,7 @@ class StepBase:
         pending: The interventions at this step so far.
         at_start: Whether an episode is just beginning.
         fresh: States of bodies that come into being.
+        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
     """
 
     compiled: CompiledTask
@@ -357,6 +358,7 @@ class StepBase:
     pending: PendingInterventions = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
+    drawn: Mapping[str, int] = field(default_factory=dict)
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for anything else."""

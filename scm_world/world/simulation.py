@@ -410,6 +410,7 @@ class Simulation(WorldAttributes):
         flat = flatten(request, twice)
         base = self._base or self._step_base()
         twice += self._wrong_actions(flat)
+        flat, drawn = self._anew(flat, base)
         region = self.variables_space if space is None else space
         key = self.noise_key(self._index)
         earlier = self._earlier
@@ -420,8 +421,27 @@ class Simulation(WorldAttributes):
         )
         audit = self._commit(plan, change, flat, check, at_start=base.at_start)
         self._earlier = earlier or carried_out(self.structures, base, flat, region, plan)
-        self._base = replace(base, pending=plan.pending)
+        self._base = replace(base, pending=plan.pending, drawn=drawn)
         return audit
+
+    def _anew(
+        self, request: Mapping[str, Any], base: StepBase
+    ) -> tuple[dict[str, Any], dict[str, int]]:
+        """Give draws noise that no earlier draw of the variable had at this instant.
+
+        Returns:
+            The request, and how often each variable has been drawn then.
+        """
+        drawn, found = dict(base.drawn), dict(request)
+        for name, act in request.items():
+            if not (isinstance(act, Draw) and act.stream is None and act.of is None):
+                continue
+            nature = base.at_start and name in base.compiled.random
+            times = drawn.get(name, int(nature))
+            drawn[name] = times + 1
+            if times:
+                found[name] = act.model_copy(update={"stream": f"draw {times}"})
+        return found, drawn
 
     def _wrong_actions(self, request: Mapping[str, Any]) -> list[InterventionError]:
         """List mechanisms of actions that give no action at this instant."""
@@ -632,6 +652,7 @@ class Simulation(WorldAttributes):
             plan=base.compiled.plan,
             vector=base.state.vector.copy(),
             pending=dict(base.pending),
+            drawn=dict(base.drawn),
             at_start=base.at_start,
         )
         static, engine = self._values.static, self.backend.snapshot()
@@ -766,6 +787,7 @@ class Simulation(WorldAttributes):
             whole_number("index", saved.index, least=0),
             dict(saved.pending),
             saved.at_start,
+            drawn={str(name): int(times) for name, times in saved.drawn.items()},
         )
 
     def _check_restored(self, present: StepBase) -> None:

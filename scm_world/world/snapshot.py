@@ -45,6 +45,7 @@ class WorldSnapshot:
         vector: Of a base: where everything is.
         pending: Of a base: what was asked for since.
         at_start: Of a base: whether an episode was just beginning.
+        drawn: Of a base: how often each variable has been drawn since.
     """
 
     engine: EngineSnapshot | bytes | None
@@ -63,6 +64,7 @@ class WorldSnapshot:
     vector: Floats = field(default_factory=lambda: np.zeros(0))
     pending: PendingInterventions = field(default_factory=dict)
     at_start: bool = False
+    drawn: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def static(self) -> dict[str, Value]:
