@@ -21,6 +21,7 @@ from scm_world.errors import (
     EngineFailure,
     EvaluationError,
     Forbidden,
+    ImpossibleObservation,
     Infeasible,
     InterventionError,
     MissingEngine,
@@ -56,6 +57,11 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         UnknownVariable("tool_blok.mass", ["floor_friction", "tool_block.mass"]),
         "no variable is named 'tool_blok.mass'; did you mean 'tool_block.mass'?",
         {"variable": "tool_blok.mass", "suggestion": "tool_block.mass"},
+    ),
+    (
+        ImpossibleObservation("x", "no value of its noise gives what was observed"),
+        "the model has 1 problem(s):\n  - 'x': no value of its noise gives what was observed",
+        {"variable": "x"},
     ),
     (
         UnknownVariable("zzz", ["tool_block.mass"]),

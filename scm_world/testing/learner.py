@@ -49,7 +49,7 @@ def table(kind: str) -> Dataset:
         if kind == "observational"
         else Design("single", targets, DONE, observational_fraction=0.3)
     )
-    return collect(collider(), design, ROWS, seed=5)
+    return collect(collider(), design, ROWS, seed=6)
 
 
 def _numpys() -> Any:
