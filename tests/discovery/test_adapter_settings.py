@@ -60,7 +60,12 @@ def test_settings_are_used_and_noted() -> None:
     pytest.importorskip("gies")
     found = learn("gies", DATA, penalty=1000.0, phases=["forward"])
     assert not found.edges.any()
-    assert found.settings == {"penalty": 1000.0, "phases": ["forward"], "iterate": True}
+    assert found.settings == {
+        "penalty": 1000.0,
+        "phases": ["forward"],
+        "iterate": True,
+        "intercept": "regime",
+    }
     assert EstimatedGraph.from_dict(found.as_dict()).settings == found.settings
 
 
