@@ -69,21 +69,56 @@ def random_model(name: str, seed: int = 0) -> SCM:
     return FAMILIES[family](int(size), seed)
 
 
-def _erdos_renyi(n: int, seed: int) -> SCM:
+def _erdos_renyi(n: int, seed: int, kind: str = "linear", number: int = 1) -> SCM:
     """Erdős–Rényi DAG, 2 edges per node, linear Gaussian."""
-    rng = np.random.default_rng([seed, n, 1])
+    rng = np.random.default_rng([seed, n, number])
     chance = min(1.0, 2.0 * PER_NODE / (n - 1))
-    return _linear(np.triu(rng.random((n, n)) < chance, 1), rng)
+    return _on_graph(np.triu(rng.random((n, n)) < chance, 1), rng, kind)
 
 
-def _scale_free(n: int, seed: int) -> SCM:
-    """Scale-free DAG (Barabási–Albert, 2 per node), linear Gaussian."""
+def _scale_free(n: int, seed: int, *, hubs_last: bool = False) -> SCM:
+    """Scale-free DAG (Barabási–Albert, 2 per node), linear Gaussian; hubs are causes."""
     rng = np.random.default_rng([seed, n, 2])
     drawn = nx.barabasi_albert_graph(n, min(PER_NODE, n - 1), seed=int(rng.integers(2**31)))
     upper = np.zeros((n, n), bool)
     for one, other in drawn.edges:
         upper[min(one, other), max(one, other)] = True  # hubs come early: they cause much
-    return _linear(upper, rng)
+    return _on_graph(upper[::-1, ::-1].T if hubs_last else upper, rng)
+
+
+def _hubs_last(n: int, seed: int) -> SCM:
+    """Scale-free DAG, linear Gaussian; hubs are effects."""
+    return _scale_free(n, seed, hubs_last=True)
+
+
+def _networks(n: int, seed: int) -> SCM:
+    """Erdős–Rényi DAG, a random network of ten tanh units for each variable."""
+    return _erdos_renyi(n, seed, "network", 4)
+
+
+def _processes(n: int, seed: int) -> SCM:
+    """Erdős–Rényi DAG, a function of a Gaussian process (length 1) for each variable."""
+    return _erdos_renyi(n, seed, "process", 5)
+
+
+def _sines(n: int, seed: int) -> SCM:
+    """Erdős–Rényi DAG, a weighted sum of a sine of each cause."""
+    return _erdos_renyi(n, seed, "sine", 6)
+
+
+def _standardised(n: int, seed: int) -> SCM:
+    """Erdős–Rényi DAG, linear Gaussian, every variable with variance 1 (iSCM)."""
+    return _erdos_renyi(n, seed, "standardised", 7)
+
+
+def _uneven(n: int, seed: int) -> SCM:
+    """Erdős–Rényi DAG, linear, the spread of the noise depends on the causes."""
+    return _erdos_renyi(n, seed, "uneven", 8)
+
+
+def _heavy(n: int, seed: int) -> SCM:
+    """Erdős–Rényi DAG, linear, noise with heavy tails (kurtosis 11.7)."""
+    return _erdos_renyi(n, seed, "heavy", 9)
 
 
 def _one_step(n: int, seed: int) -> SCM:
@@ -111,20 +146,92 @@ def tanh_of_sum(*parents: Value, noise: Value | float = 0.0, weights: Floats) ->
     return np.tanh(total) + noise
 
 
-def _linear(upper: NDArray[np.bool_], rng: np.random.Generator) -> SCM:
-    """Draw weights for the edges of a causal order, shuffle the order, add unit Gaussian noise."""
+def layer(
+    *parents: Value,
+    noise: Value | float = 0.0,
+    inner: Floats,
+    phase: Floats,
+    outer: Floats,
+    wave: float,
+) -> Any:
+    """Return a network with one layer of tanh, or of cosines, plus noise."""
+    if not parents:
+        return noise
+    x = np.stack(np.broadcast_arrays(*parents), axis=-1)
+    bent = x @ np.reshape(inner, (len(parents), -1)) + np.asarray(phase)
+    return (np.cos(bent) if wave else np.tanh(bent)) @ np.asarray(outer) + noise
+
+
+def uneven(*parents: Value, noise: Value | float = 0.0, weights: Floats, spread: Floats) -> Any:
+    """Return a weighted sum, plus noise whose spread depends on another weighted sum."""
+    total = sum((w * x for w, x in zip(weights, parents, strict=True)), np.zeros(()))
+    size = sum((w * x for w, x in zip(spread, parents, strict=True)), np.zeros(()))
+    return total + noise * np.exp(np.tanh(size))
+
+
+def heavy(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
+    """Return a weighted sum, plus noise squared with its sign, of variance 1."""
+    total = sum((w * x for w, x in zip(weights, parents, strict=True)), np.zeros(()))
+    return total + noise * np.abs(noise) / math.sqrt(3.0)
+
+
+def _on_graph(upper: NDArray[np.bool_], rng: np.random.Generator, kind: str = "linear") -> SCM:
+    """Draw mechanisms for the edges of a causal order, shuffle the order, add unit Gaussian noise.
+
+    Source:
+        Ormaniec et al., *Standardizing structural causal models*, ICLR 2025, for variables of
+        variance 1; Rahimi and Recht, *Random features for large-scale kernel machines*, NeurIPS
+        2007, for Gaussian processes as sums of cosines.
+    """
     n = len(upper)
     size = rng.uniform(WEAKEST, STRONGEST, (n, n)) * rng.choice([-1.0, 1.0], (n, n))
     places = rng.permutation(n)
-    weights = np.zeros((n, n))
-    weights[np.ix_(places, places)] = np.where(upper, size, 0.0)
+    upper_weights = np.where(upper, size, 0.0)
+    stds = np.ones(n)
+    if kind == "standardised":
+        totals = np.zeros((n, n))  # of each variable, the weights of all noise
+        for j in range(n):
+            totals[j] = upper_weights[:, j] @ totals + np.eye(n)[j]
+            stds[j] = 1.0 / np.linalg.norm(totals[j])
+            totals[j] *= stds[j]
+            upper_weights[:, j] *= stds[j]
+    weights, noise_of = np.zeros((n, n)), np.ones(n)
+    weights[np.ix_(places, places)], noise_of[places] = upper_weights, stds
     names, made = _names(n), []
     for j, name in enumerate(names):
         causes = np.flatnonzero(weights[:, j]).tolist()
-        mechanism = Linear(weights=tuple(weights[causes, j].tolist()))
-        parents, noise = tuple(names[i] for i in causes), Normal(mean=0.0, std=1.0)
+        w, k = tuple(weights[causes, j].tolist()), len(causes)
+        mechanism: Any
+        match kind:
+            case "linear" | "standardised":
+                mechanism = Linear(weights=w)
+            case "uneven":
+                spread = tuple((rng.normal(size=k) / max(k, 1)).tolist())
+                mechanism = Function(uneven, constants={"weights": w, "spread": spread})
+            case "heavy":
+                mechanism = Function(heavy, constants={"weights": w})
+            case "network":
+                inner, outer = _signed(rng, (k, 10)), 2.0 * _signed(rng, 10) / math.sqrt(10)
+                mechanism = _layer(inner, rng.normal(size=10), outer, 0.0)
+            case "process":
+                inner, phase = rng.normal(size=(k, 200)), rng.uniform(0.0, 2.0 * np.pi, 200)
+                mechanism = _layer(inner, phase, 0.2 * rng.normal(size=200), 1.0)
+            case _:
+                inner, phase = np.diag(rng.uniform(1.0, 3.0, k)), rng.uniform(0.0, 2.0 * np.pi, k)
+                mechanism = _layer(inner, phase, np.array(w), 1.0)
+        parents, noise = tuple(names[i] for i in causes), Normal(mean=0.0, std=float(noise_of[j]))
         made.append(Derived(name=name, parents=parents, mechanism=mechanism, noise=noise))
     return SCM(made)
+
+
+def _signed(rng: np.random.Generator, shape: Any) -> Floats:
+    return np.asarray(rng.uniform(WEAKEST, STRONGEST, shape) * rng.choice([-1.0, 1.0], shape))
+
+
+def _layer(inner: Floats, phase: Floats, outer: Floats, wave: float) -> Function:
+    given = {"inner": inner, "phase": phase, "outer": outer}
+    constants = {name: tuple(np.ravel(value).tolist()) for name, value in given.items()}
+    return Function(layer, constants={**constants, "wave": wave})
 
 
 def _names(n: int) -> list[str]:
@@ -134,9 +241,20 @@ def _names(n: int) -> list[str]:
 FAMILIES: Mapping[str, Callable[[int, int], SCM]] = {
     "er2": _erdos_renyi,
     "sf2": _scale_free,
+    "sf2in": _hubs_last,
+    "mlp2": _networks,
+    "gp2": _processes,
+    "sine2": _sines,
+    "iscm2": _standardised,
+    "uneven2": _uneven,
+    "heavy2": _heavy,
     "tanh4": _one_step,
 }
-"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``)."""
+"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``).
+
+In ``mlp2`` both layers have such weights, the second one times 2 / √10; functions of ``gp2`` have
+standard deviation 2; in ``sine2`` frequencies are uniform in [1, 3].
+"""
 
 
 # --- problems -------------------------------------------------------------------------------------

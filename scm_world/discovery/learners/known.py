@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from scm_world.discovery.learners import libraries
+from scm_world.discovery.learners.do_gp import do_gp
 from scm_world.discovery.learners.do_order import do_order
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
 from scm_world.discovery.learners.registry import Learner, register
@@ -24,6 +25,10 @@ OURS = (
     ),
     Learner(
         "do_order", do_order, ("interventional",), doc="order by invariance, edges by regression"
+    ),
+    Learner(
+        "do_gp", do_gp, ("observational", "interventional"),
+        doc="curves: best score of Gaussian processes, one for all regimes",
     ),
     Learner(
         "do_order_ranks", partial(do_order, features=2, ranks=True, spread=True),

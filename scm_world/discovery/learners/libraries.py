@@ -221,7 +221,7 @@ def _static(
     done: bool = False,
 ) -> EstimatedGraph:
     """Estimate a static graph with a library; ``search`` gives edges and a note."""
-    table, notes = _usable(learner, data, done=done)
+    table, notes = usable(learner, data, done=done)
     edges, note = np.zeros((len(table.names), len(table.names)), bool), ""
     if len(edges) > 1:  # some libraries fail where there is nothing to find
         with _quietly(learner, seed):
@@ -342,7 +342,7 @@ def pcmci_plus(
         "alpha": _number("alpha of 'pcmci+'", alpha, below=1.0),
         "tau_max": whole_number("tau_max of 'pcmci+'", tau_max, least=1),
     }
-    table, notes = _usable("pcmci+", data)
+    table, notes = usable("pcmci+", data)
     p = len(table.names)
     edges, sure = np.zeros((tau_max + 1, p, p), bool), np.zeros((tau_max + 1, p, p))
     if p:
@@ -405,7 +405,7 @@ def edges_of_links(graph: Any) -> Bools:
 # --- data and calls -------------------------------------------------------------------------------
 
 
-def _usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset, tuple[str, ...]]:
+def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset, tuple[str, ...]]:
     """Return standardised rows and columns that a learner can use, and notes on what it cannot.
 
     Where columns are linear functions of one another, earlier control steps are kept rather than
