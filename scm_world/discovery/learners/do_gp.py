@@ -31,8 +31,13 @@ from scm_world.discovery.learners.libraries import usable
 
 WAVES = 24  # functions of one cause, besides the straight line
 EDGE, CLIP = 4.2, 3.8  # standard deviations: where the functions end, and where columns are cut off
-LENGTHS = (1.5, 0.6, 0.25)  # standard deviations, over which functions change
-SIGNALS = 10.0 ** np.arange(-4, 3)  # variance of the functions, in that of the noise
+LENGTHS = (
+    100.0,
+    1.5,
+    0.6,
+    0.25,
+)  # standard deviations, over which functions change; 100: lines only
+SIGNALS = 10.0 ** np.arange(-4, 6)  # variance of the functions, in that of the noise
 JOINT = 64  # random functions of several causes
 JOINT_LENGTH = 1.0  # standard deviations
 SMALL = 1e-4  # weight of a function below which it is left out
@@ -120,7 +125,7 @@ class _Evidence:
         sums = sums[:-1, :-1] - np.outer(sums[:-1, -1], sums[-1, :-1]) / n
         squares = max(float(sums[-1, -1]), EXACT * n)
         best = -0.5 * n * math.log(squares / n), LENGTHS[0]
-        lengths = LENGTHS
+        lengths: tuple[float, ...] = LENGTHS
         together = np.zeros((0, 0))
         if joint:  # over the length that is best for the causes one by one
             lengths = (self._of(column, frozenset(causes), joint=False)[1],)
