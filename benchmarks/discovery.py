@@ -92,6 +92,7 @@ def protocol() -> Any:
 
 
 SEEDS = range(20)
+SCALED = 5  # seeds on standardised data: a test says that no learner here sees a difference
 LIMIT = 60.0  # [s] of a learner on a table
 FROM_DATA = ("do_gp", "do_order", "gies", "gies_shared", "boss", "empty")
 NONLINEAR = ("mlp2:20", "gp2:20", "sine2:20")
@@ -181,14 +182,15 @@ def tried(learner: str, data: Dataset, truth: list[Any]) -> dict[str, Any]:
 
 
 def compared(name: str, kind: str, each: int, both: bool) -> list[dict[str, Any]]:
-    """Run every learner on a case with all seeds, on raw data and, if asked, standardised."""
+    """Run every learner on a case with all seeds; if asked, on standardised data with a few."""
     tables = [case(name, kind, each, seed) for seed in SEEDS]
     sorted_by = [sortability(d.observational, t) for t, d in tables if t]
     found = []
     for learner, scaled in product(FROM_DATA, (False, True) if both else (False,)):
         if scaled and learner.startswith("gies"):
             continue  # its rows are standardised by the adapter; a test compares
-        runs = [tried(learner, d.standardised() if scaled else d, t) for t, d in tables]
+        given = [(t, d.standardised()) for t, d in tables[:SCALED]] if scaled else tables
+        runs = [tried(learner, d, t) for t, d in given]
         done = [run for run in runs if "failed" not in run]
         row: dict[str, Any] = {
             "model": name,
@@ -196,7 +198,7 @@ def compared(name: str, kind: str, each: int, both: bool) -> list[dict[str, Any]
             "each": each,
             "standardised": scaled,
             "learner": learner,
-            "seeds": [SEEDS.start, SEEDS.stop - 1],
+            "seeds": [SEEDS.start, SEEDS.start + len(given) - 1],
             "sortability": {
                 key: float(np.mean([each_[key] for each_ in sorted_by])) for key in sorted_by[0]
             },
@@ -209,12 +211,12 @@ def compared(name: str, kind: str, each: int, both: bool) -> list[dict[str, Any]
             row[key] = {"mean": interval.value, "low": interval.low, "high": interval.high}
         row["shd_by_seed"] = [run.get("shd") for run in runs]
         found.append(row)
-        print(name, kind, each, scaled, learner, row.get("shd"), row["failed"][:1], flush=True)
+        print(json.dumps(row), flush=True)
     return found
 
 
 def nonlinear() -> Any:
-    """Nonlinear mechanisms: 20 variables, 1,606 rows, raw and standardised."""
+    """Nonlinear mechanisms: 20 variables, 1,606 rows; raw, and some standardised."""
     return [row for name in NONLINEAR for row in compared(name, "", 73, both=True)]
 
 
