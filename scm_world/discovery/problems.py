@@ -6,8 +6,8 @@ import hashlib
 import inspect
 import math
 import re
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, final, runtime_checkable
 
@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
-from scm_world.discovery.data.recorded import first_name, is_state, settable
+from scm_world.discovery.data.recorded import first_name, settable
+from scm_world.discovery.data.truth import GroundTruth as GroundTruth
+from scm_world.discovery.data.truth import (
+    observed_part,
+    truth_of_episodes,
+    truth_of_steps,
+)
 from scm_world.discovery.learners.simulators import (
     EpisodeSimulator,
     PairedSimulator,
@@ -28,9 +34,7 @@ from scm_world.errors import ModelError, UnknownOption, UnknownVariable, Unreada
 from scm_world.graph import SCM, from_json, to_json
 from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies.scripted import as_policy
-from scm_world.queries.experiments.effects import EdgeKey
-from scm_world.queries.identification import nature_graph
-from scm_world.queries.outcomes import as_outcome
+from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.tasks import TASKS, TriFingerTask, make_task
 from scm_world.tasks.factories import load_factory
@@ -258,35 +262,6 @@ standard deviation 2; in ``sine2`` frequencies are uniform in [1, 3].
 
 
 # --- problems -------------------------------------------------------------------------------------
-
-
-@final
-@dataclass(frozen=True, kw_only=True)
-class GroundTruth:
-    """The true graph of a problem.
-
-    Attributes:
-        name: Of the problem.
-        names: Of its variables, in order.
-        edges: Cause, effect and lag [control steps].
-        unscored: Pairs that are not scored, in either direction and with any lag.
-        about: What else a reader of the results should know.
-    """
-
-    name: str
-    names: tuple[str, ...]
-    edges: tuple[EdgeKey, ...]
-    unscored: tuple[tuple[str, str], ...] = ()
-    about: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def pairs(self) -> NDArray[np.bool_]:
-        """Which pairs are scored, shape (p, p)."""
-        at = {name: i for i, name in enumerate(self.names)}
-        mask = np.ones((len(at), len(at)), dtype=bool)
-        for one, other in self.unscored:
-            mask[at[one], at[other]] = mask[at[other], at[one]] = False
-        return mask
 
 
 @runtime_checkable
@@ -520,32 +495,20 @@ class WorldProblem:
         return drawn
 
     def _outcome_truth(self, shown: str) -> GroundTruth:
+        ends = [Outcome(outcome.name) for outcome in self._outcomes]
+        labels = {outcome: outcome.name for outcome in ends}
         model = self._world.model
-        outcomes = [outcome.name for outcome in self._outcomes]
-        graph = nature_graph(model, self._contexts, outcomes)
-        named = {n: first_name(model, n) for n in self._causes}
-        node = {f"{model.target(n)}@0" if is_state(model, n) else n: f for n, f in named.items()}
-        node |= {outcome: outcome for outcome in outcomes}
-        edges = tuple((node[c], node[e], 0) for c, e in projected(graph, node))
-        ends = tuple(dict.fromkeys(outcomes))
-        pairs = tuple((a, b) for i, a in enumerate(ends) for b in ends[i + 1 :])
-        names = (*named.values(), *ends)
-        return GroundTruth(
-            name=shown, names=names, edges=edges, unscored=pairs, about=self._about()
-        )
+        written = truth_of_episodes(model, self._contexts, self._causes, ends, labels)
+        named = (first_name(model, name) for name in self._causes)
+        names = tuple(dict.fromkeys((*named, *labels.values())))
+        return replace(observed_part(shown, written, names), about=self._about())
 
     def _step_truth(self, shown: str) -> GroundTruth:
         actions, bundles = self._world.compiled.actions, self._world.compiled.bundles
         outcomes = (outcome.name for outcome in self._outcomes)
         names = tuple(dict.fromkeys((*self._causes, *outcomes, *actions)))
-        known = set(names)
-        whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
-        found = (e.key for e in self._world.model.edges)
-        named = ((whole.get(c, c), whole.get(e, e), lag) for c, e, lag in found)
-        edges = tuple(
-            dict.fromkeys((c, e, lag) for c, e, lag in named if {c, e} <= known and (lag or c != e))
-        )
-        return GroundTruth(name=shown, names=names, edges=edges, about=self._about())
+        written = truth_of_steps(self._world.model, names, bundles)
+        return replace(observed_part(shown, written, names), about=self._about())
 
     def _about(self) -> dict[str, Any]:
         view, backend = self._view, self._world.backend
@@ -605,20 +568,6 @@ class WorldProblem:
     def close(self) -> None:
         """Close the backend."""
         self._world.close()
-
-
-def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
-    """Leave out nodes that follow from others without noise: their causes act in their place."""
-    found = set()
-    for cause in kept:
-        ahead = [cause] if cause in graph else []
-        while ahead:
-            for effect in graph.successors(ahead.pop()):
-                if effect in kept:
-                    found.add((cause, effect))
-                else:
-                    ahead.append(effect)
-    return sorted(found)
 
 
 def block_start(height: Any, number: int, count: int) -> Draw:

@@ -58,7 +58,8 @@ def episode_outcome(
     still = set(parameters)
     moving = follow.subgraph([name for name in follow if name not in still])
     for outcome in outcomes:
-        causes = {model.declared(outcome).name, *nx.ancestors(moving, outcome)}
+        causes = {model.declared(outcome).name}
+        causes |= nx.ancestors(moving, outcome) if outcome in moving else set()
         direct = {p for name in causes for p in follow.predecessors(name) if p in still}
         graph.add_edges_from((parameter, outcome) for parameter in sorted(direct))
         graph.add_edges_from((f"{name}@0", outcome) for name in starts if name in causes)

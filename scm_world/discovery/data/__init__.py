@@ -7,11 +7,15 @@ from scm_world.discovery.data.folders import load, save
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sources import DataSource, SourceRows
 from scm_world.discovery.data.sweeps import Levels, Swept, sweep
+from scm_world.discovery.data.truth import GroundTruth
 from scm_world.discovery.data.views import (
+    Arrays,
     CausalLearn,
     as_causal_learn,
+    as_dcdi,
     as_frame,
     as_gies,
+    as_numpy,
     as_tigramite,
     from_frame,
 )
@@ -19,19 +23,23 @@ from scm_world.errors import UnwritableFolder
 
 __all__ = [
     "DESIGNS",
+    "Arrays",
     "CausalLearn",
     "Column",
     "DataSource",
     "Dataset",
     "Design",
+    "GroundTruth",
     "Levels",
     "Regime",
     "SourceRows",
     "Swept",
     "UnwritableFolder",
     "as_causal_learn",
+    "as_dcdi",
     "as_frame",
     "as_gies",
+    "as_numpy",
     "as_tigramite",
     "collect",
     "default_causes",

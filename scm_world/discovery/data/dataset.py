@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownVariable
 from scm_world.queries.plans import Plan
+from scm_world.variables import SOFT, Mechanism
+
+if TYPE_CHECKING:
+    from scm_world.discovery.data.truth import GroundTruth
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -62,6 +66,15 @@ class Regime:
 
     plan: Plan = SEEN
     targets: tuple[str, ...] = ()
+
+    @property
+    def softly(self) -> frozenset[str]:
+        """The targets that still follow their causes: shifted, scaled, or with another noise."""
+        return frozenset(
+            name
+            for name, act in self.plan.at_start().items()
+            if isinstance(act, SOFT) or (isinstance(act, Mechanism) and act.function is None)
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Write it as plain data."""
@@ -248,6 +261,75 @@ class Dataset:
             dtype=bool,
         ).reshape(len(self.regimes), len(self.columns))
         return kinds[self.regime]
+
+    @cached_property
+    def soft(self) -> Bools:
+        """Which of the ``targeted`` numbers still follow their causes, shape (n, p).
+
+        These are shifted or scaled, or have another noise; all others were set, drawn, or follow
+        other causes.
+        """
+        kinds = np.array(
+            [[c.variable in r.softly for c in self.columns] for r in self.regimes], dtype=bool
+        ).reshape(len(self.regimes), len(self.columns))
+        return kinds[self.regime] & self.targeted
+
+    @property
+    def targets(self) -> tuple[tuple[str, ...], ...]:
+        """The variables that were intervened on in each row."""
+        return tuple(self.regimes[kind].targets for kind in self.regime.tolist())
+
+    @cached_property
+    def truth(self) -> GroundTruth | None:
+        """The true graph over exactly these variables; None where it is not known.
+
+        What is not in the table is hidden: it confounds, and effects through it are direct ones.
+        Of rows that are episodes of a world, it is the graph from what they begin with to what they
+        end with.
+        """
+        from scm_world.discovery.data.truth import observed_part
+
+        written = self.about.get("truth")
+        if written is None:
+            return None
+        names = dict.fromkeys(column.variable for column in self.columns if not column.lag)
+        return observed_part(str(self.about.get("system", "table")), written, tuple(names))
+
+    def adjacency(self, lag: int = 0) -> Bools:
+        """Give the true edges of a lag between columns, shape (p, p): row causes column.
+
+        Raises:
+            ModelError: The graph is not known.
+        """
+        found: Bools = self.weights(lag) != 0.0
+        return found
+
+    def weights(self, lag: int = 0) -> Floats:
+        """Give the weights of true edges between columns, shape (p, p): row causes column.
+
+        Zero where there is no edge, NaN where the mechanism is not linear.
+
+        Raises:
+            ModelError: The graph is not known.
+        """
+        truth = self.truth
+        if truth is None:
+            raise ModelError(["the table does not know its graph: it was not collected here"])
+        found = np.zeros((len(self.columns), len(self.columns)))
+        for cause, effect, steps in truth.edges:
+            if steps == lag:
+                where = np.ix_(self.blocks[cause], self.blocks[effect])
+                found[where] = truth.weights.get((cause, effect, steps), np.nan)
+        return found
+
+    def hide(self, names: Iterable[str]) -> Dataset:
+        """Leave out columns or variables; ``truth`` then has them as hidden causes.
+
+        Raises:
+            UnknownVariable: There is none of this name.
+        """
+        gone = {column.name for column in self.select(names).columns}
+        return self.select(name for name in self.names if name not in gone)
 
     @property
     def is_temporal(self) -> bool:

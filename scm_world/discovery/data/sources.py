@@ -12,6 +12,7 @@ import numpy as np
 from scm_world.discovery.data.dataset import Column, Dataset, columns_of
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.recorded import reached
+from scm_world.discovery.data.truth import truth_of_model
 from scm_world.errors import ModelError
 from scm_world.graph import SCM, to_json
 from scm_world.graph.structure import Edge
@@ -110,6 +111,7 @@ class ModelSource:
             "seed": seed,
             "steps": 1 if steps is None else steps,
             "design": design.as_dict(),
+            "truth": truth_of_model(model),
             "versions": versions(),
         }
 

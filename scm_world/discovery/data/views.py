@@ -7,13 +7,14 @@ import json
 from collections.abc import Container, Iterable
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from scm_world._arguments import load
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Column, Dataset, Ints, Regime
+from scm_world.discovery.data.dataset import Bools, Column, Dataset, Ints, Regime
 from scm_world.discovery.data.shards import NUMBERS, TARGETS, check_names
 from scm_world.errors import ModelError
 
@@ -40,6 +41,77 @@ def as_gies(dataset: Dataset) -> tuple[list[Floats], list[list[int]]]:
     where = where.reshape(-1)
     data = [dataset.values[where == kind] for kind in order]
     return data, [np.flatnonzero(kinds[kind]).tolist() for kind in order]
+
+
+class Arrays(NamedTuple):
+    """A dataset as arrays.
+
+    Attributes:
+        values: Shape (n, p).
+        targeted: What was intervened on, shape (n, p).
+        soft: What of it still follows its causes, shape (n, p).
+        regime: Number of the regime of each row, shape (n,).
+        adjacency: The true edges of lag 0, row causes column, shape (p, p); None if not known.
+    """
+
+    values: Floats
+    targeted: Bools
+    soft: Bools
+    regime: Ints
+    adjacency: Bools | None
+
+
+def as_numpy(dataset: Dataset) -> Arrays:
+    """Give a dataset as copies of its arrays.
+
+    Example:
+        >>> table = Dataset.of([[0.0], [1.0]], ["x"], targets=[(), ("x",)])
+        >>> as_numpy(table).targeted.ravel().tolist(), as_numpy(table).adjacency
+        ([False, True], None)
+    """
+    known = None if dataset.truth is None else dataset.adjacency()
+    targeted, soft = dataset.targeted.copy(), dataset.soft.copy()
+    return Arrays(dataset.values.copy(), targeted, soft, dataset.regime.copy(), known)
+
+
+def as_dcdi(dataset: Dataset, folder: Path | str, number: int = 1) -> Path:
+    """Write a dataset the way DCDI reads it: ``--data-path folder --i-dataset number``.
+
+    Rows without an intervention are regime 0. Its perfect interventions are hard: a dataset with
+    soft ones is for ``--intervention-type imperfect``, which the file ``soft<number>.csv`` tells.
+
+    Args:
+        dataset: Rows that are episodes, of a known graph without lags.
+        folder: It is made if need be; files of the same number are replaced.
+        number: Of the dataset in the folder.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ModelError: The graph is not known, or rows are control steps.
+
+    Source:
+        https://github.com/slachapelle/dcdi, ``dcdi/data.py``.
+    """
+    if dataset.is_temporal:
+        raise ModelError(["DCDI takes rows that are episodes; collect without control steps"])
+    adjacency, target = dataset.adjacency().astype(float), Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    kinds, where = np.unique(dataset.targeted, axis=0, return_inverse=True)
+    none = ~kinds.any(axis=1)
+    order = np.argsort(~none, kind="stable")  # without intervention first
+    rank = np.argsort(order) + (0 if none.any() else 1)
+    seen = dataset.values[~dataset.targeted.any(axis=1)]
+    np.save(target / f"DAG{number}.npy", adjacency)
+    np.save(target / f"data{number}.npy", seen)
+    np.save(target / f"data_interv{number}.npy", dataset.values)
+    for name, table in (("intervention", dataset.targeted), ("soft", dataset.soft)):
+        lines = (",".join(map(str, np.flatnonzero(row).tolist())) for row in table)
+        (target / f"{name}{number}.csv").write_text("\n".join(lines) + "\n")
+    regimes = rank[where.reshape(-1)].tolist()
+    (target / f"regime{number}.csv").write_text("\n".join(map(str, regimes)) + "\n")
+    return target
 
 
 # --- pandas -----------------------------------------------------------------------------------

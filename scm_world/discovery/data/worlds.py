@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, final
 
@@ -24,9 +24,14 @@ from scm_world.discovery.data.recorded import (
     settable,
 )
 from scm_world.discovery.data.sources import FORMAT, SourceRows, Tell, digest_of
+from scm_world.discovery.data.truth import (
+    truth_of_episodes,
+    truth_of_model,
+    truth_of_steps,
+)
 from scm_world.env.observer import published
 from scm_world.env.vector import WIDE, bounds, spread
-from scm_world.errors import BudgetExhausted, InterventionError, UnknownOption
+from scm_world.errors import BudgetExhausted, InterventionError, ModelError, UnknownOption
 from scm_world.graph.structure import Edge
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode
@@ -137,8 +142,23 @@ class WorldSource:
             "nature": Plan(setting.nature).as_dict()["do"],
             "design": design.as_dict(),
             "engine": "equations" if isinstance(world, Equations) else world.backend.name,
+            "truth": self._truth(varied, measured),
             "versions": versions("" if isinstance(world, Equations) else world.engine),
         }
+
+    def _truth(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any] | None:
+        """Write the graph over the columns; None where nature acts later than at the beginning."""
+        world, model = self._world, self._world.model
+        if isinstance(world, Equations) and (self._every_step or not model.is_temporal):
+            return truth_of_model(model)
+        if self._every_step:
+            return truth_of_steps(model, self._watched, getattr(world.compiled, "bundles", {}))
+        labels = {o: columns_of_outcome(model.declared(o.name), o)[0].variable for o in measured}
+        nature = merged(model, self._given, Plan(self._setting.nature))
+        try:
+            return truth_of_episodes(model, nature, varied, measured, labels)
+        except ModelError:
+            return None
 
     def __getstate__(self) -> dict[str, Any]:
         """Go elsewhere, where workers share the cores: an engine has one thread there."""
