@@ -36,6 +36,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
+from scm_world.graph import SCM
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.reading import read_bytes, read_text
 from scm_world.output.remote import Location, located
@@ -213,7 +214,7 @@ def _as_json(plain: Any) -> str:
 
 def benchmark(
     learners: Sequence[str],
-    problems: Sequence[str],
+    problems: Sequence[str | SCM],
     budgets: Sequence[int] = (1000,),
     seeds: int = 3,
     *,
@@ -233,7 +234,7 @@ def benchmark(
 
     Args:
         learners: Names, or ``"module:attribute"`` of custom ones.
-        problems: As ``problem`` takes them.
+        problems: Names, or models, as ``problem`` takes them.
         budgets: How many rows, episodes or experiments a learner may use; a single one is also
             divided by 2, 4 and 8.
         seeds: How many: models, data and learners are drawn again with each.
@@ -278,11 +279,12 @@ def benchmark(
     kinds = {name: _kinds(learner(name), problems, data) for name in learners}
     marks = {name: _learner_version(learner(name)) for name in learners}
     truths: dict[str, GroundTruth] = {}
-    for name in problems:
-        with closing(problem(name, view=view)) as known:
+    named = [label if isinstance(p, SCM) else p for p, label in zip(problems, shown, strict=True)]
+    for given, name in zip(problems, named, strict=True):
+        with closing(problem(given, view=view)) as known:
             truths[known.truth.name], marks[name] = known.truth, known.version
     asked = {
-        "problems": problems,
+        "problems": named,
         "learners": learners,
         "data": data,
         "budgets": spent,
@@ -294,7 +296,7 @@ def benchmark(
     settings = json.loads(json.dumps({**asked, "versions": versions(), "marks": marks}))
     folder = None if out is None else located(out)
     groups = []
-    for (name, label), seed in product(zip(problems, shown, strict=True), range(seeds)):
+    for (given, label), seed in product(zip(problems, shown, strict=True), range(seeds)):
         runs = [
             BenchmarkRun(
                 problem=label, learner=who, data=kind, budget=n, seed=seed, standardised=even
@@ -304,7 +306,7 @@ def benchmark(
             if not even or (standardised and n == spent[-1] and kind != "paired")
         ]
         place = None if folder is None else folder / "data" / slug(label)
-        groups.append([_Job(name, run, spent[-1], view, place) for run in runs])
+        groups.append([_Job(given, run, spent[-1], view, place) for run in runs])
     if engine is None:
         engine, workers = PROCESS, 1 if workers is None else workers
     with opened(engine, workers) as executor:
@@ -327,14 +329,16 @@ def _check_names(**given: Sequence[str]) -> None:
             raise UnknownOption(what, ", ".join(names), ("names, each of them once",))
 
 
-def _kinds(chosen: Learner, problems: Sequence[str], wanted: Sequence[str]) -> list[Source]:
+def _kinds(chosen: Learner, problems: Sequence[str | SCM], wanted: Sequence[str]) -> list[Source]:
     """Return the kinds of data for a learner, by default the richest that it takes."""
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
     refused = ""
     if chosen.claims:
         refused = "a learner that is not given the graph; 'coloring' checks one"
-    elif chosen.on == "models" and any(n in TASKS or n.endswith(FILES) for n in problems):
+    elif chosen.on == "models" and any(
+        isinstance(n, str) and (n in TASKS or n.endswith(FILES)) for n in problems
+    ):
         refused = "'paired' for a world; this one needs families of models or files of SCMs"
     if refused:
         raise UnknownOption("learner in a benchmark", chosen.name, (refused,))
@@ -400,7 +404,7 @@ class _Job:
         folder: Where collected data are kept; nowhere if None.
     """
 
-    name: str
+    name: str | SCM
     run: BenchmarkRun
     collected: int
     view: TaskView
@@ -555,7 +559,7 @@ class _Runner:
 
     def prepare(self, job: _Job) -> None:
         """Make the problem and collect its data, unless that is done."""
-        run, key = job.run, (job.name, job.run.seed, repr(job.view))
+        run, key = job.run, (job.run.problem, str(job.name), job.run.seed, repr(job.view))
         if self._problem is None or key != self._key:
             if self._problem is not None:
                 self._problem.close()

@@ -582,13 +582,13 @@ def block_start(height: Any, number: int, count: int) -> Draw:
 # --- by name --------------------------------------------------------------------------------------
 
 
-def problem(name: str, *, seed: int = 0, view: TaskView | None = None) -> Problem:
+def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> Problem:
     """Return a benchmark problem.
 
     Args:
-        name: A family with a size (``"er2:20"``), a task, the file of a model (.xml, .urdf), the
-            JSON file of an ``SCM``, or ``"module:function"`` for a function that gives a task, a
-            world, an ``SCM`` or a ``Problem``.
+        name: A model, or the name of a problem: a family with a size (``"er2:20"``), a task, the
+            file of a model (.xml, .urdf), the JSON file of an ``SCM``, or ``"module:function"``
+            for a function that gives a task, a world, an ``SCM`` or a ``Problem``.
         seed: Which model of the family.
         view: Of a task or a world.
 
@@ -601,6 +601,8 @@ def problem(name: str, *, seed: int = 0, view: TaskView | None = None) -> Proble
         ('x0', 'x1', 'x2', 'x3', 'x4')
     """
     view = view or TaskView()
+    if isinstance(name, SCM):
+        return SCMProblem(problem_label(name, view), name)
     if name.partition(":")[0] in FAMILIES:
         return SCMProblem(name, random_model(name, seed))
     if name.endswith(".json"):
@@ -621,8 +623,10 @@ def problem(name: str, *, seed: int = 0, view: TaskView | None = None) -> Proble
     return WorldProblem(name, view)
 
 
-def problem_label(name: str, view: TaskView) -> str:
-    """Return the name of a problem as it is shown."""
+def problem_label(name: str | SCM, view: TaskView) -> str:
+    """Return the name of a problem as it is shown; of a model it tells models apart."""
+    if isinstance(name, SCM):
+        return f"model {hashlib.sha256(to_json(name).encode()).hexdigest()[:8]}"
     if name.partition(":")[0] in FAMILIES or name.endswith(".json"):
         return Path(name).stem if name.endswith(".json") else name
     home, colon, function = name.rpartition(":")

@@ -126,6 +126,16 @@ def test_scores_are_those_of_the_reference(name: str) -> None:
                 assert value == expected, (key, line)
 
 
+def test_models_are_problems(tmp_path: Path) -> None:
+    """An object stands beside names; two of them are told apart, and results are read again."""
+    models = [random_model("er2:4", seed) for seed in (1, 2)]
+    result = benchmark(["pooled"], [*models, "er2:4"], budgets=[40], seeds=1, out=tmp_path / "r")
+    assert len(result.problems) == 3
+    assert {run.status for run in result.runs} == {"done"}
+    again = benchmark(["pooled"], [*models, "er2:4"], budgets=[40], seeds=1, out=tmp_path / "r")
+    assert [run.key for run in again.runs] == [run.key for run in result.runs]
+
+
 def test_nothing_is_written_without_a_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
