@@ -208,7 +208,7 @@ def compared(name: str, kind: str, each: int, both: bool) -> list[dict[str, Any]
         for key in done[0] if done else ():
             values = [run[key] for run in done]
             interval = mean_interval(values, proportion=key in ("f1", "false", "recall"))
-            row[key] = {"mean": interval.value, "low": interval.low, "high": interval.high}
+            row[key] = {k: interval.as_dict()[k] for k in ("value", "low", "high")}
         row["shd_by_seed"] = [run.get("shd") for run in runs]
         found.append(row)
         print(json.dumps(row), flush=True)
