@@ -88,6 +88,16 @@ class NoiseKey:
         return drawn if self.count is not None else drawn[0]
 
 
+def earlier(name: str, lag: int) -> str:
+    """Name the value of so many control steps ago, where values of one step ago have plain names.
+
+    Example:
+        >>> earlier("x", 1), earlier("x", 3)
+        ('x', 'x@-3')
+    """
+    return name if lag == 1 else f"{name}@-{lag}"
+
+
 @final
 @dataclass(frozen=True)
 class AppliedIntervention:
@@ -294,14 +304,15 @@ class Evaluator:
     def _arguments(
         self, parents: Iterable[Parent], values: Values, previous: Values
     ) -> list[Value]:
-        return [
-            values[parent.name]
-            if parent.lag == 0
-            else previous[parent.name]
-            if parent.name in previous
-            else self.first(parent.name)
-            for parent in parents
-        ]
+        found = []
+        for parent in parents:
+            name = parent.name
+            if parent.lag == 0:
+                found.append(values[name])
+            else:
+                key = name if parent.lag == 1 else earlier(name, parent.lag)
+                found.append(previous[key] if key in previous else self.first(name))
+        return found
 
     def first(self, name: str) -> Value:
         """Return the value that lagged children see before the first step."""

@@ -79,6 +79,7 @@ def _of_model(model: SCM) -> nx.MultiDiGraph:
             "kind": given.kind,
             "role": variable.role,
             "unit": variable.unit,
+            "per": "step" if getattr(given, "per", "") == "step" else "",
             "value_shape": "x".join(map(str, variable.shape)),
             **{key: ", ".join(space_lines(s, digits=DIGITS)) for key, s in spaces.items()},
             "doc": " ".join(variable.doc.split()),
@@ -139,8 +140,13 @@ def slices_of(graph: nx.MultiDiGraph, steps: int) -> nx.DiGraph:
 
 def _held(graph: nx.MultiDiGraph) -> list[str]:
     """List the parameters without causes: they keep their value from one step to the next."""
-    roles = graph.nodes(data="role")
-    return [name for name, role in roles if role == "parameter" and not graph.in_degree(name)]
+    return [
+        name
+        for name, data in graph.nodes(data=True)
+        if data.get("role") == "parameter"
+        and data.get("per") != "step"
+        and not graph.in_degree(name)
+    ]
 
 
 def _sliced(graph: nx.MultiDiGraph) -> nx.MultiDiGraph:

@@ -23,7 +23,7 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph.acceptance import accepted, adds_edges, settable_causes
-from scm_world.graph.evaluate import AppliedIntervention, Evaluator, NoiseKey, source_of
+from scm_world.graph.evaluate import AppliedIntervention, Evaluator, NoiseKey, earlier, source_of
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
     SOFT,
@@ -403,9 +403,9 @@ class SCM:
 
         Args:
             known: Values of exogenous and measured variables and of actions; batch axes may lead.
-            previous: Values of one control step ago, for parents of lag 1. Where it is not
-                given, they are the declared ``start`` or default of the parent; ``begin`` gives
-                what they are under interventions.
+            previous: Values of one control step ago, for parents of lag 1, and those of longer lags
+                as ``remembered`` names them. Where one is not given, it is the declared ``start``
+                or default of the parent; ``begin`` gives what they are under interventions.
             key: Where to draw noise. Without it exogenous variables take their default and
                 noise terms are zero.
             only: Compute these, in the order of the model, and take the rest from ``known``.
@@ -492,6 +492,28 @@ class SCM:
             values[name] = self._spread(name, found, lead) if lead else found
         return values
 
+    def remembered(self, values: Values, previous: Values) -> dict[str, Value]:
+        """Give what the next control step looks back at: the present, and what is older.
+
+        Args:
+            values: Of the present.
+            previous: What the present looked back at.
+
+        Returns:
+            Values by name; those of ``lag`` control steps before the next one as ``name@-lag``.
+        """
+        parents = [p for v in self._declared.values() for p in v.all_parents if p.lag > 1]
+        for act in self._acts.values():
+            if isinstance(act.intervention, Mechanism):
+                parents += [p for p in act.intervention.parents if p.lag > 1]
+        kept = dict(values)
+        for parent in parents:
+            for lag in range(2, parent.lag + 1):
+                before = previous.get(earlier(parent.name, lag - 1))
+                if before is not None:
+                    kept[earlier(parent.name, lag)] = before
+        return kept
+
     def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
         """Compute one variable from the values of all its parents.
 
@@ -523,9 +545,10 @@ class SCM:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])
             return self.solve(key=NoiseKey(noise, first, 0, n))
         slices: list[dict[str, Value]] = []
-        start = self.begin(key=NoiseKey(noise, first, 0, n)) if steps else {}
+        before = self.begin(key=NoiseKey(noise, first, 0, n)) if steps else {}
         for step in range(steps):
-            before = slices[-1] if slices else start
+            if slices:
+                before = self.remembered(slices[-1], before)
             slices.append(self.solve(previous=before, key=NoiseKey(noise, first, step, n)))
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
 

@@ -72,7 +72,7 @@ def d_separated(
     """Return whether ``given`` blocks every path between ``x`` and ``y``.
 
     In a model with lagged edges a plain name means the present slice and ``(name, -1)`` the one
-    before. As many earlier slices as the model has variables are
+    before. As many earlier slices as the model has variables, times the longest lag, are
     looked at too, so that what a common past connects is seen to be connected.
 
     Raises:
@@ -81,7 +81,8 @@ def d_separated(
     Source:
         Pearl, *Causality*, 2nd ed., section 1.2.3; computed by networkx.
     """
-    graph = unrolled(model, len(model) + 2 if model.is_temporal else 1)
+    longest = max((edge.lag for edge in model.edges), default=0)
+    graph = unrolled(model, longest * (len(model) + 1) + 1)
 
     def nodes(chosen: Iterable[Node]) -> set[Any]:
         found: set[Any] = set()

@@ -24,7 +24,7 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import noise_of
+from scm_world.graph.evaluate import earlier, noise_of
 from scm_world.queries.equations import Layout
 from scm_world.variables import (
     Action,
@@ -202,7 +202,7 @@ class _Abduction:
         for step in range(self.steps):
             if certain and self.sampled:
                 return
-            before = self._abduct(step, before)
+            before = model.remembered(self._abduct(step, before), before)
 
     # --- what was observed ----------------------------------------------------------------------
 
@@ -358,7 +358,13 @@ class _Abduction:
                     raise
                 log = np.zeros(len(value))  # of no account, but that it is possible
             return value, np.where(np.isfinite(log), log, 0.0) * bounded, np.isfinite(log), False
-        parents = [(before if p.lag else values)[p.name] for p in variable.all_parents]
+        start = self.model.begin()
+        parents = [
+            before.get(earlier(p.name, p.lag), np.broadcast_to(start[p.name], (self._size,)))
+            if p.lag
+            else values[p.name]
+            for p in variable.all_parents
+        ]
         each = 1 if weigh else self.n
         return _Inverse(self, variable, source, parents, step, each).solve(value, weigh=weigh)
 
@@ -407,7 +413,7 @@ class _Abduction:
                     self._follow_bounds(name, was, values, step)
                 values[name] = self._computed(model, name, values, before, step)
             found.append(values)
-            before = values
+            before = model.remembered(values, before)
         logs = self.log_weights.reshape(self._rows, self.n)
         weights = np.exp(logs - logs.max(axis=1, keepdims=True))
         return Counterfactuals(

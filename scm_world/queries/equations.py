@@ -254,6 +254,8 @@ class Equations:
         now = {**self._now(), **self._split(given)}
         for name in self.compiled.actions:
             now[name] = self._taken(name, now, self.index)
+        for model in (self.model, *{id(m): m for m in self._models}.values()):
+            now = model.remembered(now, self._before)
         self._before, self._action = now, {name: now[name] for name in self.compiled.actions}
         self.index += 1
         self._solved = None

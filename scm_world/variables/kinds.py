@@ -53,14 +53,15 @@ class Parent(Frozen):
 
     Attributes:
         name: The cause.
-        lag: 0 where the cause acts within the instant, 1 where it acts one control step later.
+        lag: 0 where the cause acts within the instant, 1 where it acts one control step later; more
+            in models without a backend.
         when: Under which condition the edge holds, None for always: ``"contact"`` while the
             bodies are in one contact island, ``"set"`` at the start of an episode and at the
             instant of an intervention.
     """
 
     name: str
-    lag: Literal[0, 1] = 0
+    lag: int = Field(default=0, ge=0)
     when: Literal["contact", "set"] | None = None
 
     def __init__(self, name: Any = None, lag: int = 0, when: str | None = None) -> None:

@@ -204,6 +204,20 @@ class CompiledTask(ActionVector):
         measured = [v for v in ordered if isinstance(v, Measured)]
         self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
         self.carried = tuple(v for v in measured if v.name in self.set_parents)
+        problems = [
+            f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
+            for v in self.model.variables
+            if isinstance(v, Exogenous) and v.distribution and v.per == "step"
+        ]
+        problems += [
+            f"{parent.name!r} acts on {v.name!r} after {parent.lag} control steps; a world has "
+            "lags 0 and 1: declare a state that remembers"
+            for v in self.model.variables
+            for parent in getattr(v.all_parents, "own", v.all_parents)
+            if parent.lag > 1
+        ]
+        if problems:
+            raise ModelError(problems)
         self.computed = _computed(self.model)
         self.static_names = _static(self.model, self.computed)
         self.random = tuple(

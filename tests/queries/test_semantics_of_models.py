@@ -10,8 +10,8 @@ from scipy import stats
 
 from scm_world import SCM, World
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.graph import NoiseKey, from_json, to_json
-from scm_world.queries import At, Clamp
+from scm_world.graph import NoiseKey, d_separated, from_json, to_json
+from scm_world.queries import At, Clamp, verify
 from scm_world.variables import (
     Bernoulli,
     Box,
@@ -28,6 +28,7 @@ from scm_world.variables import (
     Gumbel,
     Laplace,
     Linear,
+    Measured,
     Mechanism,
     Noise,
     Normal,
@@ -296,3 +297,55 @@ def test_each_draw_at_an_instant_of_a_world_is_another_one() -> None:
     apart = np.corrcoef(table.T) - np.eye(3)
     assert np.abs(apart).max() < 0.25
     assert numbers(7) == table[7].tolist()
+
+
+def autoregression() -> SCM:
+    """Make s of its own value two steps ago, and of k three steps ago."""
+    return SCM(
+        [
+            Exogenous(name="k", distribution=Normal(), per="step"),
+            Derived(
+                name="s",
+                parents=(Parent("s", 2), Parent("k", 3)),
+                mechanism=Linear(weights=(0.5, 2.0)),
+                noise=Normal(0.0, 0.1),
+                start=1.0,
+            ),
+        ]
+    )
+
+
+def test_lags_of_any_order() -> None:
+    """Draws, rollouts, counterfactuals, verification and d-separation look as far back."""
+    model = autoregression()
+    found = model.draw(5, seed=0, steps=8)
+    noise = model.do({"s": Mechanism(lambda noise: noise, [])}).draw(5, seed=0, steps=8)["s"]
+    s, k = found["s"], found["k"]
+    expected = 0.5 * s[:, 1:-2] + 2.0 * k[:, :-3] + noise[:, 3:]
+    np.testing.assert_allclose(s[:, 3:], expected, atol=1e-12)
+    np.testing.assert_allclose(s[:, 0], 0.5 + noise[:, 0])  # before the first step it is the start
+    episode = model.rollout(seed=0, steps=8)
+    np.testing.assert_array_equal(episode["s"][1:], s[0])
+    assert episode.counterfactual({}, at=4) == episode
+    done = model.do({"k": 0.0})
+    wanted = done.draw(5, seed=0, steps=8)
+    np.testing.assert_allclose(model.counterfactual(found, do={"k": 0.0})["s"], wanted["s"])
+    report = verify(model, probes=20)
+    assert report.passed
+    assert {edge.key for edge in report.fired} == {("s", "s", 2), ("k", "s", 3)}
+    assert d_separated(model, [("s", -1)], ["s"])  # of odd and of even steps
+    assert not d_separated(autoregression().do({"s": Mechanism(lambda s: s, [Parent("s", 1)])}),
+                           [("s", -1)], ["s"])  # fmt: skip
+    assert from_json(to_json(model)) == model
+
+
+def test_worlds_have_lags_of_one_step() -> None:
+    """A longer lag in a task is refused, with what to declare instead."""
+    far = Derived(name="memory", parents=(Parent("x", 2),), mechanism=Linear(weights=(1.0,)))
+    with pytest.raises(ModelError, match="declare a state that remembers"):
+        World.from_step(
+            lambda parameters, state, action, noise: {"x": state["x"]},
+            states=[Measured(name="x", default=1.0, parents=("x",))],
+            outcomes=[far],
+            control_dt=0.1,
+        )

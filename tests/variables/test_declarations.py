@@ -161,7 +161,7 @@ def test_wrong_fields_are_errors_of_this_package(make: Any, kind: type, said: st
         lambda: Derived(name="x", parents=("a", "b"), mechanism=double, inverse=double),
         lambda: Normal(0.0, -1.0),
         lambda: Categories(()),
-        lambda: Parent("x", 2),
+        lambda: Parent("x", -1),
         lambda: Draw("C"),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.graph import SCM, NoiseKey
+from scm_world.graph.evaluate import earlier
 from scm_world.queries.equations import Layout
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.noise import shared_noise
@@ -40,6 +41,7 @@ class PairedEquations:
     def run(self, number: int, probe: Any = None) -> None:
         """Do all experiments with one unit."""
         model, effects, noise = self._model, self.effects, self._noise
+        longest = max((edge.lag for edge in model.edges), default=1)
         first = model.solve(self._actions, key=NoiseKey(noise, number, 0))
         at = NoiseKey(noise, number, 1)
         unit = model.solve(self._actions, previous=first, key=at)
@@ -51,8 +53,10 @@ class PairedEquations:
         for cause in model:
             other = _another(model[cause], unit[cause], unit, noise, number)
             _compare(model, cause, {**unit, cause: other}, first, unit, at, effects, lag=0)
-            memory = {**first, cause: _another(model[cause], first[cause], first, noise, number)}
-            _compare(model, cause, unit, memory, unit, at, effects, lag=1)
+            other = _another(model[cause], first[cause], first, noise, number)
+            for lag in range(1, longest + 1):
+                memory = {**first, earlier(cause, lag): other}
+                _compare(model, cause, unit, memory, unit, at, effects, lag=lag)
             effects.rollouts += 1
         for name in reversed(tuple(model)):  # alone, last ones first, and after all the others
             value = model.solve(unit, previous=first, key=at, only=(name,))[name]
