@@ -199,9 +199,12 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
         more = [f"and {len(edges) - LISTED} more, see report.json"] * (len(edges) > LISTED)
         return "\n".join([str(len(edges)), *shown, *more])
 
+    from scm_world.queries.verification import counted
+
     score, complete = report.score, report.probes == report.planned
     version = report.versions.get(report.backend, "")
     states = f"{report.probes}" if complete else f"{report.probes} of {report.planned}: interrupted"
+    yield from counted(report.provenance)
     yield "backend", f"{report.backend} {version}, preset {report.preset}", None
     if report.arguments:
         yield "options", ", ".join(report.arguments), None
@@ -210,11 +213,10 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
     yield "noise floor (do and undo)", f"{report.floor:.3g}", None
     yield "threshold", f"{report.threshold:.3g}", None
     yield "largest effect without an edge", f"{report.inert:.3g}", None
-    yield "edges declared, found", f"{len(report.declared)}, {len(report.found)}", None
-    yield "SHD", str(score.shd), score.shd == 0
     yield "precision", f"{score.precision:.4f}", None
     yield "recall", f"{score.recall:.4f}", None
     yield "F1", f"{score.f1:.4f}", None
+    yield "SHD over all edges", str(score.shd), score.shd == 0
     yield "[+] undeclared", listed(score.undeclared), not score.undeclared
     yield "[-] missed", listed(score.missed), not score.missed
     if report.refused:

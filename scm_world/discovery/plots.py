@@ -80,9 +80,10 @@ def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
             )  # fmt: skip
     score = report.score
     engine = f"{report.backend} {report.versions.get(report.backend, '')}".strip()
+    seen = report.provenance.items()
     numbers = (
-        f"SHD {score.shd}   precision {score.precision:.3f}   recall {score.recall:.3f}   "
-        f"F1 {score.f1:.3f}   undeclared {len(score.undeclared)}   missed {len(score.missed)}   "
+        "   ".join(f"{by}: {a} of {n}, {b} undeclared" for by, (a, n, b) in seen if n or b)
+        + f"   precision {score.precision:.3f}   recall {score.recall:.3f}   "
         f"{report.probes} probe states, {report.rollouts} rollouts"
     )
     title: Any = {"fontsize": 17, "weight": "bold", "color": INK}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, final
 
 from scm_world._arguments import whole_number
@@ -21,6 +21,7 @@ from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
+from scm_world.queries.verification import by_provenance, counted
 from scm_world.world import Simulation
 
 REPORT = "scm_world/discovery/1"
@@ -52,6 +53,8 @@ class DiscoveryReport:
         refused: Targets that found no feasible value in some probes, with how often.
         seconds: Wall time.
         versions: Of everything that decides the result.
+        provenance: How many declared edges were found, how many there are, and how many others were
+            found, by what decides the effect: engine, readout or definition.
         arguments: What the task was made with, each as ``name=value``, where that is known.
     """
 
@@ -73,6 +76,7 @@ class DiscoveryReport:
     refused: dict[str, int]
     seconds: float
     versions: dict[str, str]
+    provenance: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     arguments: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
@@ -92,6 +96,7 @@ class DiscoveryReport:
             "floor": self.floor,
             "threshold": self.threshold,
             "largest_effect_without_edge": self.inert,
+            "provenance": {by: list(counts) for by, counts in self.provenance.items()},
             **asdict(self.score),
             "edges": [
                 {"cause": c, "effect": e, "lag": lag, "largest": self.effects[c, e, lag]}
@@ -113,11 +118,11 @@ class DiscoveryReport:
 
     def __str__(self) -> str:
         s = self.score
+        counts = "; ".join(f"{name} {text}" for name, text, _ in counted(self.provenance))
         return (
-            f"{self.task} on {self.backend}: {len(self.found)} edges found, "
-            f"{len(self.declared)} declared, SHD {s.shd}, precision {s.precision:.3f}, "
-            f"recall {s.recall:.3f}, F1 {s.f1:.3f}; {self.probes} probe states, "
-            f"{self.rollouts} rollouts, floor {self.floor:g}"
+            f"{self.task} on {self.backend}: {counts}; precision {s.precision:.3f}, "
+            f"recall {s.recall:.3f}, F1 {s.f1:.3f}, SHD over all edges {s.shd}; {self.probes} "
+            f"probe states, {self.rollouts} rollouts, floor {self.floor:g}"
         )
 
 
@@ -232,6 +237,7 @@ def _report(
         threshold=effects.threshold,
         inert=max(inert, default=0.0),
         score=score(found, declared),
+        provenance=by_provenance(model, declared, found, found - declared),
         found=tuple(sorted(found)),
         declared=tuple(sorted(declared)),
         effects={key: effects.largest[key] for key in found},

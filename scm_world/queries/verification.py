@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import accumulate
 from typing import Any, Literal, Self, final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scm_world.errors import UnreadableFile
+from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.variables import Measured
 
 SHOWN = 10  # edges that are written out in a table
 Row = tuple[str, str, bool | None]
@@ -101,6 +103,25 @@ class Undeclared(Report):
 
 
 @final
+class Unstable(Report):
+    """A variable that differs by itself, or after another one was changed and put back.
+
+    Attributes:
+        variable: That differs.
+        after: The other one, or ``""``.
+        size: Largest difference, in the unit of the variable.
+    """
+
+    variable: str
+    after: str
+    size: float
+
+    def __str__(self) -> str:
+        after = f" after {self.after} was put back" if self.after else ""
+        return f"{self.variable}{after}: {self.size:.3g}"
+
+
+@final
 class Verification(Report):
     """The result of comparing a declared graph with the physics.
 
@@ -122,8 +143,8 @@ class Verification(Report):
         provenance: How many declared edges were seen, how many there are, and how many effects
             without an edge were seen, by what decides the effect: ``"engine"``, ``"readout"``
             (computed from states) or ``"definition"``.
-        unstable: What differed, and by how much, though nothing had been changed: from one
-            evaluation or run to the next, or after something was put back.
+        unstable: What differed though nothing had been changed: from one evaluation or run to the
+            next, or after something was put back.
         shared_noise: Pairs of variables that are given one and the same noise.
         planned: How many probe states there may have been, without those.
         interrupted: Whether it was stopped (Ctrl-C) before it was through.
@@ -151,7 +172,7 @@ class Verification(Report):
     held_out: int = 0
     seen_held_out: int | None = None
     provenance: dict[str, tuple[int, int, int]] = {}
-    unstable: dict[str, float] = {}
+    unstable: tuple[Unstable, ...] = ()
     shared_noise: tuple[tuple[str, str], ...] = ()
     planned: int
     interrupted: bool
@@ -205,11 +226,6 @@ class Verification(Report):
         states = f"{self.probes} of at most {self.planned}"
         states += f", {self.held_out} held out" if self.held_out else ""
         unseen = not self.never_fired or (None if self.generated else False)
-        counts: list[Row] = [
-            (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared", not others)
-            for by, (seen, all_, others) in self.provenance.items()
-            if all_ or others
-        ]
         least = min((edge.states for edge in self.fired), default=0)
         more: list[Row] = [("each seen one in at least", f"{least} states", None)]
         if self.seen_held_out is not None:
@@ -218,7 +234,7 @@ class Verification(Report):
             )
             more.append(("without the task's scenarios", text, None))
         return (
-            *counts,
+            *counted(self.provenance),
             ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
             ("preset, seed", f"{self.preset}, {self.seed}", None),
             ("probe states", states + ": interrupted" * self.interrupted, None),
@@ -229,7 +245,7 @@ class Verification(Report):
             *more,
             ("never seen", listed(map(arrow, self.never_fired)), unseen),
             ("undeclared effects", listed(map(str, self.undeclared)), not self.undeclared),
-            ("differs by itself", listed(self.unstable), not self.unstable),
+            ("differs by itself", listed(map(str, self.unstable)), not self.unstable),
             (
                 "noise in common",
                 listed(map(" and ".join, self.shared_noise)),
@@ -242,6 +258,39 @@ class Verification(Report):
 
     def __str__(self) -> str:
         return written(f"Verification of {self.task} on {self.backend}", self.rows())
+
+
+def by_provenance(
+    model: SCM, declared: Iterable[EdgeKey], found: set[EdgeKey], undeclared: Iterable[EdgeKey]
+) -> dict[str, tuple[int, int, int]]:
+    """Count declared edges that were seen, all of them, and undeclared ones, by what decides.
+
+    The engine decides states and what it reports. What is computed from them is a readout, and
+    everything else follows by definition: its edges hold because the mechanism is what it is.
+    """
+    counted = {"engine": [0, 0, 0], "readout": [0, 0, 0], "definition": [0, 0, 0]}
+
+    def of(key: EdgeKey) -> list[int]:
+        effect: Any = model.declared(key[1])
+        if not isinstance(effect, Measured):
+            return counted["definition"]
+        return counted["engine" if effect.mechanism is None else "readout"]
+
+    for key in declared:
+        of(key)[0] += key in found
+        of(key)[1] += 1
+    for key in undeclared:
+        of(key)[2] += 1
+    return {by: (seen, all_, others) for by, (seen, all_, others) in counted.items()}
+
+
+def counted(provenance: Mapping[str, tuple[int, int, int]]) -> list[Row]:
+    """Write the counts of ``by_provenance`` as rows; of what there is none, there is no row."""
+    return [
+        (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared", not others)
+        for by, (seen, all_, others) in provenance.items()
+        if all_ or others
+    ]
 
 
 def named(key: EdgeKey) -> dict[str, Any]:

@@ -23,7 +23,9 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.verification import (
     Fired,
     Undeclared,
+    Unstable,
     Verification,
+    by_provenance,
     named,
 )
 from scm_world.tasks import Task
@@ -172,30 +174,6 @@ def verify_engines(
     )
 
 
-def _provenance(
-    model: SCM, declared: Iterable[EdgeKey], found: set[EdgeKey], undeclared: Iterable[EdgeKey]
-) -> dict[str, tuple[int, int, int]]:
-    """Count declared edges that were seen, all of them, and undeclared ones, by what decides.
-
-    The engine decides states and what it reports. What is computed from them is a readout, and
-    everything else follows by definition: its edges hold because the mechanism is what it is.
-    """
-    counted = {"engine": [0, 0, 0], "readout": [0, 0, 0], "definition": [0, 0, 0]}
-
-    def of(key: EdgeKey) -> list[int]:
-        effect: Any = model.declared(key[1])
-        if not isinstance(effect, Measured):
-            return counted["definition"]
-        return counted["engine" if effect.mechanism is None else "readout"]
-
-    for key in declared:
-        of(key)[0] += key in found
-        of(key)[1] += 1
-    for key in undeclared:
-        of(key)[2] += 1
-    return {by: (seen, all_, others) for by, (seen, all_, others) in counted.items()}
-
-
 @final
 class _Experiments:
     """All experiments with a world: one variable changed, and everything that should not matter.
@@ -234,7 +212,7 @@ class _Watch:
 
     def __call__(self, effects: Effects, done: int) -> bool:
         """Record the edges that are observed now; tell whether to stop."""
-        new = self.missing & effects.found(effects.threshold)
+        new = self.missing & effects.edges(self.missing)
         self.missing -= new
         self.after.update(dict.fromkeys(new, done))
         self._last = done if new else self._last
@@ -303,8 +281,11 @@ def _verified(
         probes=done,
         held_out=0 if further is None else further.done,
         seen_held_out=None if again is None or generated else len(again & set(declared)),
-        provenance=_provenance(model, declared, found, [edge.key for edge in undeclared]),
-        unstable=dict(sorted(effects.unstable.items())),
+        provenance=by_provenance(model, declared, found, [edge.key for edge in undeclared]),
+        unstable=tuple(
+            Unstable(variable=name, after=after, size=size)
+            for (name, after), size in sorted(effects.unstable.items())
+        ),
         shared_noise=tuple(sorted(effects.shared_noise)),
         planned=probes,
         interrupted=interrupted,

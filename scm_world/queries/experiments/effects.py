@@ -63,11 +63,13 @@ class Effects:
         settings: Where the largest effect of each pair was seen, if it is not zero.
         states: In how many probe states each pair answered, beyond rounding.
         floor: Noise floor: the largest difference after something was done and undone.
+        floors: The same of each target by itself, after it was changed and put back.
         exact: Whether any difference counts, rounding too, where no edge is declared.
         undone: Targets that were changed and put back.
         rollouts: Control steps simulated in an experiment of their own.
         refused: Targets for which no feasible value was found, with how often.
-        unstable: What differed though nothing had been changed, with by how much.
+        unstable: By how much a variable differed though nothing had been changed, or after another
+            one had been changed and put back: by its name, and the name of that one or "".
         apart: The largest effect, and where, of each edge by contact while nothing touched.
         shared_noise: Pairs of variables that are given one and the same noise.
         setting: What is being done now.
@@ -78,11 +80,12 @@ class Effects:
     settings: dict[EdgeKey, ProbeSetting] = field(default_factory=dict)
     states: dict[EdgeKey, int] = field(default_factory=dict)
     floor: float = 0.0
+    floors: dict[str, float] = field(default_factory=dict)
     exact: bool = False
     undone: set[str] = field(default_factory=set)
     rollouts: int = 0
     refused: dict[str, int] = field(default_factory=dict)
-    unstable: dict[str, float] = field(default_factory=dict)
+    unstable: dict[tuple[str, str], float] = field(default_factory=dict)
     apart: dict[EdgeKey, tuple[float, ProbeSetting]] = field(default_factory=dict)
     shared_noise: set[tuple[str, str]] = field(default_factory=set)
     setting: ProbeSetting | None = None
@@ -100,6 +103,11 @@ class Effects:
             self._answered.add(key)
         if self.responses is not None and size > 0.0:
             self._respond(self.responses, key, np.ravel(after), np.ravel(before))
+
+    def see_unstable(self, name: str, size: float, after: str = "") -> None:
+        """Keep a difference that nothing explains; see ``unstable``."""
+        if size > self.unstable.get((name, after), 0.0):
+            self.unstable[name, after] = size
 
     def see_apart(self, sizes: Mapping[EdgeKey, float]) -> None:
         """Keep effects of what needs contact, seen while nothing touched."""
@@ -144,10 +152,12 @@ class Effects:
                     self.settings[key] = replace(found, probe=done + found.probe)
             self.states[key] = self.states.get(key, 0) + other.states.get(key, 0)
         self.floor = max(self.floor, other.floor)
+        for name, size in other.floors.items():
+            self.floors[name] = max(size, self.floors.get(name, 0.0))
         self.undone |= other.undone
         self.shared_noise |= other.shared_noise
-        for name, size in other.unstable.items():
-            self.unstable[name] = max(size, self.unstable.get(name, 0.0))
+        for (name, after), size in other.unstable.items():
+            self.see_unstable(name, size, after)
         for key, (size, found) in other.apart.items():
             if key not in self.apart or size > self.apart[key][0]:
                 self.apart[key] = size, replace(found, probe=done + found.probe)
@@ -164,12 +174,16 @@ class Effects:
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
         """List the edges that were seen: declared ones beyond rounding, and others."""
-        least = FACTOR * self.floor if self.exact else self.threshold
         return {
             key
             for key, size in self.largest.items()
-            if size > (self.threshold if key in declared else least)
+            if size > FACTOR * self.floor_of(key[0])
+            and (size > RESOLUTION or (self.exact and key not in declared))
         }
+
+    def floor_of(self, cause: str) -> float:
+        """Give the noise floor of a cause, or of several; of what is not put back, that of all."""
+        return max(self.floors.get(name, self.floor) for name in cause.split(" & "))
 
     def copy(self) -> Effects:
         """Keep what was seen so far."""
@@ -177,6 +191,7 @@ class Effects:
             self,
             largest=dict(self.largest),
             settings=dict(self.settings),
+            floors=dict(self.floors),
             states=dict(self.states),
             undone=set(self.undone),
             refused=dict(self.refused),

@@ -60,10 +60,7 @@ class PairedEquations:
             effects.rollouts += 1
         for name in reversed(tuple(model)):  # alone, last ones first, and after all the others
             value = model.solve(unit, previous=first, key=at, only=(name,))[name]
-            if gap(value, unit[name]) > 0.0:
-                effects.unstable[name] = max(
-                    effects.unstable.get(name, 0.0), gap(value, unit[name])
-                )
+            effects.see_unstable(name, gap(value, unit[name]))
         effects.end_of_probe()
 
 

@@ -415,14 +415,17 @@ class Paired:
         self.effects.undone.add(target)
         self._advanced(self._probe.action)
         moved, now = self._after.differing(self._world), self._world.current()[0]
+        self.effects.floors.setdefault(target, 0.0)
         for name in moved:
-            self._see_floor(name, gap(now[name], self._later[name]))
+            self._see_floor(name, gap(now[name], self._later[name]), target)
 
-    def _see_floor(self, name: str, size: float) -> None:
+    def _see_floor(self, name: str, size: float, after: str = "") -> None:
         """Note what differs though nothing was changed, or what was has been put back."""
-        if size > 0.0:
-            self.effects.floor = max(self.effects.floor, size)
-            self.effects.unstable[name] = max(self.effects.unstable.get(name, 0.0), size)
+        effects = self.effects
+        effects.floor = max(effects.floor, size)
+        for target in (after,) if after else self.targets:
+            effects.floors[target] = max(effects.floors.get(target, 0.0), size)
+        effects.see_unstable(name, size, after)
 
     def _vary_action(self, name: str) -> None:
         """Find the effects of another value of one action, within its range."""

@@ -18,7 +18,6 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
-from scm_world.graph import NoiseKey
 from scm_world.queries.experiments.effects import RESOLUTION, Effects, ProbeSetting, gap
 from scm_world.queries.experiments.noise import shared_noise
 from scm_world.queries.experiments.probes import Probe, anywhere, drawn
@@ -121,15 +120,9 @@ class Together:
         self._unlike(world.values(), self._later)
         if number == 0:
             self.effects.shared_noise |= shared_noise(
-                world.graph, self._later, self._memory, self._told
+                world.graph, self._later, self._memory, partial(world.told, probe.action)
             )
         self.effects.end_of_probe()
-
-    def _told(self, key: NoiseKey) -> Floats:
-        """Give what the engine is told in the step of the probe, with other noise."""
-        commands, (now, state) = self._world.composition.commands, self._world.current()
-        action = np.array(self._probe.action)
-        return action if commands is None else commands.told(action, now, state.vector, key)
 
     def _wish(self, dice: Dice, draw: int) -> dict[str, Value]:
         """Draw another value of everything that can be set, the action too."""
@@ -196,15 +189,24 @@ class Together:
                 continue
             self._blamed[effect, lag] += 1
 
-            def differs(some: Iterable[str], effect: str = effect) -> bool:
+            seen = [found[effect]]
+
+            def differs(
+                some: Iterable[str], effect: str = effect, seen: list[tuple[int, float]] = seen
+            ) -> bool:
                 try:
-                    return effect in differing({name: changed[name] for name in some})
+                    again = differing({name: changed[name] for name in some})
                 except (InterventionError, EngineFailure):
                     return False
+                if effect in again:
+                    seen.append(again[effect])
+                return effect in again
 
             causes = fewest(list(changed), differs)
-            after, size = differing({name: changed[name] for name in causes})[effect]
-            self._note(causes, effect, after + lag, size)
+            if differs(causes):
+                self._note(causes, effect, seen[-1][0] + lag, seen[-1][1])
+            else:  # the same experiment gives something else
+                self.effects.see_unstable(effect, seen[-1][1])
 
     def _note(self, causes: Iterable[str], effect: str, lag: int, size: float) -> None:
         self.effects.setting = ProbeSetting(self._number, f"{self._probe.kind}, together")
@@ -285,17 +287,15 @@ class Together:
             }
             self._instants.append((known, previous, solved))
             for name, size in self._evaluated(self._instants[-1]).items():
-                self._differs(name, size)
+                self.effects.see_unstable(name, size)
             self._unlike({name: known[name] for name in world.computed}, solved, RESOLUTION)
 
     def _unlike(self, now: Values, before: Values, least: float = 0.0) -> None:
         """Note what is not as it was though everything was the same."""
         for name, value in now.items():
-            self._differs(name, gap(value, before[name]), least)
-
-    def _differs(self, name: str, size: float, least: float = 0.0) -> None:
-        if size > least:
-            self.effects.unstable[name] = max(self.effects.unstable.get(name, 0.0), size)
+            size = gap(value, before[name])
+            if size > least:
+                self.effects.see_unstable(name, size)
 
     # --- memory ----------------------------------------------------------------------------------
 
@@ -349,14 +349,20 @@ class Together:
     def _differing_from(
         self, base: list[dict[str, Value]], runs: list[dict[str, Value]]
     ) -> Differing:
-        """Tell what differs, beyond what declared variables remember that cannot be set."""
+        """Tell what differs first, beyond what declared variables remember that cannot be set."""
         if base[0].keys() != runs[0].keys():
             return {}
         lagged, instant = set[str](), self._world.model
         may = {name for name in base[0] if gap(runs[0][name], base[0][name]) > 0.0}
         found: Differing = {}
         for after in range(1, len(base)):
-            lagged = {e.effect for e in instant.edges if e.lag and e.cause in may}
+            lagged = {
+                e.effect
+                for e in instant.edges
+                if e.lag and e.cause in may
+                # states follow from the action that is taken next; rewards know the last one, too
+                if e.cause not in self._actions or e.effect in self._world.computed
+            }
             may = lagged.union(*(instant.structure.instant_descendants((n,)) for n in lagged))
             for name in base[0].keys() - may - found.keys():
                 value, other = base[after][name], runs[after][name]
