@@ -10,7 +10,7 @@ from scm_world._types import Value, Values
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.queries.equations import Layout
-from scm_world.queries.experiments.effects import Effects, gap
+from scm_world.queries.experiments.effects import Effects, ProbeSetting, gap
 from scm_world.queries.experiments.noise import shared_noise
 from scm_world.variables import Box, Categories, Integers, Noise, Variable
 
@@ -41,6 +41,7 @@ class PairedEquations:
     def run(self, number: int, probe: Any = None) -> None:
         """Do all experiments with one unit."""
         model, effects, noise = self._model, self.effects, self._noise
+        effects.setting = ProbeSetting(number, "unit")
         longest = max((edge.lag for edge in model.edges), default=1)
         first = model.solve(self._actions, key=NoiseKey(noise, number, 0))
         at = NoiseKey(noise, number, 1)
