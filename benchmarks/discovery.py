@@ -10,6 +10,7 @@ import argparse
 import json
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -203,7 +204,7 @@ def compared(name: str, kind: str, each: int, both: bool) -> list[dict[str, Any]
                 key: float(np.mean([each_[key] for each_ in sorted_by])) for key in sorted_by[0]
             },
             "edges": float(np.mean([len(t) for t, _ in tables])),
-            "failed": [run["failed"] for run in runs if "failed" in run],
+            "failed": dict(Counter(run["failed"] for run in runs if "failed" in run)),
         }
         for key in done[0] if done else ():
             values = [run[key] for run in done]
