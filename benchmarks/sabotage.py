@@ -36,7 +36,7 @@ from scm_world.backends.base import Backend, BackendWrapper, EngineSnapshot
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import Difference, Scene
 from scm_world.queries import Verification, World, verify
-from scm_world.tasks.trifinger.entities.block_world import BlockWorld
+from scm_world.tasks.trifinger.pushing import Pushing
 from scm_world.variables import Box, Derived, Exogenous, Function, Linear, Measured, Normal
 
 PROBES, HELD_OUT = 32, 8
@@ -185,7 +185,7 @@ CART = """
 """
 
 
-def task(name: str, engine: str = "mujoco", **wrong: Any) -> World:
+def task(name: Any, engine: str = "mujoco", **wrong: Any) -> World:
     """Make a world of a task, with something wrong in its engine."""
     options = {"resolution": "finger"} if wrong.pop("fine", False) else {}
     backend = Sabotaged(make_backend(engine), **wrong)
@@ -389,29 +389,22 @@ def outcome(text: str, wrong: Callable[[World], float]) -> World:
 
 def rewarded(wrong: Callable[[Any], float]) -> World:
     """Make pushing with a reward term that reads something else, too."""
-    name, box = "reward.block_to_goal", list[Any]()
-    honest = BlockWorld.variables
+    box: list[World] = []
 
-    def variables(self: BlockWorld) -> Any:
-        found = []
-        for variable in honest(self):
-            if variable.name == name:
-                inner = variable.mechanism.bind()
+    class Liking(Pushing):
+        def dense(self) -> Iterable[Any]:
+            for variable in super().dense():
+                if variable.name == "reward.block_to_goal":
+                    inner = variable.mechanism.bind()
 
-                def function(*given: Any, inner: Any = inner) -> Any:
-                    return inner(*given) + (wrong(box[0]) if box else 0.0)
+                    def function(*given: Any, inner: Any = inner) -> Any:
+                        return inner(*given) + (wrong(box[0]) if box else 0.0)
 
-                found.append(variable.model_copy(update={"mechanism": Function(function)}))
-            else:
-                found.append(variable)
-        return tuple(found)
+                    yield variable.model_copy(update={"mechanism": Function(function)})
+                else:
+                    yield variable
 
-    BlockWorld.variables = variables  # type: ignore[method-assign]
-    try:
-        box.append(task("pushing"))
-        box[0].reset(seed=0)
-    finally:
-        BlockWorld.variables = honest  # type: ignore[method-assign]
+    box.append(task(Liking()))
     return box[0]
 
 
@@ -468,9 +461,9 @@ def telling(world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> Any:
 
 
 def colored(command: Any, values: Any, key: NoiseKey) -> Any:
-    """Draw actuator noise from a stream that a color selects."""
-    name = f"noise {float(values['tool_block.color'][0])}"
-    return command + 0.01 * key.draw(Normal(), name, (len(command),), {})
+    """Draw actuator noise, where there is some, from a stream that a color selects."""
+    noise, name = float(values["actuator_noise"]), f"noise {float(values['tool_block.color'][0])}"
+    return command + 0.1 * noise * key.draw(Normal(), name, (len(command),), {})
 
 
 def keyed_by_state(command: Any, values: Any, key: NoiseKey) -> Any:
@@ -947,7 +940,7 @@ SABOTAGES: tuple[Sabotage, ...] = (
         lambda: task("pushing", after=remembered),
     ),
     Sabotage(
-        "noise is keyed by a color",
+        "actuator noise is keyed by a color",
         "time",
         "pushing, mujoco",
         (COLOR, "joint_.*"),
@@ -1059,8 +1052,8 @@ def complaints(report: Verification, *, unseen: bool = True) -> Iterable[set[str
     yield from ({one.variable, one.after} for one in report.unstable)
     yield from ({*pair} for pair in report.shared_noise)
     for law in getattr(report, "laws", ()):
-        if not law.holds:
-            yield {law.parameter}
+        if law.passed is False:
+            yield {law.variable}
 
 
 def caught(report: Verification, names: tuple[str, ...], *, unseen: bool = True) -> bool:

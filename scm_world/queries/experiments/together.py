@@ -112,8 +112,10 @@ class Together:
             wish = self._wish(dice, draw)
             self._see(wish, wish, 0, self._alone)
             for parents, children in groups:
-                others = wish.keys() - parents
-                self._see(wish, others, 1, partial(self._step, children))
+                context, base = self._context(wish, parents) if draw else ({}, self._later)
+                self._see(
+                    wish, wish.keys() - parents, 1, partial(self._step, children, context, base)
+                )
         self._see_memory(self._wish(dice, DRAWS), dice)
         self._restored()
         world.step(probe.action)
@@ -240,16 +242,42 @@ class Together:
 
     # --- effects within the instant, and one step later ------------------------------------------
 
-    def _step(self, children: Iterable[str], changed: dict[str, Value]) -> Differing:
-        """Take a control step with changes; tell which children differ."""
-        self._set(changed)
+    def _context(
+        self, wish: Mapping[str, Value], parents: Container[str]
+    ) -> tuple[dict[str, Value], Values]:
+        """Change the parents, too: some effects show under other circumstances only.
+
+        Returns:
+            Values of parents that are no states, and all values one step later.
+        """
+        context = {
+            name: value
+            for name, value in wish.items()
+            if name in parents and name not in self._actions and name not in self._states
+        }
+        try:
+            self._set(context)
+            self._world.step(self._probe.action)
+        except (InterventionError, EngineFailure):
+            return {}, self._later
+        return context, self._world.values()
+
+    def _step(
+        self,
+        children: Iterable[str],
+        context: Mapping[str, Value],
+        base: Values,
+        changed: Mapping[str, Value],
+    ) -> Differing:
+        """Take a control step with changes; tell which children differ from those without."""
+        self._set({**context, **changed})
         if self._world.compiled is not self._compiled:
             return {}
         self._world.step(self._act(changed))
         self.effects.rollouts += 1
         now = self._world.current()[0]
         least = 0.0 if self.effects.exact else RESOLUTION
-        sizes = {name: gap(now[name], self._later[name]) for name in children}
+        sizes = {name: gap(now[name], base[name]) for name in children}
         return {name: (0, size) for name, size in sizes.items() if size > least}
 
     def _alone(self, changed: dict[str, Value]) -> Differing:
