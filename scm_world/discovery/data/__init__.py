@@ -4,6 +4,7 @@ from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
 from scm_world.discovery.data.folders import load, save
+from scm_world.discovery.data.pictures import triplets
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sources import DataSource, SourceRows
 from scm_world.discovery.data.sweeps import Levels, Swept, sweep
@@ -48,4 +49,5 @@ __all__ = [
     "load",
     "save",
     "sweep",
+    "triplets",
 ]
