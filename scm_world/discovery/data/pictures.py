@@ -202,11 +202,12 @@ class _Maker:
             row[f"z{which}.{name}"] = np.ravel(now[name]).astype(float).tolist()
         for _ in range(self.steps):
             world.step(world.task.idle(world))
-        scene, own = world.scene(), {camera.name: camera for camera in world.cameras()}
-        for name in self.cameras:
-            label = f"image{which}" + (f".{name}" if name and len(self.cameras) > 1 else "")
-            camera = own.get(name, name)
-            row[label] = _png(picture(scene, camera, self.size, "software"))  # alike everywhere
+        scene = world.scene()
+        own: dict[str | None, Any] = {camera.name: camera for camera in world.cameras()}
+        for camera in self.cameras:
+            label = f"image{which}" + (f".{camera}" if camera and len(self.cameras) > 1 else "")
+            where = own.get(camera, camera)
+            row[label] = _png(picture(scene, where, self.size, "software"))  # alike everywhere
 
 
 def _features(table: Any) -> dict[str, Any]:
