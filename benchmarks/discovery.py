@@ -20,11 +20,12 @@ import networkx as nx
 import numpy as np
 
 from scm_world.discovery.data import Dataset, Design, collect
+from scm_world.discovery.data.truth import projected
 from scm_world.discovery.learners import Learner, learn
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
 from scm_world.discovery.learners.simulators import SCMSimulator
 from scm_world.discovery.metrics import evaluate, sortability
-from scm_world.discovery.problems import DONE, projected, random_model
+from scm_world.discovery.problems import DONE, random_model
 from scm_world.discovery.run import discover
 from scm_world.errors import ModelError, in_one_line
 from scm_world.evaluation.statistics.intervals import mean_interval
