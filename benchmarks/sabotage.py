@@ -1097,8 +1097,10 @@ def tables(found: dict[str, Any]) -> str:
     """Write the results as tables in Markdown."""
     rows, honest = found["sabotages"], found["honest"]
     passed = sum(row["passed"] for row in honest)
+    alarms = len(honest) - passed
     lines = [
-        f"Honest systems: {passed} of {len(honest)} runs passed (11 systems, seeds 0 to 2).",
+        f"Systems without sabotage: {passed} of {len(honest)} runs passed "
+        f"({len({row['system'] for row in honest})} systems, seeds 0 to 2): {alarms} false alarms.",
         "",
         "| class | sabotages | visible | caught of these |",
         "|---|---|---|---|",

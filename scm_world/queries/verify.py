@@ -191,8 +191,9 @@ class _Experiments:
 
     def run(self, number: int, probe: Probe) -> None:
         """Do all experiments of one probe state."""
-        self._paired.run(number, probe)
-        self._together.run(number, probe)
+        if self._paired.arrives(probe):
+            self._paired.run(number, probe)
+            self._together.run(number, probe)
 
 
 @final

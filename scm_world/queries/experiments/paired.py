@@ -19,7 +19,7 @@ import numpy as np
 
 from scm_world._types import Floats, Value, Values
 from scm_world.backends.base import InMemory
-from scm_world.errors import EngineFailure, InterventionError
+from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch
 from scm_world.queries.experiments.effects import (
     RESOLUTION,
     EdgeKey,
@@ -190,6 +190,23 @@ class Paired:
             self._pool[name] = [*self._pool[name], self._at_once[name], self._later[name]]
             self._pool[name] = self._pool[name][-SEEN_ELSEWHERE:]
         self.effects.end_of_probe()
+
+    def arrives(self, probe: Probe) -> bool:
+        """Tell whether the world can go to a probe state; if not, note which parameters differ.
+
+        What was prepared with an engine that changes parameters by itself is no state of the world.
+        """
+        try:
+            self._world.restore(probe.snapshot)
+        except SnapshotMismatch:
+            now, found = self._world.current()[0], self._engine_values()
+            sizes = {name: gap(value, now[name]) for name, value in found.items()}
+            if not any(sizes.values()):
+                raise
+            for name in sorted(name for name, size in sizes.items() if size > 0.0):
+                self._see_floor(name, sizes[name])
+            return False
+        return True
 
     def memory(self) -> dict[str, list[Any]]:
         """Give what later probes need of earlier ones: values of readouts, as plain data."""
