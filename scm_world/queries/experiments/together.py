@@ -206,12 +206,17 @@ class Together:
 
             causes = fewest(list(changed), differs)
             if differs(causes):
-                self._note(causes, effect, seen[-1][0] + lag, seen[-1][1])
+                values = {name: changed[name] for name in causes}
+                self._note(values, effect, seen[-1][0] + lag, seen[-1][1])
             else:  # the same experiment gives something else
                 self.effects.see_unstable(effect, seen[-1][1])
 
-    def _note(self, causes: Iterable[str], effect: str, lag: int, size: float) -> None:
-        self.effects.setting = ProbeSetting(self._number, f"{self._probe.kind}, together")
+    def _note(self, causes: Mapping[str, Value], effect: str, lag: int, size: float) -> None:
+        """Keep an effect of some values."""
+        base = {name: self._probe.action[where] for name, where in self._actions.items()}
+        moved = [np.ravel(v) - np.ravel(base.get(n, self._first[n])) for n, v in causes.items()]
+        kind = f"{self._probe.kind}, together"
+        self.effects.setting = ProbeSetting(self._number, kind, np.concatenate(moved))
         self.effects.see(" & ".join(causes), effect, lag, np.array(size), np.array(0.0))
 
     def _feasible(
