@@ -214,6 +214,7 @@ class ModelBodies:
         places: Where the parameters of the model stand in here; those that are missing have no
             meaning to this description.
         missing: What acts in the model and has no words here, one sentence each.
+        product: Whether a contact has the product of two frictions, instead of the larger one.
     """
 
     bodies: tuple[Body, ...]
@@ -226,6 +227,7 @@ class ModelBodies:
     timestep: float
     places: Mapping[ParameterKey, Place] = field(default_factory=dict, repr=False)
     missing: tuple[str, ...] = ()
+    product: bool = False
 
     def with_parameters(self, values: Mapping[ParameterKey, Any]) -> ModelBodies:
         """Give the same bodies with other values of some parameters, which have a place here.

@@ -122,6 +122,32 @@ class Unstable(Report):
 
 
 @final
+class Law(Report):
+    """What an engine makes of a declared value; see ``queries.laws``.
+
+    Attributes:
+        variable: Its name.
+        law: Which one.
+        declared: Values of its components that act in what was measured.
+        found: The values that would explain what was measured.
+        error: Largest relative difference of both.
+        passed: Whether that is within the tolerance; None where there is no law.
+        reason: Why it failed, or why there is none.
+    """
+
+    variable: str
+    law: str
+    declared: tuple[float, ...] = ()
+    found: tuple[float, ...] = ()
+    error: float | None = None
+    passed: bool | None = None
+    reason: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.variable} ({self.law}): {self.reason}"
+
+
+@final
 class Verification(Report):
     """The result of comparing a declared graph with the physics.
 
@@ -157,6 +183,7 @@ class Verification(Report):
         never_fired: Declared edges that were not.
         undeclared: Effects without an edge.
         colors: Edges from a color to something that moves, declared or seen.
+        laws: What the engine makes of the values of parameters; see ``queries.laws``.
         seconds: Wall time.
         versions: Of everything that decides the result.
     """
@@ -185,6 +212,7 @@ class Verification(Report):
     never_fired: tuple[EdgeKey, ...]
     undeclared: tuple[Undeclared, ...]
     colors: tuple[EdgeKey, ...]
+    laws: tuple[Law, ...] = ()
     seconds: float
     versions: dict[str, str]
 
@@ -218,7 +246,8 @@ class Verification(Report):
         Of a generated graph, edges may be left that were never seen.
         """
         unseen = self.never_fired and not self.generated
-        wrong = (self.undeclared, unseen, self.colors, self.unstable, self.shared_noise)
+        broken = [law for law in self.laws if law.passed is False]
+        wrong = (self.undeclared, unseen, self.colors, self.unstable, self.shared_noise, broken)
         return self.floor == 0.0 and not self.interrupted and not any(wrong)
 
     def rows(self) -> tuple[Row, ...]:
@@ -252,6 +281,7 @@ class Verification(Report):
                 not self.shared_noise,
             ),
             ("colors that move something", listed(map(arrow, self.colors)), not self.colors),
+            *law_rows(self.laws),
             ("seconds", f"{self.seconds:.1f}", None),
             ("passed", "yes" if self.passed else "no", self.passed),
         )
@@ -291,6 +321,20 @@ def counted(provenance: Mapping[str, tuple[int, int, int]]) -> list[Row]:
         for by, (seen, all_, others) in provenance.items()
         if all_ or others
     ]
+
+
+def law_rows(laws: tuple[Law, ...]) -> tuple[Row, ...]:
+    """Count laws, and write out those that do not hold."""
+    if not laws:
+        return ()
+    broken = [law for law in laws if law.passed is False]
+    held = len({law.variable for law in laws if law.passed})
+    none = {law.variable for law in laws} - {law.variable for law in laws if law.passed is not None}
+    return (
+        ("laws that hold", str(held), None),
+        ("laws broken", listed(broken), not broken),
+        ("parameters without a law", str(len(none)), None),
+    )
 
 
 def named(key: EdgeKey) -> dict[str, Any]:

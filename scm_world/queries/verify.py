@@ -19,6 +19,7 @@ from scm_world.queries.experiments.probes import Probe
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.together import Together
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.laws import check_laws
 from scm_world.queries.progress import Progress
 from scm_world.queries.verification import (
     Fired,
@@ -313,6 +314,7 @@ def _verified(
                 if edge[0].endswith("color") and edge[1] in measured
             )
         ),
+        laws=check_laws(world, seed=seed) if world else (),
         seconds=time.perf_counter() - started,
         versions=versions(world.engine if world else ""),
     )

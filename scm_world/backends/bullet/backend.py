@@ -366,6 +366,11 @@ class BulletBackend(Backend):
         history.substeps += substeps
         self._reported, self._resting, self._saved = reported, None, None
 
+    def push(self, body: str, force: Floats, torque: Floats) -> None:
+        """Act on a body during the next physics step."""
+        self._commit()
+        self._last().push(body, force.tolist(), torque.tolist())
+
     def _commit(self) -> None:
         """Make the present the world that everything after it starts from."""
         if self._present is None:

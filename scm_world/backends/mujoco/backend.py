@@ -122,6 +122,7 @@ class MujocoBackend(Backend):
     _now: Realization
     _touches: Touches | None
     slot: BatchSlot | None = None
+    _pushed = False
 
     def __getattr__(self, name: str) -> Any:
         if name == "_now":
@@ -214,12 +215,21 @@ class MujocoBackend(Backend):
         self._touches = None
         try:
             mujoco.mj_step(now.model, now.data, substeps)
+            if self._pushed:
+                now.data.xfrc_applied[:], self._pushed = 0.0, False
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
             now.recover()
             raise EngineFailure(f"MuJoCo: {error}", self.name) from error
         problem = now.problem()
         if problem:
             raise EngineFailure(problem, self.name)
+
+    def push(self, body: str, force: Floats, torque: Floats) -> None:
+        """Act on a body during the next physics step."""
+        self._return()
+        number, self._pushed = self._now.number(body), True
+        self._now.data.xfrc_applied[number, :3] = force
+        self._now.data.xfrc_applied[number, 3:] = torque
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step.

@@ -364,10 +364,18 @@ class Realization(ABC):
 
     def inertia(self, body: str) -> Floats:
         """Copy the principal moments of inertia of a body, shape (3,) [kg m²]."""
+        moments: Floats = self.model.body_inertia[self.number(body)].copy()
+        return moments
+
+    def number(self, body: str) -> int:
+        """Find a body.
+
+        Raises:
+            UnknownOption: There is no such body.
+        """
         if body not in self._bodies:
             raise UnknownOption("body", body, self._bodies)
-        moments: Floats = self.model.body_inertia[self._bodies.index(body)].copy()
-        return moments
+        return self._bodies.index(body)
 
     def fingerprint(self) -> tuple[Any, ...]:
         """Return a digest of the model without its structure: models of one digest are alike."""

@@ -12,7 +12,14 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.geometry.hulls import Hull
-from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
+from scm_world.models.scene import (
+    ControlMode,
+    ParameterKey,
+    Parameters,
+    Scene,
+    State,
+    StateLayout,
+)
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import FAST, ControllerSpec, Preset
 from scm_world.tasks.trifinger.state import BLOCK_SIZE, ROBOT_SIZE, PhysicalState, state_layout
@@ -82,6 +89,11 @@ class TriFingerStructure:
     def realization(self, backend: str) -> Any:
         """Return how the robot is realised on a backend, or drawn."""
         return _realization("published" if self.published and backend == "bullet" else backend)
+
+    def described(self, parameters: Parameters, mode: ControlMode) -> tuple[Any, Any]:
+        """Describe all bodies; see ``description``."""
+        module = import_module("scm_world.tasks.trifinger.description")
+        return module.described(self, parameters, mode)  # type: ignore[no-any-return]
 
     def hull(self, block: str) -> Hull | None:
         """Give the shape of a block that is no box; None for a box."""
