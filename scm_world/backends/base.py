@@ -142,6 +142,11 @@ class Backend(ABC):
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
 
+    @property
+    def stages(self) -> int:
+        """How often forces are evaluated in a physics step: 1, or 4 of Runge-Kutta."""
+        return 1
+
     def push(self, body: str, force: Floats, torque: Floats) -> None:
         """Act on a body during the next call of ``step``, which must have one physics step.
 

@@ -188,8 +188,10 @@ class Model:
             raise ModelError([f"{self.name!r} does not describe its bodies; read it from a file"])
         return self.describe(self)
 
-    def described(self, parameters: Parameters, mode: ControlMode) -> tuple[ModelBodies, Integers]:
-        """Describe the bodies with these parameters.
+    def described(
+        self, parameters: Parameters, mode: ControlMode, backend: str
+    ) -> tuple[ModelBodies, Integers]:
+        """Describe the bodies with these parameters, alike for all backends.
 
         Returns:
             The description, and where each of its coordinates stands in the state vector.

@@ -352,7 +352,7 @@ def compare_signs(
     task: Task | str,
     backends: tuple[str, str],
     probes: int,
-    seed: int,
+    seeds: range,
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[Sign, ...]:
@@ -361,8 +361,8 @@ def compare_signs(
     Args:
         task: A task, or the name of one.
         backends: Names of the engines.
-        probes: How many states to experiment in with each of ``SEEDS`` seeds.
-        seed: The first one, of states and values.
+        probes: How many states to experiment in with each seed.
+        seeds: Of states and values.
         progress: Called with (finished, planned) after each probe state of each engine.
         options: Arguments of ``World``, without ``backend``.
 
@@ -375,12 +375,13 @@ def compare_signs(
         measured = [v for v in world.model.variables if isinstance(v, Measured)]
         found.append([])
         try:
-            for turn in range(SEEDS):
+            for turn, seed in enumerate(seeds):
                 first, last = turn * probes, (turn + 1) * probes
-                told = part(progress, number * SEEDS * probes, len(backends) * SEEDS * probes)
-                paired = Paired(world, seed + turn, responses=True)
-                series = Series(paired, SEEDS * probes, told, done=first)
-                series.run(probe_states(world, last, seed + turn, settled=False, first=first))
+                many = len(seeds) * probes
+                told = part(progress, number * many, len(backends) * many)
+                paired = Paired(world, seed, responses=True)
+                series = Series(paired, many, told, done=first)
+                series.run(probe_states(world, last, seed, settled=False, first=first))
                 if series.done < last:
                     raise KeyboardInterrupt
                 found[-1].append(series.effects.responses or {})
@@ -389,8 +390,8 @@ def compare_signs(
     moves = frozenset(v.name for v in measured if v.mechanism is None)
     return tuple(
         sign
-        for turn, (one, other) in enumerate(zip(*found, strict=True))
-        for sign in _signs(one, other, moves, seed + turn)
+        for seed, one, other in zip(seeds, *found, strict=True)
+        for sign in _signs(one, other, moves, seed)
     )
 
 

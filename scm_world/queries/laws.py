@@ -30,7 +30,6 @@ from scm_world.world import Simulation
 RESIDUE, TOLERANCE = 0.03, 0.1
 """What steps may differ from the equations of motion by, of the largest change of each velocity,
 and parameters from what would explain the steps best: a physics step is of first order."""
-DRY_TOLERANCE = 0.3  # of dry friction, which engines solve as a soft or iterated constraint
 CLEAR = 4.0  # by how many standard errors
 TURN = 0.01  # [rad] or [m] that a joint moves at most in a measured step
 TINY = 1e-4  # [s] for derivatives in time
@@ -39,7 +38,7 @@ NOISE = 2e-3  # share of the largest change of velocity; what is below is no evi
 STATES, DRAWS = 3, 60  # without contact: how many are measured, and tried
 SHARE = (0.75, 1.35)  # by which factors values are changed before they are measured
 DRY = "frictionloss"
-ATTRIBUTES = {"damping": 5.0, "armature": 0.3, DRY: 2.0, "stiffness": 20.0}
+ATTRIBUTES = {"damping": 5.0, "armature": 0.3, "stiffness": 20.0}
 """What is set at least, for each unit of inertia that the joint feels: 5/s, 20/s² etc."""
 KEPT = ("timestep", "orientation", "position", "axis")
 """What keeps its value, because another one changes where bodies are."""
@@ -273,6 +272,9 @@ class _Laws:
 
     def __init__(self, world: Simulation, generator: np.random.Generator) -> None:
         self.world, self.rng, self.backend = world, generator, world.backend
+        self.engine = world.backend
+        while isinstance(self.engine, BackendWrapper):
+            self.engine = self.engine.engine
         rows = {row.key for row in getattr(world.structure, "parameters", ()) if row.visual}
         self.keys: dict[str, ParameterKey] = {
             name: key
@@ -291,15 +293,11 @@ class _Laws:
         values = self.values | dict(changed or {})
         structure: Any = world.structure
         bodies: ModelBodies
-        bodies, self.places = structure.described(values, world.composition.mode)
+        bodies, self.places = structure.described(values, world.composition.mode, self.engine.name)
         return bodies
 
-    def vary(self, *, dry: bool) -> None:
-        """Set parameters to values that differ from one another, where that is possible.
-
-        Args:
-            dry: Whether dry friction is set where there is none; all others otherwise.
-        """
+    def vary(self) -> None:
+        """Set parameters to values that differ from one another, where that is possible."""
         bodies = self.described()
         mechanics = Mechanics(bodies)
         scale = 1.0 / np.diag(np.linalg.inv(mechanics.inertia(self.state()[self.places])))
@@ -310,7 +308,7 @@ class _Laws:
                 np.broadcast_to(getattr(variable.bounds, end, -sign * math.inf), value.shape)
                 for end, sign in (("low", 1.0), ("high", -1.0))
             )
-            if key[1] in KEPT or variable.dtype != "real" or (dry and key[1] != DRY):
+            if key[1] in KEPT or key[1] == DRY or variable.dtype != "real":
                 continue
             size = () if key[1] in ("inertia", "size") else value.shape
             new = value * self.rng.uniform(*SHARE, size)
@@ -319,8 +317,6 @@ class _Laws:
             elif not value.any() and variable.a is not None and hasattr(variable.a, "high"):
                 new = self.rng.uniform(0.5, 1.0) * np.array(variable.a.high) + 0.0 * value
             elif key[1] in ATTRIBUTES and (place := bodies.places.get(key)) is not None:
-                if (key[1] == DRY) is not dry:
-                    continue
                 least = ATTRIBUTES[key[1]] * self.rng.uniform(*SHARE)
                 new = np.maximum(new, least * scale[mechanics.first[place.row]])
             try:
@@ -392,7 +388,6 @@ class _Laws:
         """Draw a command: forces up to a fifth beyond what actuators and joints can exert."""
         command = np.zeros(self.world.structure.n_commands)
         inertia = np.diag(self.mechanics.inertia(state))
-        dry = any(joint.friction for joint in self.bodies.joints)
         for actuator in self.bodies.actuators:
             joint = self.bodies.joints[actuator.joint]
             if not actuator.gain[0] or actuator.joint >= len(self.bodies.joints):
@@ -402,12 +397,12 @@ class _Laws:
             most = 10.0 * inertia[self.mechanics.first[actuator.joint]] / gear
             if limit is not None:
                 most = 1.2 * max(map(abs, limit))
-            force = 0.0 if dry else most * self.rng.uniform(-1.0, 1.0)
+            force = most * self.rng.uniform(-1.0, 1.0)
             length = actuator.gear[0] * state[joint.start]
             command[actuator.control] = (
                 force - actuator.bias[0] - actuator.bias[1] * length
             ) / actuator.gain[0]
-            if actuator.control_range is not None and not actuator.bias[1] and not dry:
+            if actuator.control_range is not None and not actuator.bias[1]:
                 low, high = actuator.control_range
                 command[actuator.control] = self.rng.uniform(low, high)
         return command
@@ -415,8 +410,6 @@ class _Laws:
     def runs(self, spread: float) -> tuple[Run, ...]:
         """Prepare five steps from one state: at rest, driven, pushed, and moving to and fro."""
         state, speeds = self.draw(spread)
-        dry = any(joint.friction for joint in self.bodies.joints)  # then nothing is at rest
-        base = state + speeds if dry else state
         first, second = self.commanded(state), self.commanded(state)
         pushes = {}
         for number, body in enumerate(self.bodies.bodies):
@@ -426,9 +419,9 @@ class _Laws:
                 arm = math.sqrt(max(body.inertia) / body.mass)
                 pushes[number] = push * body.mass * 10.0 * np.repeat((1.0, arm), 3)
         return (
-            Run(base, first, {}),
-            Run(base, second, {}),
-            Run(base, first, pushes),
+            Run(state, first, {}),
+            Run(state, second, {}),
+            Run(state, first, pushes),
             Run(state + speeds, first, {}),
             Run(state - speeds, first, {}),
         )
@@ -436,11 +429,7 @@ class _Laws:
     def combined(self, changes: list[Floats]) -> Floats:
         """Combine five changes to four, each of which one kind of force dominates."""
         rest, driven, pushed, to, fro = changes
-        dry = any(joint.friction for joint in self.bodies.joints)
-        parts = [driven - rest, pushed - rest, (to - fro) / 2, rest]
-        if dry:  # pushes could turn joints round
-            parts = [0.0 * rest, 0.0 * rest, (to - fro) / 2, 0.0 * rest]
-        return np.concatenate(parts)
+        return np.concatenate([driven - rest, pushed - rest, (to - fro) / 2, rest])
 
     def untied(self, state: Floats) -> Floats:
         """Give the projection that removes what the forces of couplings do, shape (n, n)."""
@@ -457,30 +446,30 @@ class _Laws:
 
     def all(self) -> Iterator[Law]:
         """Measure everything."""
-        engine = self.backend
-        while isinstance(engine, BackendWrapper):
-            engine = engine.engine
+        engine = self.engine
         if type(engine).push is Backend.push:
             reason = f"the backend {engine.name!r} cannot push bodies"
             yield from (self.silent(name, "motion", reason) for name in self.keys)
             return
-        self.vary(dry=False)
+        self.vary()
         self.bodies = self.described()
-        if self.bodies.missing or getattr(self.world.structure, "published", False):
-            what = next(iter(self.bodies.missing), "damping of the predecessor")
-            reason = f"not in the equations of motion used here: {what}"
+        lacking = [*self.bodies.missing]
+        if getattr(self.world.structure, "published", False):
+            lacking.append("damping of the predecessor")
+        if engine.stages > 1:
+            lacking.append("steps of Runge-Kutta, which are not of first order")
+        if any(joint.friction for joint in self.bodies.joints):
+            lacking.append("dry friction, a constraint that can stop a joint within a step")
+        if lacking:
+            reason = f"not in the equations of motion used here: {lacking[0]}"
             yield from (self.silent(name, "motion", reason) for name in self.keys)
             return
         keys = self.keys
         dry = {name: key for name, key in keys.items() if key[1] == DRY}
         self.keys = {name: key for name, key in keys.items() if name not in dry}
         yield from self.motion()
-        if dry:
-            self.keys = dry
-            self.vary(dry=True)
-            self.bodies = self.described()
-            yield from self.motion()
         self.keys = keys
+        yield from (self.silent(name, "motion", "dry friction is a constraint") for name in dry)
 
     def silent(self, name: str, law: str, reason: str) -> Law:
         """Report that there is no law."""
@@ -563,7 +552,7 @@ class _Laws:
                 declared.append(here)
                 acts.append(here + share * size)
                 errors.append(abs(share))
-                if clear and abs(share) > (DRY_TOLERANCE if key[1] == DRY else TOLERANCE):
+                if clear and abs(share) > TOLERANCE:
                     reason = f"declared {here:.4g}, acts as {acts[-1]:.4g}"
             if declared:
                 passed, error = not reason, max(errors)

@@ -119,6 +119,7 @@ def verify_engines(
     least: int = LEAST,
     held_out: int = HELD_OUT,
     seed: int = 0,
+    seeds: int = SEEDS,
     progress: Callable[[str], Progress | None] | None = None,
     **options: Any,
 ) -> Agreement:
@@ -135,9 +136,10 @@ def verify_engines(
         backends: Their names.
         probes: How many states to experiment in at most.
         least: How many at least, even if every declared edge has been observed before; signs are
-            compared in a fourth of as many with each of ten seeds.
+            compared in a fourth of as many with each seed.
         held_out: How many further ones for effects without an edge.
         seed: Of states and values.
+        seeds: With how many seeds signs are compared, this one and those after it.
         progress: Called with the name of each backend, and last with ``"signs"``; gives what is
             called with (finished, planned) after each probe state.
         options: Arguments of ``World``, without ``backend``.
@@ -147,6 +149,7 @@ def verify_engines(
         MissingEngine: One of the backends is not installed.
     """
     started = time.perf_counter()
+    many = whole_number("number of seeds", seeds, least=1)
 
     def told(name: str) -> Progress | None:
         return None if progress is None else progress(name)
@@ -162,14 +165,16 @@ def verify_engines(
     signs: tuple[Sign, ...] | None = None
     if not reports[-1].interrupted:
         with contextlib.suppress(KeyboardInterrupt):
-            signs = compare_signs(task, backends, compared, seed, told("signs"), options)
+            signs = compare_signs(
+                task, backends, compared, range(seed, seed + many), told("signs"), options
+            )
     return Agreement(
         task=reports[0].task,
         backends=backends,
         verifications=tuple(reports),
         interrupted=signs is None,
-        probes=0 if signs is None else SEEDS * compared,
-        seeds=SEEDS,
+        probes=0 if signs is None else many * compared,
+        seeds=many,
         signs=signs or (),
         seconds=time.perf_counter() - started,
     )

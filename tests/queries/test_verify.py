@@ -268,7 +268,7 @@ def test_an_agreement_survives_json_and_prints(agreement: Agreement) -> None:
 
 def test_an_engine_agrees_with_itself() -> None:
     """The same engine twice: every edge on both, every sign the same, no floor between them."""
-    found = verify_engines("reaching", backends=("mujoco", "mujoco"), probes=2, held_out=0)
+    found = verify_engines("reaching", backends=("mujoco", "mujoco"), probes=2, held_out=0, seeds=2)
     share = found.at(10.0)
     assert all(edges == () for edges in found.only.values())
     assert all(sign.apart == 0.0 for sign in found.signs)

@@ -224,6 +224,11 @@ class MujocoBackend(Backend):
         if problem:
             raise EngineFailure(problem, self.name)
 
+    @property
+    def stages(self) -> int:
+        """How often forces are evaluated in a physics step."""
+        return 4 if self._now.staged else 1
+
     def push(self, body: str, force: Floats, torque: Floats) -> None:
         """Act on a body during the next physics step."""
         self._return()

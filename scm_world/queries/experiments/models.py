@@ -42,7 +42,7 @@ class PairedEquations:
         """Do all experiments with one unit."""
         model, effects, noise = self._model, self.effects, self._noise
         effects.setting = ProbeSetting(number, "unit")
-        longest = max((edge.lag for edge in model.edges), default=1)
+        longest = max((1, *(edge.lag for edge in model.edges)))
         first = model.solve(self._actions, key=NoiseKey(noise, number, 0))
         at = NoiseKey(noise, number, 1)
         unit = model.solve(self._actions, previous=first, key=at)
