@@ -163,3 +163,20 @@ def test_permuted_masses_break_laws(engine: str) -> None:
         f"{upper}.mass", f"{middle}.mass"
     }  # fmt: skip
     assert broken("pushing", engine, swapped(middle, "robot_finger_120_link_2"))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(("system", "body"), [("pushing", "tool_block"), ("arm", "lower")])
+def test_restoring_takes_back_a_push(system: str, body: str, engine: str) -> None:
+    """A push that was not stepped does not act after a snapshot from before it is restored."""
+    one, other = world(system, engine), world(system, engine)
+    rest = np.zeros(one.compiled.n_actions)
+    for each in (one, other):
+        each.reset(seed=1)
+        each.step(rest)
+    before = one.snapshot()
+    one.backend.push(body, np.array([5.0, 3.0, 2.0]), np.array([0.1, 0.2, 0.3]))
+    one.restore(before)
+    for each in (one, other):
+        each.step(rest)
+    np.testing.assert_array_equal(one.vector, other.vector)
