@@ -182,9 +182,27 @@ class Mechanics:
 
     def bias(self, state: Floats) -> Floats:
         """Compute the forces that are quadratic in velocities, shape (n_dofs,)."""
-        speeds, moved = state[self.speeds], []
+        speeds = state[self.speeds]
         if not speeds.any():
             return np.zeros(len(speeds))
+        key = (self._shape, state.tobytes(), "bias")
+        if key not in self.known:
+            self.known[key] = self._rates(state)
+        rise, growth = self.known[key]
+        levers, spins, frames = self.jacobians(state)
+        masses = np.array([body.mass for body in self.bodies.bodies])
+        moments = np.array([body.inertia for body in self.bodies.bodies])
+        tensors = (frames * moments[:, None, :]) @ frames.transpose(0, 2, 1)
+        spin = spins @ speeds
+        turning = np.einsum("nij,nj->ni", tensors, growth)
+        turning += np.cross(spin, np.einsum("nij,nj->ni", tensors, spin))
+        pulls = (masses[:, None] * rise).ravel() @ levers.reshape(-1, len(speeds))
+        found: Floats = pulls + turning.ravel() @ spins.reshape(-1, len(speeds))
+        return found
+
+    def _rates(self, state: Floats) -> tuple[Floats, Floats]:
+        """Compute accelerations of bodies whose joints keep their speed, each of shape (n, 3)."""
+        speeds, moved = state[self.speeds], []
         for step in (TINY, -TINY):
             other = state.copy()
             for joint in self.bodies.joints:
@@ -198,16 +216,9 @@ class Mechanics:
                 spin = from_rotation_vector(step * state[first : first + 3])
                 other[at : at + 4] = quaternion_product(state[at : at + 4], spin)
             moved.append(self.jacobians(other))
-        levers, spins, frames = self.jacobians(state)
         rise = (moved[0][0] - moved[1][0]) @ speeds / (2.0 * TINY)
         growth = (moved[0][1] - moved[1][1]) @ speeds / (2.0 * TINY)
-        found = np.zeros(len(speeds))
-        for number, body in enumerate(self.bodies.bodies):
-            tensor = (frames[number] * np.array(body.inertia)) @ frames[number].T
-            spin = spins[number] @ speeds
-            turning = tensor @ growth[number] + np.cross(spin, tensor @ spin)
-            found += body.mass * rise[number] @ levers[number] + turning @ spins[number]
-        return found
+        return rise, growth
 
     def change(self, run: Run, implicit: int) -> Floats:
         """Predict by how much a physics step changes velocities, shape (n_dofs,).
@@ -221,8 +232,8 @@ class Mechanics:
         bodies, state = self.bodies, run.state
         levers, spins, _ = self.jacobians(state)
         forces = -self.bias(state)
-        for number, body in enumerate(bodies.bodies[1:], start=1):
-            forces += body.mass * np.array(bodies.gravity) @ levers[number]
+        masses = np.array([0.0, *(body.mass for body in bodies.bodies[1:])])
+        forces += np.outer(masses, bodies.gravity).ravel() @ levers.reshape(-1, len(forces))
         pushed = np.zeros(len(forces))
         for number, push in run.pushes.items():
             pushed += push[:3] @ levers[number] + push[3:] @ spins[number]
