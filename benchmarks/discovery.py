@@ -21,7 +21,7 @@ import numpy as np
 
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.data.truth import projected
-from scm_world.discovery.learners import Learner, learn
+from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
 from scm_world.discovery.learners.simulators import SCMSimulator
 from scm_world.discovery.metrics import evaluate, sortability
@@ -96,7 +96,7 @@ def protocol() -> Any:
 SEEDS = range(20)
 SCALED = 5  # seeds on standardised data: a test says that no learner here sees a difference
 LIMIT = 60.0  # [s] of a learner on a table
-FROM_DATA = ("do_gp", "do_order", "gies", "gies_shared", "boss", "empty")
+FROM_DATA = ("do_gp", "do_order", "gies", "gies_shared", "boss", *baselines())
 NONLINEAR = ("mlp2:20", "gp2:20", "sine2:20")
 CASES = (
     *((f"{family}:10", "", 50) for family in ("er2", "sf2", "sf2in", "iscm2", "uneven2", "heavy2")),
@@ -154,11 +154,6 @@ def case(name: str, kind: str, each: int, seed: int) -> tuple[list[Any], Dataset
     return truth, Dataset.of(data.values[np.ix_(rows, columns)], shown, targets=targets)
 
 
-def empty(data: Dataset, *, seed: int = 0) -> Any:
-    """Find no edge."""
-    return np.zeros((len(data.names), len(data.names)))
-
-
 def tried(learner: str, data: Dataset, truth: list[Any]) -> dict[str, Any]:
     """Let a learner find a graph within the limit, and score it; or say why there is none."""
 
@@ -168,7 +163,7 @@ def tried(learner: str, data: Dataset, truth: list[Any]) -> dict[str, Any]:
     signal.signal(signal.SIGALRM, stop)
     signal.setitimer(signal.ITIMER_REAL, LIMIT)
     try:
-        found = learn(Learner("empty", empty) if learner == "empty" else learner, data)
+        found = learn(learner, data)
     except (TimeoutError, ModelError) as error:
         return {"failed": in_one_line(error)}
     finally:

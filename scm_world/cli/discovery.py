@@ -59,6 +59,7 @@ def discover(
     option: options.Option = None,
     resolution: options.Resolution = None,
     learner: options.Text = None,
+    baselines: bool = True,
     data: options.Text = None,
     budget: str = "1000",
     seeds: options.Count = 3,
@@ -87,6 +88,7 @@ def discover(
         probes: Number of states to experiment in.
         strict: Exit 1 if the SHD is not 0.
         learner: Learners to benchmark, with commas; see 'scm-world list'.
+        baselines: Trivial ones beside learners from data.
         data: Of the benchmark: observational, interventional or paired, with commas; by default
             what each learner can use best.
         budget: Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c.
@@ -113,7 +115,8 @@ def discover(
         )
         where = {"executor": executor, "workers": workers, "address": address}
         spent = (budget, seeds, timeout)
-        _benchmark(task, learner or "paired", data or "", chosen, spent, where, option or (), out)
+        named = (learner or "paired", baselines)
+        _benchmark(task, named, data or "", chosen, spent, where, option or (), out)
         return
 
     from scm_world.discovery import discover as discovered
@@ -227,7 +230,7 @@ def _numbers(report: DiscoveryReport) -> Iterator[tuple[str, str, bool | None]]:
 
 def _benchmark(
     task: str,
-    learner: str,
+    named: tuple[str, bool],
     data: str,
     view: TaskView,
     spent: tuple[str, int, float],
@@ -238,12 +241,17 @@ def _benchmark(
     """Run learners over budgets and seeds; print a table per problem."""
     from scm_world.discovery.benchmark_report import COLUMNS, HEADS, summary
     from scm_world.discovery.benchmarks import benchmark, slug
+    from scm_world.discovery.learners.registry import baselines as trivial
+    from scm_world.discovery.learners.registry import learner as find
     from scm_world.discovery.problems import FAMILIES
     from scm_world.policies.scripted import NAMED
 
-    problems, learners, (budget, seeds, timeout) = split(task), split(learner), spent
-    if ":" in learner:  # a custom learner, beside where the command is called
+    problems, learners, (budget, seeds, timeout) = split(task), split(named[0]), spent
+    if ":" in named[0]:  # a custom learner, beside where the command is called
         sys.path.insert(0, str(Path.cwd()))
+    beside = [name for name in trivial() if named[1] and name not in learners]
+    if all(find(name).takes == ("paired",) for name in learners):
+        beside = []  # it needs no data
     policies = (*NAMED, "still", "usual")
     one_of("policy", view.policy, policies)
     view = replace(view, policy=None) if view.policy == "still" else view
@@ -261,7 +269,7 @@ def _benchmark(
         options.open_executor(**where, what="runs", lines=10, usual="process") as (pool, tell),
     ):
         result = benchmark(
-            learners,
+            [*learners, *beside],
             problems,
             [int(word) for word in split(budget)],
             seeds,
@@ -275,6 +283,8 @@ def _benchmark(
     columns = [column for column in COLUMNS if column.key in BRIEF]
     for (name, both), oracles in product(summary(result).items(), (False, True)):
         truth, rows = result.problems[name], [row for row in both if row.is_oracle == oracles]
+        most = max((row.run.budget for row in rows), default=0)
+        rows = [row for row in rows if row.run.learner not in beside or row.run.budget == most]
         if not rows:
             continue
         size = f"{len(truth.names)} variables, {len(truth.edges)} true edges"

@@ -14,6 +14,7 @@ import numpy as np
 
 from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
 from scm_world.discovery.learners.found import EstimatedGraph
+from scm_world.discovery.learners.registry import baselines
 from scm_world.discovery.problems import GroundTruth
 from scm_world.output.canvas import PALETTE, blank, save, small_png, styled
 from scm_world.output.durable import write_whole
@@ -106,6 +107,11 @@ class SummaryRow:
         return self.run.data == "paired"
 
     @property
+    def is_baseline(self) -> bool:
+        """Whether the learner is a trivial one."""
+        return self.run.learner in baselines()
+
+    @property
     def heads(self) -> tuple[str, str, str, str, str]:
         """The cells before the numbers."""
         ended = [f"{self.statuses.count('done')} of {len(self.statuses)}"]
@@ -139,12 +145,15 @@ def summary(result: BenchmarkResult) -> dict[str, list[SummaryRow]]:
 
     The best of a column is the best mean over all seeds that were started: without one of them,
     the hard one may be missing. There are several if they are equally good, none if all are.
-    Oracles with access to the simulator come last, and are compared with one another only.
+    Trivial baselines follow the learners. Oracles with access to the simulator come last, and are
+    compared with one another only.
     """
     rows: dict[str, list[SummaryRow]] = {name: [] for name in result.problems}
 
-    def key(run: BenchmarkRun) -> tuple[str, str, str, int]:
-        return (run.problem, run.data, run.learner, run.budget)  # "paired" is the last kind
+    plain = baselines()
+
+    def key(run: BenchmarkRun) -> tuple[str, str, bool, str, int]:  # "paired" is the last kind
+        return (run.problem, run.data, run.learner in plain, run.learner, run.budget)
 
     for _, group in groupby(sorted(result.runs, key=key), key):
         runs = list(group)
@@ -210,6 +219,7 @@ def _csv(result: BenchmarkResult) -> str:
 
 MARKERS = "osD^vPX*<>ph"
 DASHES = {"observational": ":", "interventional": "-", "paired": "--"}
+GREY = "#8A8F98"  # of baselines
 ACROSS = 4  # problems side by side
 SCORES = (("shd", "SHD (0 is best)"), ("f1", "F1 (1 is best)"))
 
@@ -218,14 +228,15 @@ SCORES = (("shd", "SHD (0 is best)"), ("f1", "F1 (1 is best)"))
 def draw_budgets(result: BenchmarkResult) -> Figure:
     """Draw SHD and F1 against the budget, two panels per problem.
 
-    Bars reach from the lowest to the highest seed. Runs that were not done are not drawn; the
-    legend says how many were.
+    Bars reach from the lowest to the highest seed; baselines are grey. Runs that were not done are
+    not drawn; the legend says how many were.
     """
     rows = summary(result)
     lines: dict[tuple[str, str], list[str]] = {}
     for row in (row for found in rows.values() for row in found):
         lines.setdefault((row.run.learner, row.data), []).extend(row.statuses)
-    who = sorted({learner for learner, _ in lines})
+    plain = baselines()
+    who = sorted({learner for learner, _ in lines}, key=lambda name: (name in plain, name))
     across = max(1, min(ACROSS, len(rows)))
     bands = max(1, math.ceil(len(rows) / across))
     figure = blank(max(8.0, 4.0 * across), 4.3 * bands + 0.4 + 0.12 * len(lines))
@@ -237,7 +248,7 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
             ax = axes[2 * (at // across) + part, at % across]
             ax.set(title="" if part else f"{name[:33]}…" if len(name) > 34 else name)
             ax.set(xlabel="budget", ylabel=label, xscale="log")
-            for place, line in enumerate(sorted(lines)):
+            for place, line in enumerate(sorted(lines, key=lambda at: (who.index(at[0]), at[1]))):
                 mine = [row for row in found if (row.run.learner, row.data) == line]
                 mine = [row for row in mine if key in row.spreads]
                 if mine:
@@ -245,8 +256,8 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
                     done, count = lines[line].count("done"), len(lines[line])
                     some = f" ({done} of {count} runs)" if done < count else ""
                     drawn = _line(ax, mine, key, aside, who.index(line[0]))
-                    oracle = " (oracle)" * mine[0].is_oracle
-                    handles[", ".join(line) + oracle + some] = drawn
+                    kind = " (oracle)" * mine[0].is_oracle + " (baseline)" * mine[0].is_baseline
+                    handles[", ".join(line) + kind + some] = drawn
             budgets = sorted({row.run.budget for row in found})
             shown = budgets[:: max(1, math.ceil(len(budgets) / 6))]
             ax.minorticks_off()
@@ -271,7 +282,8 @@ def _line(ax: Axes, rows: Sequence[SummaryRow], key: str, aside: float, style: i
         [max(row.run.budget, 0.5) * aside for row in rows],
         mean,
         yerr=np.maximum([np.subtract(mean, low), np.subtract(high, mean)], 0.0),
-        color=PALETTE[style % len(PALETTE)],
+        color=GREY if rows[0].is_baseline else PALETTE[style % len(PALETTE)],
+        linewidth=0.8 if rows[0].is_baseline else None,
         marker=MARKERS[style % len(MARKERS)],
         linestyle=DASHES[rows[0].run.data],
         capsize=2.5,

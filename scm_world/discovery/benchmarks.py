@@ -233,7 +233,8 @@ def benchmark(
     interrupted or killed resumes with the same call: at most the unfinished runs are lost.
 
     Args:
-        learners: Names, or ``"module:attribute"`` of custom ones.
+        learners: Names, or ``"module:attribute"`` of custom ones; ``baselines()`` belong beside
+            every learner from data, and use the kinds of data that the others use.
         problems: Names, or models, as ``problem`` takes them.
         budgets: How many rows, episodes or experiments a learner may use; a single one is also
             divided by 2, 4 and 8.
@@ -277,6 +278,10 @@ def benchmark(
     if len(spent) == 1:
         spent = sorted({max(1, spent[0] // share) for share in SHARES})
     kinds = {name: _kinds(learner(name), problems, data) for name in learners}
+    of_others = {k for n, found in kinds.items() if not learner(n).baseline for k in found}
+    beside: list[Source] = [kind for kind in SOURCES if kind in of_others and kind != "paired"]
+    if beside and not data:  # baselines use what they are compared on
+        kinds |= {name: beside for name in learners if learner(name).baseline}
     marks = {name: _learner_version(learner(name)) for name in learners}
     truths: dict[str, GroundTruth] = {}
     named = [label if isinstance(p, SCM) else p for p, label in zip(problems, shown, strict=True)]

@@ -1,6 +1,13 @@
 """Learners of causal graphs."""
 
 from scm_world.discovery.learners.found import EstimatedGraph
-from scm_world.discovery.learners.registry import Learner, learn, learner, learners, register
+from scm_world.discovery.learners.registry import (
+    Learner,
+    baselines,
+    learn,
+    learner,
+    learners,
+    register,
+)
 
-__all__ = ["EstimatedGraph", "Learner", "learn", "learner", "learners", "register"]
+__all__ = ["EstimatedGraph", "Learner", "baselines", "learn", "learner", "learners", "register"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from scm_world.discovery.learners import libraries
+from scm_world.discovery.learners import libraries, trivial
 from scm_world.discovery.learners.do_gp import do_gp
 from scm_world.discovery.learners.do_order import do_order
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
@@ -60,5 +60,19 @@ OTHERS = (
 )  # fmt: skip
 """Existing baselines behind our call. Without its library a learner names the extra to install."""
 
-for _learner in (*OURS, *OTHERS):
+_baseline = partial(Learner, baseline=True)
+BASELINES = (
+    _baseline("empty", trivial.empty, doc="baseline: no edge"),
+    _baseline("bipartite", trivial.bipartite, doc="baseline: every cause on every outcome"),
+    _baseline("roles", trivial.roles, doc="baseline: the same, but colors on nothing"),
+    _baseline(
+        "all_or_nothing", trivial.all_or_nothing,
+        doc="baseline: a cause acts on all outcomes if it is correlated with one",
+    ),
+    _baseline("correlation", trivial.correlation, doc="baseline: what is correlated"),
+    _baseline("sort_regress", trivial.sort_regress, doc="baseline: in the order of variance"),
+)  # fmt: skip
+"""Trivial ones, to stand beside every score."""
+
+for _learner in (*OURS, *OTHERS, *BASELINES):
     register(_learner)

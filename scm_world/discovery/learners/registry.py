@@ -41,6 +41,7 @@ class Learner:
         extra: The optional dependency it needs; empty if none.
         package: Whose version is recorded, and whose absence is reported.
         doc: In one line.
+        baseline: Whether it is a trivial one, to compare others with.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Learner:
     extra: str = ""
     package: str = ""
     doc: str = ""
+    baseline: bool = False
 
     @property
     def version(self) -> str | None:
@@ -87,6 +89,16 @@ def learners() -> Mapping[str, Learner]:
     """Return all learners that are known, by name."""
     import_module(f"{__package__}.known")
     return dict(_KNOWN)
+
+
+def baselines() -> tuple[str, ...]:
+    """Return the names of the trivial learners that belong beside every score.
+
+    Example:
+        >>> baselines()
+        ('empty', 'bipartite', 'roles', 'all_or_nothing', 'correlation', 'sort_regress')
+    """
+    return tuple(name for name, known in learners().items() if known.baseline)
 
 
 def learner(name: str) -> Learner:

@@ -1,0 +1,97 @@
+"""Trivial baselines: what each one finds, and that they stand beside every learner from data."""
+
+import numpy as np
+import pytest
+
+from scm_world.discovery.benchmark_report import summary
+from scm_world.discovery.benchmarks import benchmark
+from scm_world.discovery.data import Column, Dataset, Design, collect
+from scm_world.discovery.learners import baselines, learn, learners
+from scm_world.discovery.metrics import evaluate
+from scm_world.discovery.problems import problem, random_model
+
+
+def physics(seed: int = 0) -> Dataset:
+    """Return rows in which a mass acts on a speed, a color and a friction on nothing."""
+    rng = np.random.default_rng(seed)
+    kinds = {"block.mass": "exogenous", "block.color": "exogenous", "floor.friction": "exogenous"}
+    kinds |= {"block.speed": "measured", "arm.angle": "measured"}
+    values = rng.normal(size=(400, 5))
+    values[:, 3] += 2.0 * values[:, 0]
+    table = Dataset.of(values, list(kinds))
+    columns = tuple(Column(name, name, kind=kind) for name, kind in kinds.items())
+    return Dataset(table.values, columns, table.regimes, table.regime, table.episode, table.step)
+
+
+def test_those_without_data_look_at_names_only() -> None:
+    """Every cause on every outcome; colors on nothing in one of them."""
+    causes, outcomes = ("block.color", "block.mass", "floor.friction"), ("arm.angle", "block.speed")
+    table = physics()
+    assert learn("empty", table).directed == ()
+    found = {(cause, effect) for cause, effect, _ in learn("bipartite", table).directed}
+    assert found == {(cause, effect) for cause in causes for effect in outcomes}
+    by_role = {(cause, effect) for cause, effect, _ in learn("roles", table).directed}
+    assert by_role == {pair for pair in found if pair[0] != "block.color"}
+
+
+def test_those_with_data_see_one_edge() -> None:
+    """A cause acts on all outcomes or none; correlation and regression find the pair."""
+    table = physics()
+    whole = {("block.mass", "arm.angle", 0), ("block.mass", "block.speed", 0)}
+    assert set(learn("all_or_nothing", table).directed) == whole
+    assert learn("correlation", table).directed == (("block.mass", "block.speed", 0),)
+    assert learn("sort_regress", table).directed == (("block.mass", "block.speed", 0),)
+
+
+def test_variance_gives_the_order_away_unless_it_is_taken_away() -> None:
+    """Sorting by variance nearly solves er2 and fails on iscm2 (Reisach et al. 2021)."""
+
+    def f1(name: str) -> float:
+        scores = []
+        for seed in range(5):
+            scm = random_model(name, seed)
+            table = collect(scm, Design(), 1000, seed=seed)
+            scores.append(evaluate(learn("sort_regress", table), [e.key for e in scm.edges]).f1)
+        return float(np.mean(scores))
+
+    assert f1("er2:10") > 0.8
+    assert f1("iscm2:10") < 0.5
+
+
+def test_every_cause_on_every_outcome_is_good_on_pushing() -> None:
+    """The graph of an episode of pushing is nearly complete: SHD 50 without any data."""
+    pushing = problem("pushing")
+    table = pushing.data("interventional", 20, 0)
+    found = evaluate(learn("bipartite", table), pushing.truth.edges, names=pushing.truth.names)
+    pushing.close()
+    assert found.shd == 50
+    assert found.f1 > 0.85
+
+
+@pytest.mark.parametrize("name", baselines())
+def test_they_work_on_any_table(name: str) -> None:
+    """One row, constants, all columns set, vectors, huge numbers, several steps of an episode."""
+    rng = np.random.default_rng(1)
+    few = Dataset.of([[1.0, 2.0]], ["x", "y"])
+    still = Dataset.of(np.ones((30, 2)), ["x", "y"], targets=[("x",)] * 30)
+    same = np.repeat(rng.normal(size=(60, 1)), 2, axis=1) * [1e150, 1e-150]
+    steps = Dataset.of(rng.normal(size=(60, 2)), ["x", "y"], step=range(60), episode=[0] * 60)
+    for table in (few, still, Dataset.of(same, ["x", "y"]), steps):
+        found = learn(name, table)
+        assert found.names == ("x", "y")
+        assert np.isfinite(found.edge_scores).all()
+        again = learn(name, table)
+        assert np.array_equal(found.edges, again.edges)
+
+
+def test_they_use_the_data_of_the_learners_beside_them() -> None:
+    """Rows of the kind that the others use; in tables they come last."""
+    asked = {"problems": ["er2:4"], "budgets": [60, 80], "seeds": 1, "standardised": False}
+    result = benchmark(["do_gp", *baselines()], data=["observational"], **asked)
+    assert {run.data for run in result.runs} == {"observational"}
+    result = benchmark(["empty", "do_order", "correlation"], **asked)
+    assert {run.data for run in result.runs} == {"interventional"}
+    rows = summary(result)["er2:4"]
+    assert [row.run.learner for row in rows[::2]] == ["do_order", "correlation", "empty"]
+    assert [row.is_baseline for row in rows[::2]] == [False, True, True]
+    assert all(learners()[name].doc.startswith("baseline: ") for name in baselines())
