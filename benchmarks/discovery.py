@@ -76,7 +76,7 @@ def protocol() -> Any:
         scored("er2:20", "do_order", range(20), 100, 50),
         scored("er2:50", "do_order", range(20), 100, 50),
         scored("sf2:20", "do_order", range(20), 1000, 500),
-        scored("er2:100", "do_order", range(5), 1000, 500),
+        scored("er2:100", "do_order", range(20), 1000, 500),
     ]
     ours, theirs = [], []
     for seed in range(10):  # one after another, so that both see the same machine

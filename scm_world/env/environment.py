@@ -265,6 +265,14 @@ class ScmWorldEnv(Looks, Copied, gymnasium.Env[Observation, NDArray[np.float32]]
         self._observer, self._goals, self._counted, self._needed = found
         self.observation_space = self._observer.space
 
+    @property
+    def observed(self) -> tuple[str, ...] | None:
+        """The variables that the observation is made of; None of pictures, which show many."""
+        if self._how.mode == "pixel":
+            return None
+        goals = self._goals.names if self._how.goals and self._goals is not None else ()
+        return (*self._observer.names, *goals)
+
     def _look(self) -> Values:
         """Compute what is needed of the present."""
         if self._version != self.world.version:

@@ -18,6 +18,7 @@ from scm_world.evaluation.players import Player
 from scm_world.evaluation.protocols import Protocol
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Null, Subset
+from scm_world.variables.reserved import SENSOR_NOISE
 
 LAST = 20
 """Control steps over which the end of an episode is averaged."""
@@ -232,6 +233,29 @@ class EpisodeRunner:
     def close(self) -> None:
         """Free the engine."""
         self.env.close()
+
+
+def unrelated(env: ScmWorldEnv, about: Mapping[str, Any]) -> tuple[str, ...]:
+    """Name what cannot matter: no directed path leads from it to the score or the observation.
+
+    Of pictures nothing is named, since everything counts that can be seen, nor for a function of
+    the whole world, nor where a variable decides which bodies, and so which paths, there are.
+    Named policies of this package read states.
+
+    Args:
+        env: Where a policy acts.
+        about: Of its ``Player``.
+    """
+    if env.observed is None or about.get("sees") == "world" or len(env.world.structures.head):
+        return ()
+    model = env.world.model
+    observed = env.observed
+    if about["kind"] == "named":
+        observed = tuple(name for name in model if model.declared(name).role == "state")
+    counted = {n for n in (*observed, FRACTION, SUCCESS, "reward", SENSOR_NOISE) if n in model}
+    counted |= {cause for name in tuple(counted) for cause in model.ancestors(name)}
+    settable = (name for name in model if model.declared(name).settable)
+    return tuple(name for name in settable if counted.isdisjoint(model.targets(name)))
 
 
 def scored(fractions: list[float], *, success: bool | None, total: float) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
 from typing import Any, final
@@ -36,6 +36,8 @@ DRAWN = "drawn "
 
 RATES = (*FRACTIONS, "success")
 """The metrics that always lie in [0, 1]."""
+
+NO_PATH = "no directed path leads from it to the score or the observation"
 
 Columns = dict[str, NDArray[Any]]
 
@@ -348,7 +350,8 @@ class Evaluation:
         """Estimate what each variable that a protocol varies does to the score.
 
         The values were drawn at random, each on its own, so what goes with them is their effect.
-        Of several runs of an agent the mean counts.
+        Variables without a directed path to the score or to the observation are left out. Of
+        several runs of an agent the mean counts.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
@@ -358,7 +361,10 @@ class Evaluation:
         units = zip(first.columns["seed"].tolist(), first.columns["episode"].tolist(), strict=True)
         varied = {n: v for n, v in first.drawn().items() if not np.isnan(v).all()}
         scores = np.array([score_of[unit] for unit in units])
-        return find_causes(varied, scores, proportion=metric in RATES)
+        silent = [n for n in self.about.get("unrelated", {}).get(agent, ()) if n in varied]
+        tested = {name: values for name, values in varied.items() if name not in silent}
+        found = find_causes(tested, scores, proportion=metric in RATES)
+        return replace(found, left_out={**found.left_out, **dict.fromkeys(silent, NO_PATH)})
 
     def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
         """Give means and standard deviations under the predecessor's names, by protocol."""

@@ -24,7 +24,7 @@ from scm_world.evaluation.agents import (
     source_of,
     task_for,
 )
-from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.evaluation.episodes import EpisodeRunner, unrelated
 from scm_world.evaluation.protocols import Protocol, chosen, protocols_of
 from scm_world.models import Model
 from scm_world.queries.experiments.versions import versions
@@ -139,6 +139,8 @@ class Setup:
         seeds: Of the noise.
         n: Episodes of each protocol, for each seed.
         versions: Of everything that decides the results, by engine.
+        unrelated: By agent, the variables from which no directed path leads to the score or to what
+            it observes; of agents that may read the whole world nothing is known.
     """
 
     place: EvaluationPlace
@@ -148,6 +150,7 @@ class Setup:
     seeds: tuple[int, ...]
     n: int
     versions: Mapping[str, Mapping[str, str]]
+    unrelated: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def env(self, shard: Shard) -> ScmWorldEnv:
         """Make the environment of a shard: on its backend, in the form of its agent."""
@@ -210,6 +213,7 @@ class Setup:
             "seeds": list(self.seeds),
             "n": self.n,
             "versions": {engine: dict(found) for engine, found in self.versions.items()},
+            "unrelated": {agent: list(names) for agent, names in self.unrelated.items()},
         }
 
 
@@ -268,6 +272,7 @@ def prepare(
             raise UnknownOption("seed", noise, ("any whole number below 2**63",))
     found: dict[str, dict[str, str]] = {}
     agents: tuple[AgentRun, ...] = ()
+    silent: dict[str, tuple[str, ...]] = {}
     for engine in engines:
         runner = EpisodeRunner(place.env(engine))
         try:
@@ -278,12 +283,13 @@ def prepare(
                 own = runner.env if agent.form is None else place.env(engine, agent.form)
                 try:
                     agents += (agent.tried_out(own),)
+                    silent[agent.agent] = unrelated(own, agent.about)
                 finally:
                     if own is not runner.env:
                         own.close()
         finally:
             runner.close()
-    setup = Setup(place, agents, engines, wanted, noises, count, found)
+    setup = Setup(place, agents, engines, wanted, noises, count, found, silent)
     setup.about()  # refuses what cannot be written down, before any time is spent
     return setup
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from scm_world._types import Floats
+from scm_world.curricula import resample, together
 from scm_world.errors import UnknownOption
+from scm_world.evaluation import Protocol, WorldPolicy, evaluate
 from scm_world.evaluation.statistics import Cause, Causes, find_causes
 from scm_world.evaluation.statistics.causes import FEWEST, holm
 
@@ -288,3 +290,62 @@ def test_independent_draws_are_rarely_called_dependent() -> None:
         drawn = {f"v{k}": rng.random((100, 1 + k % 2)) for k in range(6)}
         wrong += bool(find_causes(drawn, rng.random(100), permutations=1).dependent)
     assert wrong <= 3
+
+
+def test_the_interval_of_a_share_and_its_test_say_the_same() -> None:
+    """Zero is in the interval where p is above 5 %, and not in it elsewhere."""
+    rng = np.random.default_rng(4)
+    for strength in np.linspace(0.0, 0.6, 40):
+        values = rng.normal(size=60)
+        cause = find_causes({"x": values}, strength * values + rng.normal(size=60)).causes[0]
+        assert cause.share.excludes(0.0) == (cause.p <= 0.05)
+        assert cause.share.low <= cause.share.value <= cause.share.high
+
+
+def test_variables_that_were_never_varied_together_are_no_pair() -> None:
+    """Half of the episodes vary one of them, the other half the other one."""
+    values = np.random.default_rng(5).normal(size=(2, 40))
+    values[0, :20], values[1, 20:] = np.nan, np.nan
+    found = find_causes({"x": values[0], "y": values[1]}, np.arange(40.0))
+    assert found.dependent == ()
+
+
+def test_what_has_no_path_to_score_or_observation_is_not_tested() -> None:
+    """The mass of a link that stands still, and a color; but not for pictures."""
+    asked: dict[str, Any] = {"task": "pushing", "n": 12, "backend": "fake"}
+    part = together(
+        resample("robot_finger_60_link_0.mass", "A"),
+        resample("tool_block.color", "A"),
+        resample("tool_block.mass", "A"),
+    )
+    looks = Protocol("looks", act=part)
+    short = {"max_episode_length": 3}
+    found = evaluate({"lazy": "random"}, looks, env=short, **asked).causes("looks")
+    said = {name for name, why in found.left_out.items() if why.startswith("no directed path")}
+    assert said == {"robot_finger_60_link_0.mass", "tool_block.color"}
+    assert [cause.variable for cause in found.causes] == ["tool_block.mass"]
+
+    def lazy(observation: Any) -> Any:
+        return np.zeros(9)
+
+    seen = evaluate({"lazy": lazy}, looks, env={**short, "observation_mode": "pixel"}, **asked)
+    assert len(seen.causes("looks").causes) == 3
+
+
+def test_a_function_of_the_world_may_read_anything() -> None:
+    """So nothing is left out for it."""
+    part = resample("tool_block.color", "A")
+
+    @WorldPolicy
+    def lazy(world: Any) -> Any:
+        return 0.5 * (world.action_low + world.action_high)
+
+    found = evaluate(
+        {"lazy": lazy},
+        Protocol("looks", act=part),
+        task="pushing",
+        n=12,
+        backend="fake",
+        env={"max_episode_length": 3},
+    )
+    assert [cause.variable for cause in found.causes("looks").causes] == ["tool_block.color"]

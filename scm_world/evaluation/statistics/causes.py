@@ -261,9 +261,11 @@ def _dependent(tables: Mapping[str, Floats], scores: Floats) -> tuple[Dependence
         rows = ~np.isnan(np.hstack([tables[one], tables[other]])).any(axis=1)
         sides = [list(tables[name][rows].T) for name in (one, other)]
         n, p = int(rows.sum()), 1.0
+        if n < FEWEST:
+            ps.append(1.0)
+            shared.append(0.0)
+            continue
         for causes, effects in (sides, sides[::-1]):
-            if n < FEWEST:
-                continue
             for column in effects:
                 fitted, r = _fitted(causes, column)
                 rest = n - r - 1
@@ -373,7 +375,9 @@ def _share(
     reach = normal_quantile(level) * math.sqrt(float(np.square(influence).mean()) / n + at_zero)
     value = 1.0 - (1.0 - raw) * (n - 1.0) / (n - r - 1.0)
     value, low, high = (min(max(x, 0.0), 1.0) for x in (value, value - reach, value + reach))
-    return Interval(value, low, high, level, n), p
+    if (1 + permutations) * (1.0 - level) >= 1.0:  # the exact test decides whether 0 is inside
+        low = 0.0 if p > 1.0 - level else max(low, math.ulp(0.0))
+    return Interval(max(value, low), low, max(high, low), level, n), p
 
 
 def _pieces(values: Floats, count: int) -> Floats:
