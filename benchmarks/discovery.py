@@ -25,7 +25,7 @@ from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
 from scm_world.discovery.learners.simulators import SCMSimulator
 from scm_world.discovery.metrics import evaluate, sortability
-from scm_world.discovery.problems import DONE, random_model
+from scm_world.discovery.problems import DONE, problem, random_model
 from scm_world.discovery.run import discover
 from scm_world.errors import ModelError, in_one_line
 from scm_world.evaluation.statistics.intervals import mean_interval
@@ -154,7 +154,7 @@ def case(name: str, kind: str, each: int, seed: int) -> tuple[list[Any], Dataset
     return truth, Dataset.of(data.values[np.ix_(rows, columns)], shown, targets=targets)
 
 
-def tried(learner: str, data: Dataset, truth: list[Any]) -> dict[str, Any]:
+def tried(learner: str, data: Dataset, truth: list[Any], names: Any = None) -> dict[str, Any]:
     """Let a learner find a graph within the limit, and score it; or say why there is none."""
 
     def stop(*_: Any) -> None:
@@ -168,7 +168,7 @@ def tried(learner: str, data: Dataset, truth: list[Any]) -> dict[str, Any]:
         return {"failed": in_one_line(error)}
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-    s = evaluate(found, truth, names=data.names)
+    s = evaluate(found, truth, names=data.names if names is None else names)
     return {
         "shd": s.shd,
         "f1": s.f1,
@@ -221,6 +221,66 @@ def families() -> Any:
     """Ten variables: families of models, faulty interventions, few and many rows."""
     return [row for given in CASES for row in compared(*given, both=False)]
 
+
+RIGS = (
+    *((f"servo:{n}", 20) for n in (5, 8, 10, 20, 50)),
+    ("servo:10", 100),
+    ("servo:10:2", 20),
+    *((f"springs:{n}", 20) for n in (5, 8, 10, 20)),
+)
+"""Families of physics, and rows: for each node, or control steps for each number of the state."""
+
+
+def physics() -> Any:
+    """Families of physics: baselines and learners on 20 seeds; edges confirmed by the engine."""
+    found = []
+    for name, each in RIGS:
+        runs: dict[str, list[Any]] = {}
+        edges, confirmed, false, states = 0, 0, 0, 0
+        for seed in SEEDS:
+            made: Any = problem(name, seed=seed)
+            truth, n = made.truth, int(name.split(":")[1])
+            rows = each * (n + 2) if name.startswith("servo") else 2 * each * n
+            data = made.data("interventional", rows, seed)
+            slow = n > 20 or name.startswith("springs")
+            for learner in (*baselines(), "do_order", *(() if slow else ("do_gp", "gies_shared"))):
+                given = [edge[:3] for edge in truth.edges]
+                runs.setdefault(learner, []).append(tried(learner, data, given, truth.names))
+            if seed < CONFIRMED and n <= 20:
+                oracle = learn("paired", made.simulator(seed), budget=UNITS * n * n)
+                seen = set(oracle.restricted(truth.names).directed)
+                real = set(truth.edges)
+                edges, confirmed = edges + len(real), confirmed + len(real & seen)
+                false, states = false + len(seen - real), states + oracle.experiments
+            made.close()
+        row: dict[str, Any] = {
+            "problem": name,
+            "rows": rows,
+            "variables": len(truth.names),
+            "seeds": [SEEDS.start, SEEDS.stop - 1],
+            "paired": {
+                "seeds": CONFIRMED,
+                "edges": edges,
+                "confirmed": confirmed,
+                "others": false,
+                "experiments": states,
+            },
+        }
+        for learner, results in runs.items():
+            done = [run for run in results if "failed" not in run]
+            row[learner] = {"failed": len(results) - len(done)}
+            for key in ("f1", "shd", "false", "recall"):
+                values = [run[key] for run in done]
+                if values:
+                    interval = mean_interval(values, proportion=key != "shd").as_dict()
+                    row[learner][key] = {k: interval[k] for k in ("value", "low", "high")}
+        found.append(row)
+        print(json.dumps(row), flush=True)
+    return found
+
+
+CONFIRMED = 5  # seeds of a family whose edges are tried by paired experiments
+UNITS = 2  # episodes of each of them
 
 KINDS = ("paired", "pooled", "coloring, one unit", "coloring, one unit, no pair left")
 
@@ -281,6 +341,7 @@ PARTS: dict[str, Callable[[], Any]] = {
     "protocol": protocol,
     "nonlinear": nonlinear,
     "families": families,
+    "physics": physics,
     "moving": moving,
     "steps": steps,
 }

@@ -26,6 +26,7 @@ from scm_world.discovery.data import Dataset
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
 from scm_world.discovery.metrics import effect_rmse, evaluate
+from scm_world.discovery.physics import PHYSICS
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
     DAMAGED,
@@ -342,7 +343,8 @@ def _kinds(chosen: Learner, problems: Sequence[str | SCM], wanted: Sequence[str]
     if chosen.claims:
         refused = "a learner that is not given the graph; 'coloring' checks one"
     elif chosen.on == "models" and any(
-        isinstance(n, str) and (n in TASKS or n.endswith(FILES)) for n in problems
+        isinstance(n, str) and (n in TASKS or n.endswith(FILES) or n.partition(":")[0] in PHYSICS)
+        for n in problems
     ):
         refused = "'paired' for a world; this one needs families of models or files of SCMs"
     if refused:

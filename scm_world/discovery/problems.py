@@ -30,13 +30,14 @@ from scm_world.discovery.learners.simulators import (
     SCMSimulator,
     StepSimulator,
 )
+from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_of, servo
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json, to_json
 from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.outcomes import Outcome, as_outcome
 from scm_world.queries.samples import STEPS, Setting
-from scm_world.tasks import TASKS, TriFingerTask, make_task
+from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
 from scm_world.tasks.factories import load_factory
 from scm_world.tasks.model import FILES
 from scm_world.variables import Box, Derived, Draw, Exogenous, Function, Linear, Parent
@@ -405,15 +406,16 @@ class WorldProblem:
     Args:
         name: Of a task, a file that is a model, or ``"module:function"``, as ``make_task`` takes.
         view: Causes, outcomes and episodes.
+        task: Instead of the one that is named.
 
     Raises:
         UnknownOption: There is no such task.
         UnknownVariable: A pattern names nothing that can be set.
     """
 
-    def __init__(self, name: str, view: TaskView) -> None:
+    def __init__(self, name: str, view: TaskView, task: Task | None = None) -> None:
         self._view, self._by_step = view, view.view == "step"
-        self._world = Simulation(make_task(name, **view.arguments), **view.options)
+        self._world = Simulation(task or make_task(name, **view.arguments), **view.options)
         try:
             robot = isinstance(self._world.task, TriFingerTask)
             usual = "sweep" if robot and not self._by_step else "random"
@@ -428,10 +430,12 @@ class WorldProblem:
             self._world.close()
             raise
         backend = self._world.backend
-        file = None if name in TASKS else name
-        if ":" in name:
+        file = None if name in TASKS or task else name
+        if file and ":" in name:
             file = inspect.getsourcefile(load_factory(name))
-        mark = "" if file is None else hashlib.sha256(read_bytes(file)).hexdigest()[:16]
+        text = b"" if file is None else read_bytes(file)
+        text = repr(task.given).encode() if task else text
+        mark = hashlib.sha256(text).hexdigest()[:16] if text else ""
         self.version = f"{backend.name} {backend.version} {mark}".strip()
 
     def _chosen(self) -> tuple[str, ...]:
@@ -586,9 +590,10 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
     """Return a benchmark problem.
 
     Args:
-        name: A model, or the name of a problem: a family with a size (``"er2:20"``), a task, the
-            file of a model (.xml, .urdf), the JSON file of an ``SCM``, or ``"module:function"``
-            for a function that gives a task, a world, an ``SCM`` or a ``Problem``.
+        name: A model, or the name of a problem: a family with a size (``"er2:20"``, or
+            ``"servo:10"`` for one of physics), a task, the file of a model (.xml, .urdf), the JSON
+            file of an ``SCM``, or ``"module:function"`` for a function that gives a task, a world,
+            an ``SCM`` or a ``Problem``.
         seed: Which model of the family.
         view: Of a task or a world.
 
@@ -605,6 +610,11 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
         return SCMProblem(problem_label(name, view), name)
     if name.partition(":")[0] in FAMILIES:
         return SCMProblem(name, random_model(name, seed))
+    if name.partition(":")[0] in PHYSICS:
+        family, n, hidden = numbers_of(name)
+        if family == "servo":
+            return ServoProblem(name, servo(n, seed, hidden), view.options)
+        return WorldProblem(name, replace(view, view="step"), Springs(n, seed))
     if name.endswith(".json"):
         try:
             return SCMProblem(Path(name).stem, from_json(read_text(Path(name))))
@@ -616,7 +626,7 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
         if isinstance(made, SCM | Problem):
             return SCMProblem(name, made) if isinstance(made, SCM) else made
     elif name not in TASKS and not name.endswith(FILES):
-        families = (f"{family}:N" for family in FAMILIES)
+        families = (f"{family}:N" for family in (*FAMILIES, *PHYSICS))
         raise UnknownOption(
             "problem", name, (*TASKS, *families, "FILE.json", "FILE.xml", "FILE.urdf")
         )
@@ -627,7 +637,7 @@ def problem_label(name: str | SCM, view: TaskView) -> str:
     """Return the name of a problem as it is shown; of a model it tells models apart."""
     if isinstance(name, SCM):
         return f"model {hashlib.sha256(to_json(name).encode()).hexdigest()[:8]}"
-    if name.partition(":")[0] in FAMILIES or name.endswith(".json"):
+    if name.partition(":")[0] in (*FAMILIES, *PHYSICS) or name.endswith(".json"):
         return Path(name).stem if name.endswith(".json") else name
     home, colon, function = name.rpartition(":")
     short = f"{Path(home).stem if home.endswith('.py') else home}:{function}" if colon else name
