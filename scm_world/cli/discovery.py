@@ -83,8 +83,8 @@ def discover(
 
     Args:
         task: A task, a model.xml or model.urdf, or module:function; with --learner also a family
-            with a size (er2:20, sf2:50, tanh4:100), the JSON file of an SCM, or several with
-            commas between them.
+            with a size (er2:20, sf2:50, servo:10), the JSON file of an SCM, or several with commas
+            between them.
         probes: Number of states to experiment in.
         strict: Exit 1 if the SHD is not 0.
         learner: Learners to benchmark, with commas; see 'scm-world list'.
@@ -243,6 +243,7 @@ def _benchmark(
     from scm_world.discovery.benchmarks import benchmark, slug
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
+    from scm_world.discovery.physics import PHYSICS
     from scm_world.discovery.problems import FAMILIES
     from scm_world.policies.scripted import NAMED
 
@@ -255,7 +256,8 @@ def _benchmark(
     policies = (*NAMED, "still", "usual")
     one_of("policy", view.policy, policies)
     view = replace(view, policy=None) if view.policy == "still" else view
-    drawn = [n.partition(":")[0] in FAMILIES or n.endswith(".json") for n in problems]
+    families = (*FAMILIES, *PHYSICS)
+    drawn = [n.partition(":")[0] in families or n.endswith(".json") for n in problems]
     if option:
         if drawn != [False]:
             raise UnknownOption("problem", task, ("one task, if --option is given",))

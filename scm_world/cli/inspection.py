@@ -186,6 +186,7 @@ def list_(zoo: bool = False) -> None:
     """
     from scm_world.backends import backends, make_backend
     from scm_world.discovery.learners import learners
+    from scm_world.discovery.physics import PHYSICS
     from scm_world.discovery.problems import FAMILIES
     from scm_world.env import IDS
     from scm_world.errors import EngineError
@@ -247,7 +248,8 @@ def list_(zoo: bool = False) -> None:
             name: ": ".join(filter(None, (one.task, policies.best_known(one))))
             for name, one in trained.items()
         },
-        "families": {f"{name}:N": first_line(draw.__doc__) for name, draw in FAMILIES.items()},
+        "families": {f"{name}:N": first_line(draw.__doc__) for name, draw in FAMILIES.items()}
+        | {f"{name}:N": doc for name, doc in PHYSICS.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }
     rows = [
