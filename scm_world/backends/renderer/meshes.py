@@ -335,6 +335,23 @@ def shadow_map(
         draw_mesh(mesh, view, towards, 1.0, canvas)
     shadow = np.where(np.isfinite(depth), 1.0, 0.0)
     for _ in range(SHADOW_BLUR):
-        shadow[1:-1] = (shadow[:-2] + shadow[1:-1] + shadow[2:]) / 3.0
-        shadow[:, 1:-1] = (shadow[:, :-2] + shadow[:, 1:-1] + shadow[:, 2:]) / 3.0
+        _soften(shadow)
     return shadow
+
+
+@njit(cache=True, error_model="numpy")
+def _soften(shadow: Floats) -> None:
+    """Average each texel with its two neighbors, along the first axis and then the second."""
+    n, m = shadow.shape
+    last = shadow[0].copy()
+    for i in range(1, n - 1):
+        for j in range(m):
+            here = shadow[i, j]
+            shadow[i, j] = (last[j] + here + shadow[i + 1, j]) / 3.0
+            last[j] = here
+    for i in range(n):
+        left = shadow[i, 0]
+        for j in range(1, m - 1):
+            here = shadow[i, j]
+            shadow[i, j] = (left + here + shadow[i, j + 1]) / 3.0
+            left = here

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -320,11 +323,27 @@ def following(camera: Camera, shapes: Sequence[Shape]) -> Camera:
     return replace(camera, eye=tuple((eye + step).tolist()), target=tuple((target + step).tolist()))
 
 
-def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:
-    """Write a picture to a file; the only thing here that needs matplotlib."""
-    from matplotlib.image import imsave
+def png(rgb: NDArray[np.uint8]) -> bytes:
+    """Encode a picture of shape (h, w, 3) as PNG, without filters: what is drawn is flat.
 
-    imsave(path, rgb, format="png")
+    Source:
+        W3C, *Portable Network Graphics (PNG) Specification*, second edition, 2003.
+    """
+    height, width, _ = rgb.shape
+    lines = np.zeros((height, 1 + 3 * width), dtype=np.uint8)
+    lines[:, 1:] = rgb.reshape(height, -1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = (b"IHDR", header), (b"IDAT", zlib.compress(lines, 1)), (b"IEND", b"")
+    chunks = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+def write_png(path: str | PathLike[str], rgb: NDArray[np.uint8]) -> None:
+    """Write a picture to a file."""
+    Path(path).write_bytes(png(rgb))
 
 
 def _average(fine: NDArray[np.uint8], samples: int) -> NDArray[np.uint8]:

@@ -4,10 +4,11 @@ from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
 from scm_world.discovery.data.folders import load, save
-from scm_world.discovery.data.pictures import triplets
+from scm_world.discovery.data.pictures import Pictures
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sources import DataSource, SourceRows
 from scm_world.discovery.data.sweeps import Levels, Swept, sweep
+from scm_world.discovery.data.triplets import triplets
 from scm_world.discovery.data.truth import GroundTruth
 from scm_world.discovery.data.views import (
     Arrays,
@@ -32,6 +33,7 @@ __all__ = [
     "Design",
     "GroundTruth",
     "Levels",
+    "Pictures",
     "Regime",
     "SourceRows",
     "Swept",
