@@ -10,6 +10,8 @@ import numpy as np
 
 from scm_world._types import Floats, Value
 from scm_world.errors import UnknownOption, UnknownVariable
+from scm_world.models.camera import Camera
+from scm_world.models.scene import Scene
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.parallel import Result, run_units
@@ -130,6 +132,20 @@ class Episode:
     def __repr__(self) -> str:
         held = ", ".join(f"{name} from {at}" for at, plan in self.layers for name in plan)
         return f"Episode({self.steps} steps, seed {self.seed}, number {self.number}, do({held}))"
+
+    def scene(self, step: int) -> tuple[Scene, tuple[Camera, ...]]:
+        """Describe an instant of a world for pictures, without running it again.
+
+        Args:
+            step: Number of the instant, as in ``__getitem__``.
+
+        Returns:
+            The scene, and the cameras whose places are variables.
+        """
+        values = _at(self.trace, step)
+        compiled = next(c for at, c in reversed(self.trace.declarations) if at <= step)
+        state = compiled.empty_state(np.array(self.trace.vectors[step]))
+        return compiled.describe(values, state), compiled.composition.cameras(values)
 
     # --- counterfactuals -----------------------------------------------------------------
 

@@ -262,7 +262,8 @@ class World(Simulation, Questions):
 
     def _with(self, do: Mapping[str, Any] | None) -> Plan:
         """Add something to what is given; of two names of one quantity the later one counts."""
-        return Plan(merged(self.model, self._standing, Plan(do)))
+        plan = Plan(do)
+        return Plan(merged(self.model, self._standing, plan)) if len(self._standing) else plan
 
     def _asked(self) -> tuple[AnyTwins, System]:
         return twins_of(self), self

@@ -13,6 +13,7 @@ from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.folders import SHARD, Folder, Head, refusals, together
+from scm_world.discovery.data.pictures import Pictures
 from scm_world.discovery.data.sources import DataSource, ModelSource, SourceRows, Tell
 from scm_world.discovery.data.worlds import Experiments, WorldSource
 from scm_world.errors import InterventionError, ModelError, UnknownOption
@@ -38,6 +39,7 @@ class Circumstances(TypedDict, total=False):
     causes: Iterable[str] | None
     outcomes: Iterable[Any] | None
     every_step: bool
+    pictures: Pictures | None
 
 
 def collect(
@@ -77,7 +79,8 @@ def collect(
             ``engine_of``. A laboratory, which keeps a log, has the first one only.
         circumstances: ``steps`` of an episode, 25 in a world. Of a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
-            or ``Outcome``), and ``every_step``: a row for each control step, with the action.
+            or ``Outcome``), ``every_step``: a row for each control step, with the action, and
+            ``pictures`` to write beside the rows, in files of their own in ``out``.
 
     Returns:
         The table. Episodes that were refused are left out, and listed in ``about["refused"]``.
@@ -104,6 +107,8 @@ def collect(
     whole_number("seed", seed, least=0)
     made = source_of(source, design, count, seed=seed, **circumstances)
     about = json.loads(json.dumps(made.about))
+    if out is None and "pictures" in about:
+        raise UnknownOption("out", None, ("a folder, since there are pictures",))
     folder = None
     if out is None:
         size = count if made.at_once else size
@@ -160,6 +165,7 @@ def source_of(
                 outcomes=given.get("outcomes"),
                 every_step=given.get("every_step", False),
                 setting=setting,
+                pictures=given.get("pictures"),
             )
     if not hasattr(source, "part"):
         raise UnknownOption("source", source, ("an SCM", "a World", "a Laboratory", "a Source"))
@@ -212,6 +218,7 @@ def _gathered(
             raise InterventionError(f"{said}: {why}", variable="")
         if folder is not None:
             folder.write(index, ranges[index], part)
+            parts[index] = replace(part, pictures=b"")
         if not serial:
             tell(len(ranges[index]))
     return [parts[index] for index in range(len(ranges))]

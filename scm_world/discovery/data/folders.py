@@ -13,6 +13,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
+from scm_world.discovery.data.pictures import ENDINGS
 from scm_world.discovery.data.shards import (
     check_kind,
     check_names,
@@ -123,6 +124,13 @@ class Folder:
         """Name a file."""
         return self.path / f"shard-{index:05d}.{self.head.kind}"
 
+    def pictures(self, index: int) -> Location | None:
+        """Name the file with the pictures that belong to a file; None where there are none."""
+        taken = self.head.about.get("pictures")
+        if taken is None or self.head.content is not None:  # a saved table has none
+            return None
+        return self.path / f"pictures-{index:05d}.{ENDINGS[taken['format']]}"
+
     def read(self, index: int, numbers: range) -> SourceRows | None:
         """Read a file; None where it is not there, or ends before it should.
 
@@ -131,6 +139,9 @@ class Folder:
         """
         path = self.shard(index)
         head = self.head
+        pictures = self.pictures(index)
+        if pictures is not None and not pictures.exists():
+            return None
         try:
             data = read_bytes(path, LARGEST_TABLE)
         except FileNotFoundError:
@@ -165,6 +176,9 @@ class Folder:
         Raises:
             UnwritableFolder: There is no room, or no permission.
         """
+        pictures = self.pictures(index)
+        if pictures is not None:  # first, so that a file of the table never lacks them
+            write_durably(pictures, part.pictures)
         write_durably(self.shard(index), encoded(part, self._plan, numbers, self.head.kind))
 
     # --- the sidecar --------------------------------------------------------------------------
@@ -182,7 +196,7 @@ class Folder:
         check_names(self.head.columns)
         with locked(self.path):
             for stale in self.path.glob(f".*{PARTIAL}"):  # of a process that was killed
-                if is_draft(stale.name, "shard-") or is_draft(stale.name, SIDECAR):
+                if any(is_draft(stale.name, of) for of in ("shard-", "pictures-", SIDECAR)):
                     removed(stale)
             if (self.path / SIDECAR).exists():
                 self._check_same(read_sidecar(self.path))

@@ -78,7 +78,7 @@ class Pictures:
         """Write rows as the bytes of a file; the same ones every time.
 
         Args:
-            rows: All with the same columns; not none.
+            rows: All with the same columns.
             keys: Of the samples in a tar file, one for each row.
         """
         return _parquet(rows) if self.format == "parquet" else _tar(rows, keys)
@@ -90,7 +90,7 @@ def _parquet(rows: Sequence[Row]) -> bytes:
     parquet = load("pyarrow.parquet", "pyarrow", "data")
     image = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
     columns, features = dict[str, Any](), dict[str, Any]()
-    for name, first in rows[0].items():
+    for name, first in rows[0].items() if rows else ():
         values = [row[name] for row in rows]
         if isinstance(first, bytes):
             cells = [{"bytes": value, "path": None} for value in values]

@@ -36,10 +36,12 @@ class SourceRows:
     Attributes:
         table: The rows.
         refused: Numbers of the episodes that could not be, and why.
+        pictures: The file with the pictures beside the rows, if there are any.
     """
 
     table: Dataset
     refused: tuple[tuple[int, str], ...] = ()
+    pictures: bytes = b""
 
 
 class DataSource(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, final
 
 import numpy as np
@@ -13,6 +13,8 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Column, Dataset, Regime, Row, columns_of
 from scm_world.discovery.data.designs import Design
+from scm_world.discovery.data.pictures import Pictures
+from scm_world.discovery.data.pictures import Row as Picture
 from scm_world.discovery.data.recorded import (
     columns_of_outcome,
     default_causes,
@@ -74,6 +76,7 @@ class WorldSource:
         outcomes: Names of variables or ``Outcome``; ``default_outcomes`` if None.
         every_step: One row for each control step in place of one for each episode.
         setting: Who acts, what varies by itself, how long, and the seed.
+        pictures: To take at each control step, or at the beginning and at the end; none if None.
 
     Raises:
         InterventionError: A target, or what varies, cannot be set to its values.
@@ -95,7 +98,9 @@ class WorldSource:
         outcomes: Iterable[Any] | None,
         every_step: bool,
         setting: Setting,
+        pictures: Pictures | None = None,
     ) -> None:
+        self._pictures = pictures
         self._world, self._twins, self._design = world, twins, design
         self._setting, self._given = setting, getattr(world, "plan", Plan())
         self._every_step, model = every_step, world.model
@@ -142,6 +147,7 @@ class WorldSource:
             "nature": Plan(setting.nature).as_dict()["do"],
             "design": design.as_dict(),
             "engine": "equations" if isinstance(world, Equations) else world.backend.name,
+            **({} if pictures is None else {"pictures": asdict(pictures)}),
             "truth": self._truth(varied, measured),
             "versions": versions("" if isinstance(world, Equations) else world.engine),
         }
@@ -171,12 +177,17 @@ class WorldSource:
         regimes = [self._design.regime_of(kind) for kind in chosen]
         lock = threading.Lock()
 
+        seen: dict[int, list[Picture]] = {}
+
         def finish(place: int, result: Result) -> Floats | str:
             if isinstance(result, Exception) and not isinstance(result, InterventionError):
                 raise result
             found: Floats | str = str(result)
             if not isinstance(result, Exception):
-                found = self._row(Episode(self._twins, units[place], result))
+                episode = Episode(self._twins, units[place], result)
+                found = self._row(episode)
+                if self._pictures is not None:
+                    seen[place] = self._look(self._pictures, episode)
             with lock:
                 tell(1)
             return found
@@ -198,7 +209,25 @@ class WorldSource:
             for step, row in enumerate(values):
                 named = replace(done, targets=self._targets(done.targets, step))
                 rows.append((number, step, named, row))
-        return SourceRows(Dataset.stacked(self.columns, rows, self.about), tuple(refused))
+        table = Dataset.stacked(self.columns, rows, self.about)
+        if self._pictures is None:
+            return SourceRows(table, tuple(refused))
+        shots = [shot for place in sorted(seen) for shot in seen[place]]
+        keys = [f"{shot['episode']:08d}-{shot['step']:06d}" for shot in shots]
+        return SourceRows(table, tuple(refused), self._pictures.encoded(shots, keys))
+
+    def _look(self, pictures: Pictures, episode: Episode) -> list[Picture]:
+        """Take the pictures of an episode, one row of them for each of its rows."""
+        if self._every_step:
+            return [
+                {"episode": episode.number, "step": t, **pictures.take(*episode.scene(t))}
+                for t in range(episode.steps)
+            ]
+        first = pictures.take(*episode.scene(0), "first_image")
+        return [
+            {"episode": episode.number, "step": 0, **first}
+            | pictures.take(*episode.scene(episode.steps))
+        ]
 
     def _targets(self, names: Iterable[str], step: int) -> tuple[str, ...]:
         """Name the columns' variables that are set in a row; a state is at the first step only."""
