@@ -113,6 +113,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {  # each with arguments that make it sho
     "panda_reach": (),
     "predator_prey": ("10",),
     "recording": (),
+    "representations": ("60", "1", "1"),
     "sim_to_sim": ("sweep", "pushing", "2"),
     "train_and_evaluate": ("4096", "", "1"),
     "transfer_a_to_b": ("sweep", "pushing", "2"),
@@ -123,15 +124,18 @@ SHORT = (
     *("cartpole_swing_up", "panda_reach", "predator_prey"),
     *("sim_to_sim", "train_and_evaluate", "transfer_a_to_b"),
 )
-LEARNING = {"train_and_evaluate"}  # they need the extra "train", which few machines have
+LEARNING = {  # they need the extra "train", which few machines have
+    "train_and_evaluate": ("stable_baselines3",),
+    "representations": ("torch", "sklearn", "pyarrow", "PIL"),
+}
 MODELS = {"panda_reach": "robosuite"}  # where the model comes from; importing it takes seconds
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Every example runs and prints something."""
-    if name in LEARNING:
-        pytest.importorskip("stable_baselines3")
+    for library in LEARNING.get(name, ()):
+        pytest.importorskip(library)
     if name in MODELS and importlib.util.find_spec(MODELS[name]) is None:
         pytest.skip(f"{MODELS[name]} is not installed")
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"))["main"](*EXAMPLES[name])

@@ -12,7 +12,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from scm_world.cli import console
-from scm_world.cli.datasets import collect, sweep
+from scm_world.cli.datasets import collect, sweep, triplets
 from scm_world.cli.discovery import discover, verify
 from scm_world.cli.evaluation import evaluate, explain
 from scm_world.cli.inspection import graph, list_, variables
@@ -73,7 +73,7 @@ def root(
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, graph, variables, do, effect, counterfactual),
-    *(collect, sweep, evaluate, explain, train, clone, list_),
+    *(collect, sweep, triplets, evaluate, explain, train, clone, list_),
 )
 for _command in COMMANDS:
     app.command(_command.__name__.rstrip("_"), help=documented(_command))(_command)

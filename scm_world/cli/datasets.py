@@ -1,4 +1,4 @@
-"""The commands that collect tables of episodes: ``collect`` and ``sweep``."""
+"""The commands that collect data: ``collect``, ``sweep`` and ``triplets``."""
 
 from __future__ import annotations
 
@@ -24,6 +24,15 @@ from scm_world.cli.arguments import (
 from scm_world.errors import UnknownOption
 from scm_world.output.remote import Location
 
+Describe = Annotated[
+    bool,
+    typer.Option(
+        "--croissant",
+        help="Write README.md and croissant.json, too, by which Hugging Face and mlcroissant find "
+        "the Parquet files.",
+    ),
+]
+Size = Annotated[int, typer.Option(min=1, help="Height and width of a picture in pixels.")]
 SHOWN, POINTS = 12, 40  # targets, and points of a grid, that are printed
 
 
@@ -54,6 +63,11 @@ def collect(
     backend: options.Backend = None,
     seed: options.Seed = 0,
     preset: options.Preset = None,
+    picture: options.Patterns = None,
+    picture_size: Size = 64,
+    picture_format: str = "parquet",
+    goal_pictures: bool = False,
+    croissant: Describe = False,
     shard: options.Shard = 100,
     format_: options.Files = "parquet",
     workers: options.Workers = None,
@@ -78,8 +92,11 @@ def collect(
         values: Support of interventions: A (training), B (held out) or 'A|B'.
         observational_fraction: Share of episodes without an intervention.
         every_step: A row for each control step.
+        picture: Camera of pictures beside the rows, or 'usual'; repeat it for more.
+        picture_format: Format of the files with pictures: parquet or webdataset.
+        goal_pictures: Pictures of the goals, too.
     """
-    from scm_world.discovery.data import Design, default_causes
+    from scm_world.discovery.data import Design, Pictures, default_causes
     from scm_world.discovery.data import collect as collected
     from scm_world.discovery.data.folders import SIDECAR
     from scm_world.discovery.data.recorded import settable
@@ -95,6 +112,9 @@ def collect(
         "outcomes": [parse_outcome(text) for text in outcome or ()],
         "every_step": every_step,
     }
+    if picture:
+        size = picture_size, picture_size
+        asked["pictures"] = Pictures(cameras_of(picture), size, goal_pictures, picture_format)
     asked = {name: value for name, value in asked.items() if value}
     with open_system(task, option, backend=backend, preset=preset) as system:
         used = backend_of(system)
@@ -145,7 +165,101 @@ def collect(
     title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
     console.table(("", "episodes", "rows"), rows, title=title)
     shards = list[Location](folder.glob("shard-*.*"))
-    console.written(folder / SIDECAR, *sorted(shards, key=str)[:1])
+    described = [describe(folder)] if croissant else []
+    console.written(folder / SIDECAR, *sorted(shards, key=str)[:1], *described)
+
+
+def describe(folder: Location) -> Location:
+    """Describe a folder for Hugging Face; return the Croissant file."""
+    from scm_world.discovery.data import as_huggingface
+
+    return as_huggingface(folder) / "croissant.json"
+
+
+def cameras_of(names: Iterable[str]) -> tuple[str | None, ...]:
+    """Return cameras by their names; ``"usual"`` is the one of pictures for people."""
+    return tuple(None if name == "usual" else name for name in names)
+
+
+def triplets(
+    task: options.System,
+    factor: options.Patterns = None,
+    n: options.N = 1000,
+    targets: options.Count = 1,
+    steps: options.NotNegative = 0,
+    given: options.Do = None,
+    camera: options.Patterns = None,
+    size: Size = 64,
+    backend: options.Backend = None,
+    seed: options.Seed = 0,
+    shard: Annotated[int, typer.Option(min=1)] = 1000,
+    format_: Annotated[str, typer.Option("--format")] = "parquet",
+    croissant: Describe = False,
+    workers: options.Workers = None,
+    executor: options.Executor = None,
+    address: options.Address = None,
+    out: options.Out = None,
+    option: options.Option = None,
+) -> None:
+    """Write pairs of pictures, before and after an intervention, with factors and targets.
+
+    With SYSTEM causal_circuit, pairs in the layout of the dataset CausalCircuit: ten files for
+    training with N pairs in all, and two with a tenth of that for validation and for testing.
+    Example: scm-world triplets pushing --factor '*.color' --factor light_ambient -n 5000
+
+    Args:
+        factor: Variables with a space A that are drawn; '*.color' by default. Repeat it for more.
+        n: Number of pairs.
+        targets: How many factors are drawn again in each pair.
+        steps: Control steps before the pictures are taken.
+        given: Further intervention in every pair; repeat it for more.
+        camera: Camera of the pictures, or 'usual'; repeat it for more.
+        shard: Pairs in one file.
+        format_: Format of the files: parquet or webdataset.
+    """
+    from scm_world.discovery.data import causal_circuit
+    from scm_world.discovery.data import triplets as written
+    from scm_world.discovery.data.pictures import ENDINGS
+    from scm_world.discovery.data.recorded import settable
+    from scm_world.queries import SCM
+
+    circuit = task == "causal_circuit"
+    folder = console.results_folder(out, "triplets", tag(task), f"seed{seed}", option=option)
+    how: dict[str, Any] = {"size": (size, size), "seed": seed}
+    with (
+        console.resumable(folder, "t*-*.*", "files"),
+        options.open_executor(executor, workers, address, "pairs") as (pool, tell),
+    ):
+        how |= {"engine": pool, "progress": tell}
+        if circuit:
+            causal_circuit(folder, train=n, val=max(n // 10, 1), test=max(n // 10, 1), **how)
+        else:
+            held = parse_assignments(given, "'--given'")
+            with open_system(task, option, backend=backend, preset=None) as plain:
+                if isinstance(plain, SCM):
+                    raise refused(task, "has no pictures: it is no world", "'SYSTEM'")
+                with plain.given(held) as system:
+                    model = system.model
+                    drawn = (v for v in model if model.declared(v).space("A") is not None)
+                    free = set(drawn)
+                    names = [v for v in settable(system, factor or ["*.color"]) if v in free]
+                    written(
+                        system,
+                        names,
+                        n,
+                        folder,
+                        cameras=cameras_of(camera or ["usual"]),
+                        targets=targets,
+                        steps=steps,
+                        shard=shard,
+                        format=format_,
+                        **how,
+                    )
+    found = list[Location](folder.glob("*.npz" if circuit else f"*.{ENDINGS[format_]}"))
+    files = sorted(found, key=str)
+    console.say(f"{n:,} pairs in {len(files)} files")
+    described = [describe(folder)] if croissant else []
+    console.written(*files[:1], *described)
 
 
 def sweep(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import hashlib
 import io
 import json
+import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +14,17 @@ import numpy as np
 import pytest
 
 from scm_world import World
-from scm_world.discovery.data import triplets
+from scm_world.discovery.data import (
+    Design,
+    Pictures,
+    as_huggingface,
+    causal_circuit,
+    collect,
+    load,
+    triplets,
+)
 from scm_world.errors import UnknownOption, UnknownVariable, UnreadableFile
+from scm_world.variables import Mechanism
 
 parquet = pytest.importorskip("pyarrow.parquet")
 Image = pytest.importorskip("PIL.Image")
@@ -107,3 +119,178 @@ def test_what_makes_no_pairs_is_refused(
     with pytest.raises(error, match=words):
         triplets(World("pushing", backend="fake"), **given)
     assert not (tmp_path / "t").exists()
+
+
+def test_a_counterfactual_that_shows_nothing_is_the_same_picture(tmp_path: Path) -> None:
+    """Byte for byte: a mass is seen nowhere, and noise stays."""
+    factors = ["tool_block.mass", "light_ambient"]
+    for row in rows(triplets(World("pushing"), factors, 12, tmp_path / "t", size=(24, 24))):
+        same = row["image"] == row["image_counterfactual"]
+        assert same == (row["targets"] == ["tool_block.mass"])
+        fixed = factors[1 - factors.index(row["targets"][0])]
+        assert row[f"z.{fixed}"] == row[f"z_counterfactual.{fixed}"]
+
+
+def darker(color: Any) -> Any:
+    """Give half a color."""
+    return color / 2.0
+
+
+def test_a_factor_with_a_mechanism_follows_it(tmp_path: Path) -> None:
+    """In x, and in x̃ unless it is the target."""
+    tie = Mechanism(darker, ["floor_color"])
+    with World("pushing", backend="fake") as plain, plain.given({"stage_color": tie}) as world:
+        found = rows(
+            triplets(world, ["floor_color", "stage_color"], 8, tmp_path / "t", size=(16, 16))
+        )
+    for row in found:
+        for which in ("", "_counterfactual"):
+            follows = np.allclose(
+                row[f"z{which}.stage_color"], np.divide(row[f"z{which}.floor_color"], 2)
+            )
+            assert follows == (not which or row["targets"] == ["floor_color"])
+
+
+def test_webdataset_files(tmp_path: Path) -> None:
+    """Members of a sample have one name up to the first dot; ``webdataset`` reads them."""
+    given: dict[str, Any] = {"shard": 2, "cameras": ("60", "120"), "size": (16, 16)}
+    world = World("pushing", backend="fake")
+    folder = triplets(world, FACTORS, 3, tmp_path / "w", format="webdataset", **given)
+    again = triplets(world, FACTORS, 3, tmp_path / "p", **given)
+    assert sorted(path.name for path in folder.glob("*.tar")) == [
+        f"triplets-{i:05d}-of-00002.tar" for i in range(2)
+    ]
+    first = rows(again)[0]
+    with tarfile.open(folder / "triplets-00000-of-00002.tar") as tar:
+        data = {member.name: tar.extractfile(member).read() for member in tar}  # type: ignore[union-attr]
+    assert {name.partition(".")[0] for name in data} == {"00000000", "00000001"}
+    assert data["00000000.image.60.png"] == first["image.60"]["bytes"]
+    plain = json.loads(data["00000000.json"])
+    assert plain == {name: first[name] for name in plain}
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_the_webdataset_package_reads_them(tmp_path: Path) -> None:
+    """With decoded pictures; it leaves files open."""
+    webdataset = pytest.importorskip("webdataset", reason="webdataset is not installed")
+    world, given = World("pushing", backend="fake"), {"shard": 2, "size": (16, 16)}
+    folder = triplets(world, FACTORS, 3, tmp_path / "w", format="webdataset", **given)
+    paths = sorted(map(str, folder.glob("*.tar")))
+    samples = list(webdataset.WebDataset(paths, shardshuffle=False).decode("rgb8"))
+    assert len(samples) == 3
+    assert samples[0]["image_counterfactual.png"].shape == (16, 16, 3)
+    gc.collect()
+
+
+def test_causal_circuit_has_the_published_layout(tmp_path: Path) -> None:
+    """Arrays of the published names and shapes; x̃ has the same noise but for its target."""
+    how: dict[str, Any] = {"train": 20, "val": 2, "test": 2, "size": (24, 24), "seed": 1}
+    folder = causal_circuit(tmp_path / "c", **how)
+    names = {path.name for path in folder.glob("*.npz")}
+    assert names == {*(f"train-{i}.npz" for i in range(10)), "val.npz", "test.npz"}
+    kept = (folder / "train-3.npz").read_bytes()
+    (folder / "train-3.npz").unlink()
+    causal_circuit(folder, **how)
+    assert (folder / "train-3.npz").read_bytes() == kept
+    parts = [dict(np.load(folder / f"train-{i}.npz")) for i in range(10)]
+    data = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    latents, noise, labels = (
+        data[n] for n in ("original_latents", "epsilon", "intervention_labels")
+    )
+    assert latents.shape == noise.shape == (20, 2, 4)
+    assert data["pressed"].shape == (20, 2, 3)
+    assert data["imgs"].shape == (20, 2)
+    assert ((latents >= 0.0) & (latents <= 1.0)).all()
+    assert len(set(labels)) > 3
+    for i, label in enumerate(labels):
+        assert data["intervention_masks"][i].tolist() == [label == k + 1 for k in range(4)]
+        others = [k for k in range(4) if k + 1 != label]
+        np.testing.assert_allclose(noise[i, 1, others], noise[i, 0, others], atol=1e-9)
+        one, other = (np.asarray(Image.open(io.BytesIO(cell))) for cell in data["imgs"][i])
+        assert one.shape == (24, 24, 3)
+        assert (one == other).all() == (label == 0)
+        moved = {k for k in range(4) if latents[i, 0, k] != latents[i, 1, k]}
+        follows = {0: set(), 1: {0}, 2: {0, 1}, 3: {0, 2}, 4: {0, 1, 2, 3}}[int(label)]
+        assert moved <= follows
+        assert label == 0 or label - 1 in moved
+    with pytest.raises(UnknownOption, match="train"):
+        causal_circuit(tmp_path / "d", train=9)
+
+
+def test_pictures_beside_rows(tmp_path: Path) -> None:
+    """What is seen at an instant is what the row says; a shard without them is made anew."""
+    world, design = World("pushing"), Design("single", ("tool_block.mass",))
+    pictures = Pictures(cameras=("60", "120"), size=(24, 24), goals=True)
+    how: dict[str, Any] = {"steps": 2, "shard": 2, "every_step": True, "pictures": pictures}
+    out = tmp_path / "a"
+    table = collect(world, design, 3, out=out, **how)
+    files = sorted(out.glob("pictures-*.parquet"))
+    seen = [row for file in files for row in parquet.read_table(file).to_pylist()]
+    assert [(row["episode"], row["step"]) for row in seen] == list(
+        zip(table.episode.tolist(), table.step.tolist(), strict=True)
+    )
+    assert set(seen[0]) == {"episode", "step"} | {
+        f"{kind}image.{camera}" for kind in ("", "goal_") for camera in ("60", "120")
+    }
+    episode = world.rollout("random", seed=0, episode=1, steps=2)
+    world.reset(seed=0, episode=1)
+    world.step(episode.actions[0])
+    scene, cameras = episode.scene(1)
+    assert pictures.take(scene, cameras) == pictures.take(world.scene(), world.cameras())
+    kept = [file.read_bytes() for file in files]
+    files[0].unlink()
+    assert collect(world, design, 3, out=out, **how) == table == load(out)
+    assert [file.read_bytes() for file in files] == kept
+    whole = tmp_path / "b"
+    taken = Pictures(size=(16, 16), format="webdataset")
+    collect(world, design, 2, steps=1, out=whole, pictures=taken)
+    with tarfile.open(whole / "pictures-00000.tar") as tar:
+        assert tar.getnames()[:3] == [
+            f"00000000-000000.{n}" for n in ("first_image.png", "image.png", "json")
+        ]
+    with pytest.raises(UnknownOption, match="folder"):
+        collect(world, design, 2, pictures=pictures)
+    with pytest.raises(UnknownOption, match="parquet, webdataset"):
+        Pictures(format="npz")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_mlcroissant_reads_what_is_described(tmp_path: Path) -> None:
+    """Without a warning, and without the network."""
+    croissant = pytest.importorskip("mlcroissant", reason="mlcroissant is not installed")
+    folder = triplets(World("pushing", backend="fake"), FACTORS, 4, tmp_path / "t", shard=3)
+    as_huggingface(folder, **ABOUT)
+    read = croissant.Dataset(folder / "croissant.json")
+    assert not read.metadata.issues.errors
+    assert not read.metadata.issues.warnings
+    found = list(read.records("pairs"))
+    assert len(found) == 4
+    assert found[0]["pairs/z.floor_color"] == pytest.approx(rows(folder)[0]["z.floor_color"])
+    assert found[0]["pairs/image"].size == (64, 64)
+
+
+ABOUT = {
+    "name": "pairs",
+    "license": "cc-by-4.0",
+    "creator": "us",
+    "url": "https://example.org",
+    "published": "2026-01-01",
+    "citation": "@misc{pairs}",
+}
+
+
+def test_croissant_and_hugging_face(tmp_path: Path) -> None:
+    """Sums of the files and all columns are there; the libraries read what is described."""
+    folder = triplets(World("pushing", backend="fake"), FACTORS, 4, tmp_path / "t", shard=3)
+    as_huggingface(folder, **ABOUT)
+    about = json.loads((folder / "croissant.json").read_text())
+    assert about["conformsTo"] == "http://mlcommons.org/croissant/1.1"
+    sums = {part["name"]: part.get("sha256") for part in about["distribution"]}
+    for path in folder.glob("*.parquet"):
+        assert sums[path.name] == hashlib.sha256(path.read_bytes()).hexdigest()
+    (records,) = about["recordSet"]
+    assert [field["name"] for field in records["field"]] == list(rows(folder)[0])
+    assert 'data_files: "triplets-*.parquet"' in (folder / "README.md").read_text()
+    assert triplets(World("pushing", backend="fake"), FACTORS, 4, folder, shard=3) == folder
+    with pytest.raises(UnreadableFile, match="Parquet"):
+        as_huggingface(tmp_path)

@@ -1,6 +1,8 @@
 """Data from interventions: tables with regimes, and how to collect them."""
 
+from scm_world.discovery.data.circuit import causal_circuit, circuit_model
 from scm_world.discovery.data.collect import collect
+from scm_world.discovery.data.croissant import as_huggingface
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
 from scm_world.discovery.data.folders import load, save
@@ -42,8 +44,11 @@ __all__ = [
     "as_dcdi",
     "as_frame",
     "as_gies",
+    "as_huggingface",
     "as_numpy",
     "as_tigramite",
+    "causal_circuit",
+    "circuit_model",
     "collect",
     "default_causes",
     "default_outcomes",

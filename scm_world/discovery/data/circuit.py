@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -17,6 +16,7 @@ from scm_world.backends.renderer import picture, png
 from scm_world.discovery.data.triplets import write_files
 from scm_world.graph import SCM
 from scm_world.models.camera import Camera
+from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.tasks.trifinger.general import General
@@ -90,7 +90,7 @@ def circuit_model() -> SCM:
 
 
 def causal_circuit(
-    out: Path | str,
+    out: Location | str,
     *,
     train: int = 100_000,
     val: int = 10_000,
@@ -100,7 +100,7 @@ def causal_circuit(
     workers: int | None = None,
     engine: Executor | str | None = None,
     progress: Progress | None = None,
-) -> Path:
+) -> Location:
     """Write pairs of pictures in the layout of CausalCircuit, with our TriFinger.
 
     In each pair nothing, or one of the four latents, is drawn anew, by lot; noise stays. Files are
@@ -118,7 +118,7 @@ def causal_circuit(
     in its functions are ours. An interrupted call resumes when it is repeated.
 
     Args:
-        out: A folder: new, empty, or one of the same call.
+        out: A folder, or a URL: new, empty, or one of the same call.
         train: How many pairs are for training.
         val: How many for validation.
         test: How many for testing.
@@ -155,7 +155,7 @@ def causal_circuit(
         first += n
     maker = _Circuit((height, width), whole_number("seed", seed, least=0))
     about = {"circuit": counts, "size": [height, width], "seed": seed, "versions": versions()}
-    return write_files(Path(out), files, maker, about, workers, engine, progress)
+    return write_files(located(out), files, maker, about, workers, engine, progress)
 
 
 @final

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-from pathlib import Path
 from typing import Any
 
 from scm_world._arguments import load
 from scm_world.errors import UnreadableFile
 from scm_world.output.durable import write_durably
+from scm_world.output.remote import Location, located
 
 CONFORMS = "http://mlcommons.org/croissant/1.1"
 PARQUET = "application/x-parquet"
@@ -41,7 +42,7 @@ CONTEXT = {
 
 
 def as_huggingface(
-    folder: Path | str,
+    folder: Location | str,
     *,
     name: str = "",
     description: str = "",
@@ -51,7 +52,7 @@ def as_huggingface(
     published: str = "",
     version: str = "1.0.0",
     citation: str = "",
-) -> Path:
+) -> Location:
     """Describe a folder of ``triplets`` or ``collect``, as it can be uploaded to Hugging Face.
 
     Writes ``README.md``, the card by which ``datasets.load_dataset`` finds the Parquet files, and
@@ -79,9 +80,12 @@ def as_huggingface(
         MLCommons, *Croissant Format Specification*, version 1.1.
     """
     parquet = load("pyarrow.parquet", "pyarrow", "data")
-    place = Path(folder).resolve()
-    groups = {part: sorted(place.glob(f"{kind}-*.parquet")) for kind, part in KINDS.items()}
-    groups = {part: files for part, files in groups.items() if files}
+    place = located(folder)
+    groups = dict[str, list[Location]]()
+    for kind, part in KINDS.items():
+        found = sorted(list[Location](place.glob(f"{kind}-*.parquet")), key=str)
+        if found:
+            groups[part] = found
     if not groups:
         advice = "give a folder that triplets or collect wrote, with format='parquet'"
         raise UnreadableFile(str(place), "there are no Parquet files of ours in it", advice)
@@ -110,7 +114,7 @@ def as_huggingface(
                 "includes": files[0].name.partition("-")[0] + "-*.parquet",
             }
         )
-        schema = parquet.read_schema(files[0])
+        schema = parquet.read_schema(io.BytesIO(files[0].read_bytes()))
         fields = [_field(part, column) for column in schema]
         records.append({"@type": "cr:RecordSet", "@id": part, "name": part, "field": fields})
     about = {

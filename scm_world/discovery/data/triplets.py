@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -13,7 +12,8 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world.discovery.data.pictures import ENDINGS, Pictures, Row
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.output.durable import write_durably
+from scm_world.output.durable import made, write_durably
+from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.variables import Draw, Noise
@@ -28,7 +28,7 @@ def triplets(
     world: Simulation,
     factors: Iterable[str],
     n: int,
-    out: Path | str,
+    out: Location | str,
     *,
     cameras: Iterable[str | None] = (None,),
     size: tuple[int, int] = (64, 64),
@@ -40,7 +40,7 @@ def triplets(
     workers: int | None = None,
     engine: Executor | str | None = None,
     progress: Progress | None = None,
-) -> Path:
+) -> Location:
     """Write pictures x of a scene and x̃ of its counterfactual, with factors z and z̃ and targets.
 
     In each pair all factors are drawn from their space A, but those that are given a mechanism with
@@ -55,7 +55,7 @@ def triplets(
         world: That is drawn; it is not changed.
         factors: Names of variables with a space A.
         n: How many pairs.
-        out: A folder: new, empty, or one of the same call.
+        out: A folder, or a URL: new, empty, or one of the same call.
         cameras: Names of cameras, of the robot or of the model; None is the usual one. Each has two
             columns.
         size: Height and width of a picture [pixels].
@@ -115,18 +115,18 @@ def triplets(
         )
         for place, start in enumerate(starts)
     }
-    return write_files(Path(out), files, maker, about, workers, engine, progress)
+    return write_files(located(out), files, maker, about, workers, engine, progress)
 
 
 def write_files(
-    folder: Path,
+    folder: Location,
     files: Mapping[str, range],
     maker: Callable[[], Callable[[range], bytes]],
     about: Mapping[str, Any],
     workers: int | None,
     engine: Executor | str | None,
     progress: Progress | None,
-) -> Path:
+) -> Location:
     """Write the files of a folder that are not there yet.
 
     Args:
@@ -141,13 +141,13 @@ def write_files(
     Raises:
         UnreadableFile: The folder holds something else.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    made(folder)
     said, head = json.dumps({"format": FORMAT, **about}, indent=1) + "\n", folder / HEAD
     if head.exists():
         if json.loads(head.read_text()) != json.loads(said):
             advice = "give the same arguments and versions, or another folder"
             raise UnreadableFile(str(head), "it is of another call", advice)
-    elif any(folder.iterdir()):
+    elif any(True for _ in folder.iterdir()):
         raise UnreadableFile(str(folder), "it is not empty", "give a new folder")
     write_durably(head, said.encode())
     missing = [name for name in files if not (folder / name).exists()]

@@ -1,0 +1,176 @@
+"""Scores of learned representations against true factors: MCC, R² and DCI."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scm_world._arguments import load, one_of
+from scm_world._types import Floats
+from scm_world.errors import UnknownOption
+
+RIDGE = 1e-3
+"""The penalty of the linear regression, for standardized codes."""
+
+
+@final
+@dataclass(frozen=True)
+class DCI:
+    """How a representation divides the factors among its codes; each at most 1, the best.
+
+    Attributes:
+        disentanglement: How far each code tells of one factor only, in [0, 1].
+        completeness: How far each factor is told by one code only, in [0, 1].
+        informativeness: R² of the factors that were foretold, of rows not fitted.
+    """
+
+    disentanglement: float
+    completeness: float
+    informativeness: float
+
+
+def mcc(
+    codes: ArrayLike, factors: ArrayLike, *, method: Literal["pearson", "spearman"] = "spearman"
+) -> float:
+    """Compute the mean correlation coefficient: of each factor with a code of its own.
+
+    Args:
+        codes: The representation, shape (n, d) with d at least k.
+        factors: The truth, shape (n, k), one column for each number.
+        method: Of correlation; ranks allow a monotone function of a factor, too.
+
+    Returns:
+        The mean absolute correlation in [0, 1], for the best assignment of codes to factors.
+
+    Raises:
+        UnknownOption: Shapes do not fit, or there is no such method.
+
+    Source:
+        Hyvärinen and Morioka, *Unsupervised feature extraction by time-contrastive learning and
+        nonlinear ICA*, NeurIPS 2016.
+
+    Example:
+        >>> z = np.random.default_rng(0).normal(size=(500, 2))
+        >>> round(mcc(np.stack([z[:, 1] ** 3, -z[:, 0]], axis=1), z), 3)
+        1.0
+    """
+    from scipy.optimize import linear_sum_assignment
+    from scipy.stats import rankdata
+
+    one_of("method", method, ("pearson", "spearman"))
+    z, truth = _checked(codes, factors)
+    if z.shape[1] < truth.shape[1]:
+        raise UnknownOption("codes", z.shape, (f"{truth.shape[1]} columns or more",))
+    if method == "spearman":
+        z, truth = rankdata(z, axis=0), rankdata(truth, axis=0)
+    strength = np.abs(_standard(z, z).T @ _standard(truth, truth)) / len(z)  # (d, k)
+    rows, columns = linear_sum_assignment(-strength)
+    return float(strength[rows, columns].mean())
+
+
+def r2(codes: ArrayLike, factors: ArrayLike) -> float:
+    """Compute the share of the factors' variance that a linear function of the codes explains.
+
+    The function is fitted to the first half of the rows, and scored on the second.
+
+    Args:
+        codes: The representation, shape (n, d).
+        factors: The truth, shape (n, k).
+
+    Returns:
+        The coefficient of determination, the mean over factors; at most 1, below 0 where the
+        function is worse than the mean.
+
+    Raises:
+        UnknownOption: Shapes do not fit.
+
+    Example:
+        >>> z = np.random.default_rng(0).normal(size=(500, 2))
+        >>> round(r2(z @ [[1.0, 2.0], [0.0, 1.0]], z), 3)
+        1.0
+    """
+    z, truth = _checked(codes, factors)
+    half = len(z) // 2
+    z, mean = _standard(z, z[:half]), truth[:half].mean(axis=0)
+    fit, aim = z[:half], truth[:half] - mean
+    if z.shape[1] <= half:
+        gram = fit.T @ fit + RIDGE * half * np.eye(z.shape[1])
+        weights = np.linalg.solve(gram, fit.T @ aim)
+    else:  # the same weights, from the smaller system
+        weights = fit.T @ np.linalg.solve(fit @ fit.T + RIDGE * half * np.eye(half), aim)
+    return _determination(mean + z[half:] @ weights, truth[half:])
+
+
+def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0) -> DCI:
+    """Compute disentanglement, completeness and informativeness, with random forests.
+
+    Forests are fitted to the first half of the rows, and scored on the second.
+
+    Args:
+        codes: The representation, shape (n, d).
+        factors: The truth, shape (n, k).
+        trees: Of each forest.
+        seed: Of the forests.
+
+    Raises:
+        UnknownOption: Shapes do not fit.
+        MissingExtra: scikit-learn is not installed.
+
+    Source:
+        Eastwood and Williams, *A framework for the quantitative evaluation of disentangled
+        representations*, ICLR 2018.
+    """
+    ensemble = load("sklearn.ensemble", "scikit-learn", "discovery")
+    z, truth = _checked(codes, factors)
+    half = len(z) // 2
+    importances, foretold = [], []
+    for factor in truth.T:
+        forest: Any = ensemble.RandomForestRegressor(trees, random_state=seed)
+        forest.fit(z[:half], factor[:half])
+        importances.append(forest.feature_importances_)
+        foretold.append(forest.predict(z[half:]))
+    weights = np.stack(importances, axis=1)  # (d, k)
+    return DCI(
+        _concentration(weights),
+        _concentration(weights.T),
+        _determination(np.stack(foretold, axis=1), truth[half:]),
+    )
+
+
+def _concentration(weights: Floats) -> float:
+    """Average 1 minus the normalized entropy of the rows, each by its share of the whole."""
+    if weights.shape[1] == 1:
+        return 1.0
+    totals = weights.sum(axis=1)
+    shares = weights[totals > 0.0] / totals[totals > 0.0, None]
+    logs = np.log(shares, out=np.zeros_like(shares), where=shares > 0.0)
+    entropy = -(shares * logs).sum(axis=1) / np.log(weights.shape[1])
+    return float(np.average(1.0 - entropy, weights=totals[totals > 0.0]))
+
+
+def _determination(foretold: Floats, truth: Floats) -> float:
+    wrong = ((truth - foretold) ** 2).sum(axis=0)
+    whole = ((truth - truth.mean(axis=0)) ** 2).sum(axis=0)
+    return float(np.mean(1.0 - wrong / whole))
+
+
+def _standard(values: Floats, by: Floats) -> Floats:
+    """Give columns mean 0 and standard deviation 1 by some rows; constant ones are 0."""
+    spread = by.std(axis=0)
+    return np.asarray((values - by.mean(axis=0)) / np.where(spread > 0.0, spread, np.inf))
+
+
+def _checked(codes: ArrayLike, factors: ArrayLike) -> tuple[Floats, Floats]:
+    z, truth = (np.asarray(values, dtype=np.float64) for values in (codes, factors))
+    for name, values in (("codes", z), ("factors", truth)):
+        if values.ndim != 2 or len(values) < 4 or not np.isfinite(values).all():
+            allowed = ("finite numbers of shape (n, columns), with 4 rows or more",)
+            raise UnknownOption(name, f"an array of shape {values.shape}", allowed)
+    if len(z) != len(truth):
+        raise UnknownOption("factors", f"{len(truth)} rows", (f"{len(z)}, as codes have",))
+    if not (truth.std(axis=0) > 0.0).all():
+        raise UnknownOption("factors", "a constant column", ("columns that vary",))
+    return z, truth
