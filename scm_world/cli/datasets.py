@@ -165,15 +165,14 @@ def collect(
     title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
     console.table(("", "episodes", "rows"), rows, title=title)
     shards = list[Location](folder.glob("shard-*.*"))
-    described = [describe(folder)] if croissant else []
-    console.written(folder / SIDECAR, *sorted(shards, key=str)[:1], *described)
+    console.written(folder / SIDECAR, *sorted(shards, key=str)[:1], *described(folder, croissant))
 
 
-def describe(folder: Location) -> Location:
-    """Describe a folder for Hugging Face; return the Croissant file."""
+def described(folder: Location, wanted: bool) -> list[Location]:
+    """Describe a folder for Hugging Face if that is wanted; give the Croissant file."""
     from scm_world.discovery.data import as_huggingface
 
-    return as_huggingface(folder) / "croissant.json"
+    return [as_huggingface(folder) / "croissant.json"] if wanted else []
 
 
 def cameras_of(names: Iterable[str]) -> tuple[str | None, ...]:
@@ -203,12 +202,10 @@ def triplets(
 ) -> None:
     """Write pairs of pictures, before and after an intervention, with factors and targets.
 
-    With SYSTEM causal_circuit, pairs in the layout of the dataset CausalCircuit: ten files for
-    training with N pairs in all, and two with a tenth of that for validation and for testing.
     Example: scm-world triplets pushing --factor '*.color' --factor light_ambient -n 5000
 
     Args:
-        factor: Variables with a space A that are drawn; '*.color' by default. Repeat it for more.
+        factor: Variables with a space A that are drawn; '*color' by default. Repeat it for more.
         n: Number of pairs.
         targets: How many factors are drawn again in each pair.
         steps: Control steps before the pictures are taken.
@@ -217,49 +214,39 @@ def triplets(
         shard: Pairs in one file.
         format_: Format of the files: parquet or webdataset.
     """
-    from scm_world.discovery.data import causal_circuit
     from scm_world.discovery.data import triplets as written
-    from scm_world.discovery.data.pictures import ENDINGS
     from scm_world.discovery.data.recorded import settable
     from scm_world.queries import SCM
 
-    circuit = task == "causal_circuit"
     folder = console.results_folder(out, "triplets", tag(task), f"seed{seed}", option=option)
-    how: dict[str, Any] = {"size": (size, size), "seed": seed}
-    with (
-        console.resumable(folder, "t*-*.*", "files"),
-        options.open_executor(executor, workers, address, "pairs") as (pool, tell),
-    ):
-        how |= {"engine": pool, "progress": tell}
-        if circuit:
-            causal_circuit(folder, train=n, val=max(n // 10, 1), test=max(n // 10, 1), **how)
-        else:
-            held = parse_assignments(given, "'--given'")
-            with open_system(task, option, backend=backend, preset=None) as plain:
-                if isinstance(plain, SCM):
-                    raise refused(task, "has no pictures: it is no world", "'SYSTEM'")
-                with plain.given(held) as system:
-                    model = system.model
-                    drawn = (v for v in model if model.declared(v).space("A") is not None)
-                    free = set(drawn)
-                    names = [v for v in settable(system, factor or ["*.color"]) if v in free]
-                    written(
-                        system,
-                        names,
-                        n,
-                        folder,
-                        cameras=cameras_of(camera or ["usual"]),
-                        targets=targets,
-                        steps=steps,
-                        shard=shard,
-                        format=format_,
-                        **how,
-                    )
-    found = list[Location](folder.glob("*.npz" if circuit else f"*.{ENDINGS[format_]}"))
-    files = sorted(found, key=str)
-    console.say(f"{n:,} pairs in {len(files)} files")
-    described = [describe(folder)] if croissant else []
-    console.written(*files[:1], *described)
+    with open_system(task, option, backend=backend, preset=None) as plain:
+        if isinstance(plain, SCM):
+            raise refused(task, "is no world, so there are no pictures of it", "'SYSTEM'")
+        free = [name for name in plain.model if plain.model.declared(name).space("A") is not None]
+        names = [name for name in settable(plain, factor or ["*color"]) if name in free]
+        with (
+            plain.given(parse_assignments(given, "'--do'")) as system,
+            console.resumable(folder, "triplets-*.*", "files"),
+            options.open_executor(executor, workers, address, "pairs") as (pool, tell),
+        ):
+            written(
+                system,
+                names,
+                n,
+                folder,
+                cameras=cameras_of(camera or ["usual"]),
+                size=(size, size),
+                targets=targets,
+                steps=steps,
+                seed=seed,
+                shard=shard,
+                format=format_,
+                engine=pool,
+                progress=tell,
+            )
+    files = sorted(list[Location](folder.glob("triplets-*.*")), key=str)
+    console.say(f"{n:,} pairs of pictures with {len(names)} factors, in {len(files)} files")
+    console.written(*files[:1], *described(folder, croissant))
 
 
 def sweep(

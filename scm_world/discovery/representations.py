@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scm_world._arguments import load, one_of
+from scm_world._arguments import load
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 
@@ -32,21 +32,19 @@ class DCI:
     informativeness: float
 
 
-def mcc(
-    codes: ArrayLike, factors: ArrayLike, *, method: Literal["pearson", "spearman"] = "spearman"
-) -> float:
-    """Compute the mean correlation coefficient: of each factor with a code of its own.
+def mcc(codes: ArrayLike, factors: ArrayLike) -> float:
+    """Compute the mean rank correlation of each factor with a code of its own.
 
     Args:
         codes: The representation, shape (n, d) with d at least k.
         factors: The truth, shape (n, k), one column for each number.
-        method: Of correlation; ranks allow a monotone function of a factor, too.
 
     Returns:
-        The mean absolute correlation in [0, 1], for the best assignment of codes to factors.
+        The mean of Spearman's absolute correlations in [0, 1], for the best assignment of codes to
+        factors. A monotone function of a factor counts as the factor.
 
     Raises:
-        UnknownOption: Shapes do not fit, or there is no such method.
+        UnknownOption: Shapes do not fit.
 
     Source:
         Hyvärinen and Morioka, *Unsupervised feature extraction by time-contrastive learning and
@@ -60,12 +58,10 @@ def mcc(
     from scipy.optimize import linear_sum_assignment
     from scipy.stats import rankdata
 
-    one_of("method", method, ("pearson", "spearman"))
     z, truth = _checked(codes, factors)
     if z.shape[1] < truth.shape[1]:
         raise UnknownOption("codes", z.shape, (f"{truth.shape[1]} columns or more",))
-    if method == "spearman":
-        z, truth = rankdata(z, axis=0), rankdata(truth, axis=0)
+    z, truth = rankdata(z, axis=0), rankdata(truth, axis=0)
     strength = np.abs(_standard(z, z).T @ _standard(truth, truth)) / len(z)  # (d, k)
     rows, columns = linear_sum_assignment(-strength)
     return float(strength[rows, columns].mean())
@@ -95,12 +91,8 @@ def r2(codes: ArrayLike, factors: ArrayLike) -> float:
     z, truth = _checked(codes, factors)
     half = len(z) // 2
     z, mean = _standard(z, z[:half]), truth[:half].mean(axis=0)
-    fit, aim = z[:half], truth[:half] - mean
-    if z.shape[1] <= half:
-        gram = fit.T @ fit + RIDGE * half * np.eye(z.shape[1])
-        weights = np.linalg.solve(gram, fit.T @ aim)
-    else:  # the same weights, from the smaller system
-        weights = fit.T @ np.linalg.solve(fit @ fit.T + RIDGE * half * np.eye(half), aim)
+    gram = z[:half].T @ z[:half] + RIDGE * half * np.eye(z.shape[1])
+    weights = np.linalg.solve(gram, z[:half].T @ (truth[:half] - mean))
     return _determination(mean + z[half:] @ weights, truth[half:])
 
 

@@ -54,3 +54,42 @@ def test_ctrl_c_on_the_command_line(tmp_path: Path) -> None:
     there = len(list(tmp_path.glob("shard-*")))
     assert f"interrupted: {there} of 600 files are safe" in text
     assert len(load(tmp_path, partial=True)) == 5 * there
+
+
+def test_the_command_writes_pairs_of_pictures(tmp_path: Path) -> None:
+    """With a description; what is no factor is refused, and Ctrl-C is resumed as in Python."""
+    command = [
+        "triplets",
+        "pushing",
+        "--backend",
+        "fake",
+        "-n",
+        "5",
+        "--shard",
+        "3",
+        "--size",
+        "16",
+    ]
+    given = ["--factor", "tool_block.color", "--factor", "light_*", "--camera", "60"]
+    out = ["--do", "gravity=[0,0,-5]", "--croissant", "--out", str(tmp_path / "pairs")]
+    for _ in range(2):
+        done = CliRunner().invoke(app, [*command, *given, *out])
+        assert done.exit_code == 0, done.output
+    assert "5 pairs of pictures with 3 factors, in 2 files" in done.output
+    assert {path.name for path in (tmp_path / "pairs").iterdir()} == {
+        "README.md", "croissant.json", "triplets.json",
+        *(f"triplets-{i:05d}-of-00002.parquet" for i in range(2)),
+    }  # fmt: skip
+    for wrong in (["--factor", "tool_blok.*"], ["--format", "npz"], ["--camera", "61"]):
+        done = CliRunner().invoke(app, [*command, *wrong, "--out", str(tmp_path / "new")])
+        assert done.exit_code == 2, done.output
+
+
+def test_the_command_collects_pictures(tmp_path: Path) -> None:
+    """Beside the rows; of the goals only where asked."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    given = ["--n", "2", "--picture", "usual", "--picture-size", "16", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, [*COMMAND, *given])
+    assert done.exit_code == 0, done.output
+    names = parquet.read_schema(tmp_path / "pictures-00000.parquet").names
+    assert names == ["episode", "step", "first_image", "image"]

@@ -18,7 +18,6 @@ def test_permuted_and_distorted_factors_are_perfect() -> None:
     """MCC and DCI allow a permutation and a monotone function of each factor, R² does not."""
     codes = np.exp(2.0 * Z[:, [2, 0, 1]]) * [1.0, -1.0, 3.0]
     assert mcc(codes, Z) == pytest.approx(1.0)
-    assert mcc(codes, Z, method="pearson") < 0.95
     assert 0.7 < r2(codes, Z) < 0.95
     pytest.importorskip("sklearn")
     found = dci(codes, Z, trees=5)

@@ -1,6 +1,5 @@
 """Data from interventions: tables with regimes, and how to collect them."""
 
-from scm_world.discovery.data.circuit import causal_circuit, circuit_model
 from scm_world.discovery.data.collect import collect
 from scm_world.discovery.data.croissant import as_huggingface
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
@@ -47,8 +46,6 @@ __all__ = [
     "as_huggingface",
     "as_numpy",
     "as_tigramite",
-    "causal_circuit",
-    "circuit_model",
     "collect",
     "default_causes",
     "default_outcomes",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
@@ -115,61 +116,26 @@ def triplets(
         )
         for place, start in enumerate(starts)
     }
-    return write_files(located(out), files, maker, about, workers, engine, progress)
-
-
-def write_files(
-    folder: Location,
-    files: Mapping[str, range],
-    maker: Callable[[], Callable[[range], bytes]],
-    about: Mapping[str, Any],
-    workers: int | None,
-    engine: Executor | str | None,
-    progress: Progress | None,
-) -> Location:
-    """Write the files of a folder that are not there yet.
-
-    Args:
-        folder: New, empty, or one of the same call.
-        files: Numbers of pairs by the name of a file.
-        maker: Called in each worker; gives what turns numbers of pairs into a file.
-        about: Everything that decides the files, as plain data.
-        workers: Processes; None is one.
-        engine: See ``engine_of``.
-        progress: Called with (finished, planned) pairs after each file.
-
-    Raises:
-        UnreadableFile: The folder holds something else.
-    """
+    folder, said = located(out), {"format": FORMAT, **json.loads(json.dumps(about))}
     made(folder)
-    said, head = json.dumps({"format": FORMAT, **about}, indent=1) + "\n", folder / HEAD
-    if head.exists():
-        if json.loads(head.read_text()) != json.loads(said):
+    if (folder / HEAD).exists():
+        if json.loads((folder / HEAD).read_text()) != said:
             advice = "give the same arguments and versions, or another folder"
-            raise UnreadableFile(str(head), "it is of another call", advice)
+            raise UnreadableFile(str(folder / HEAD), "it is of another call", advice)
     elif any(True for _ in folder.iterdir()):
         raise UnreadableFile(str(folder), "it is not empty", "give a new folder")
-    write_durably(head, said.encode())
+    else:
+        write_durably(folder / HEAD, (json.dumps(said, indent=1) + "\n").encode())
     missing = [name for name in files if not (folder / name).exists()]
-    count = sum(map(len, files.values()))
     done = count - sum(len(files[name]) for name in missing)
     with opened(engine, 1 if workers is None and engine is None else workers) as executor:
-        executor.check("world of pictures", maker)
+        executor.check("world of pictures", world)
         for place, data in executor.run(maker, [files[name] for name in missing]):
             write_durably(folder / missing[place], data)
             done += len(files[missing[place]])
             if progress is not None:
                 progress(done, count)
     return folder
-
-
-def twin_of(world: Simulation) -> Any:
-    """Build another world like this one."""
-    build, arguments, *rest = world.__reduce__()
-    twin: Any = build(*arguments) if callable(build) else world
-    for state in rest:
-        twin.__dict__.update(state)
-    return twin
 
 
 @final
@@ -186,7 +152,7 @@ class _Pairs:
 
     def __call__(self) -> Callable[[range], bytes]:
         """Give the function from numbers of pairs to a file."""
-        twin = twin_of(self.world)
+        twin = copy.deepcopy(self.world)
 
         def file(numbers: range) -> bytes:
             rows = [self._pair(twin, number) for number in numbers]
