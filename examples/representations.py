@@ -98,9 +98,7 @@ def main(pairs: str = "5000", epochs: str = "15", seeds: str = "3") -> None:
             with torch.no_grad():
                 codes[name].append(net(x[n:]).numpy())
     for name, found in codes.items():
-        rows = [
-            (mcc(c, z[n:]), r2(c, z[n:]), *vars(dci(c, z[n:], trees=10)).values()) for c in found
-        ]
+        rows = [(mcc(c, z[n:]), r2(c, z[n:]), *dci(c, z[n:], trees=10)) for c in found]
         said = (
             f"{score} {min(column):.2f} to {max(column):.2f}"
             for score, column in zip(

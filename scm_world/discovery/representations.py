@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,9 +15,7 @@ RIDGE = 1e-3
 """The penalty of the linear regression, for standardized codes."""
 
 
-@final
-@dataclass(frozen=True)
-class DCI:
+class DCI(NamedTuple):
     """How a representation divides the factors among its codes; each at most 1, the best.
 
     Attributes:
@@ -72,16 +69,11 @@ def r2(codes: ArrayLike, factors: ArrayLike) -> float:
 
     The function is fitted to the first half of the rows, and scored on the second.
 
-    Args:
-        codes: The representation, shape (n, d).
-        factors: The truth, shape (n, k).
+    Arguments and errors are those of ``mcc``, with any number of codes.
 
     Returns:
         The coefficient of determination, the mean over factors; at most 1, below 0 where the
         function is worse than the mean.
-
-    Raises:
-        UnknownOption: Shapes do not fit.
 
     Example:
         >>> z = np.random.default_rng(0).normal(size=(500, 2))
@@ -99,7 +91,8 @@ def r2(codes: ArrayLike, factors: ArrayLike) -> float:
 def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0) -> DCI:
     """Compute disentanglement, completeness and informativeness, with random forests.
 
-    Forests are fitted to the first half of the rows, and scored on the second.
+    Forests are fitted to the first half of the rows, and scored on the second. Other arguments and
+    errors are those of ``mcc``, with any number of codes.
 
     Args:
         codes: The representation, shape (n, d).
@@ -108,7 +101,6 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
         seed: Of the forests.
 
     Raises:
-        UnknownOption: Shapes do not fit.
         MissingExtra: scikit-learn is not installed.
 
     Source:

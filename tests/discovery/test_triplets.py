@@ -109,6 +109,8 @@ def test_pictures_after_some_steps_share_their_noise(tmp_path: Path) -> None:
         ({"factors": []}, UnknownOption, "factors"),
         ({"targets": 9}, UnknownOption, "1 to 4"),
         ({"n": 0}, UnknownOption, "n"),
+        ({"cameras": ["61"]}, UnknownOption, "60"),
+        ({"format": "npz"}, UnknownOption, "webdataset"),
     ],
 )
 def test_what_makes_no_pairs_is_refused(
@@ -247,6 +249,9 @@ def test_pictures_beside_rows(tmp_path: Path) -> None:
         assert tar.getnames()[:3] == [
             f"00000000-000000.{n}" for n in ("first_image.png", "image.png", "json")
         ]
+    with pytest.raises(UnknownOption, match="camera"):
+        collect(world, design, 2, out=tmp_path / "c", pictures=Pictures(cameras=("61",)))
+    assert not (tmp_path / "c").exists()
     with pytest.raises(UnknownOption, match="folder"):
         collect(world, design, 2, pictures=pictures)
     with pytest.raises(UnknownOption, match="parquet, webdataset"):

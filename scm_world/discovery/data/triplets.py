@@ -117,14 +117,15 @@ def triplets(
         for place, start in enumerate(starts)
     }
     folder, said = located(out), {"format": FORMAT, **json.loads(json.dumps(about))}
-    made(folder)
     if (folder / HEAD).exists():
         if json.loads((folder / HEAD).read_text()) != said:
             advice = "give the same arguments and versions, or another folder"
             raise UnreadableFile(str(folder / HEAD), "it is of another call", advice)
-    elif any(True for _ in folder.iterdir()):
+    elif folder.exists() and any(True for _ in folder.iterdir()):
         raise UnreadableFile(str(folder), "it is not empty", "give a new folder")
     else:
+        maker()(range(1))  # what cannot be done is refused before there is anything
+        made(folder)
         write_durably(folder / HEAD, (json.dumps(said, indent=1) + "\n").encode())
     missing = [name for name in files if not (folder / name).exists()]
     done = count - sum(len(files[name]) for name in missing)

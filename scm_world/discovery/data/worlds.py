@@ -82,7 +82,7 @@ class WorldSource:
         InterventionError: A target, or what varies, cannot be set to its values.
         UnknownVariable: No variable has this name.
         UnknownOption: An outcome is a function, sums up an episode with ``every_step``, or is
-            written down as a cause already.
+            written down as a cause already; or there is no such camera.
     """
 
     at_once = False
@@ -101,6 +101,11 @@ class WorldSource:
         pictures: Pictures | None = None,
     ) -> None:
         self._pictures = pictures
+        if pictures is not None:
+            with twins.twin() as twin:  # a camera that does not exist is refused now
+                seen: Any = twin
+                seen.reset(seed=setting.seed)
+                pictures.take(seen.scene(), seen.cameras())
         self._world, self._twins, self._design = world, twins, design
         self._setting, self._given = setting, getattr(world, "plan", Plan())
         self._every_step, model = every_step, world.model
