@@ -140,7 +140,7 @@ def clone(
         rounds: Further rounds, in which the network acts, too.
         out: Folder for all files; by default under scm-world-results.
     """
-    from scm_world.policies.cards import COMMON, FORM
+    from scm_world.policies.cards import COMMON, FORM, OPTIONS, PolicyAbout
     from scm_world.policies.scripted import NAMED
     from scm_world.training import imitation
     from scm_world.training.recipe import recipe
@@ -178,7 +178,11 @@ def clone(
     _tell(found, task)
     learned = found.lesson
     usual = recipe(task, observations=learned.observations)
-    same = all(usual.options.get(k) == learned.options.get(k) for k in (*FORM, *COMMON))
+    mine, its = (
+        PolicyAbout(task=task, env={name: one[name] for name in OPTIONS if name in one})
+        for one in (learned.options, usual.options)
+    )
+    same = all(mine.option(name) == its.option(name) for name in (*FORM, *COMMON))
     if same and usual.network.activation == learned.network.activation:
         more = "" if observations is None else f" --observations {observations}"
         console.say(f"go on:    scm-world train {task}{more} --start {found.best}")

@@ -526,8 +526,9 @@ def clone(
     network acts now and then, the actions of the teacher are recorded (DAgger), and the network is
     fitted to all demonstrations.
 
-    If ``out`` holds a part of the same work, it resumes after the last whole file of episodes, or
-    the last round. The result follows from the lesson, the seed, the backend and the versions.
+    The policy of a round is written before it is evaluated. If ``out`` holds a part of the same
+    work, it resumes after the last whole file of episodes, the last fit or the last evaluation.
+    The result follows from the lesson, the seed, the backend and the versions.
 
     Args:
         source: Where demonstrations come from: None for the teacher of the lesson; a recording,
@@ -590,11 +591,16 @@ def clone(
                 form: dict[str, Any] = {"task": lesson.task, "env": lesson.options, "card": card}
                 form["activation"] = lesson.network.activation
                 policy = MlpPolicy.of(tensors, form)
+                save_policy(path, policy)  # nothing that fails later costs what was learned
+                save_policy(folder / "policy.safetensors", policy)
+                say(f"round {round_}: loss {loss:.4f}; written to {path}")
+            policy = load_policy(str(path))
+            if "trials" not in policy.about.card:
                 scores: dict[str, float] = {}
                 if lesson.trials.protocols:
                     given_to = (lesson.task, lesson.options, lesson.trials, backend)
                     _, scores = scored(policy, *given_to)
-                say(f"round {round_}: loss {loss:.4f}; {words(scores) or 'not evaluated'}")
+                    say(f"round {round_}: {words(scores)}")
                 save_policy(path, policy, policy.about.with_card(trials=scores))
             policies.append(load_policy(str(path)))
         trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]

@@ -5,10 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import gymnasium
 import pytest
 from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
+from scm_world.evaluation.recording import record
+from scm_world.policies import load_policy
+from scm_world.training import imitation
+from scm_world.training.recipe import recipe
 
 QUICK = (
     *("--episodes", "1", "--rounds", "0", "--set", "keep=0", "--set", "updates=5"),
@@ -59,3 +64,34 @@ def test_it_says_what_comes_next(tmp_path: Path) -> None:
     made = about["lesson"]
     assert (made["episodes"], made["network"]["hidden"], made["keep"]) == (1, [4], 0.0)
     assert made["network"]["activation"] == "relu"  # a dotted name leaves the other parts alone
+
+
+def test_a_recording_of_gymnasium_is_learned_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recording names all options of its environment; a failed trial costs no policy."""
+    pytest.importorskip("torch")
+    options = {**recipe("picking").env, "task_options": None, "max_episode_length": 5}
+    env = gymnasium.make("scm_world/Picking-v0", **options)
+    record("still", env, 1, out=tmp_path / "shown.parquet")
+    env.close()
+    given = ("picking", "--from", str(tmp_path / "shown.parquet"), "--out", str(tmp_path / "run"))
+    small = ("--set", "trials.episodes=1", "--set", 'trials.protocols=["P0"]')
+    arguments = (*given, *QUICK[4:8], "--set", "network.hidden=[4]", *small)
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("no more room")
+
+    monkeypatch.setattr(imitation, "scored", broken)
+    assert isinstance(call(*arguments).exception, RuntimeError)
+    first = load_policy(tmp_path / "run" / "policy.safetensors")
+    assert "trials" not in first.about.card
+    monkeypatch.undo()
+
+    monkeypatch.setattr(imitation, "fitted", broken)  # what was learned is not learned again
+    done = call(*arguments)
+    assert done.exit_code == 0, done.output
+    assert "scm-world train picking --start" in done.output
+    second = load_policy(tmp_path / "run" / "best.safetensors")
+    assert second.about.card["trials"] == {"P0": 0.0}
+    assert (second.layers[0].weight == first.layers[0].weight).all()
